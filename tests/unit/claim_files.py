@@ -18,7 +18,7 @@ from vipetsc.studies.linear_run import MEASURES
 
 
 def measure(claim: str, root: Path, reading: str = "calibrated") -> SimpleNamespace:
-    """The row of a claim, ``"C7"`` say, as measured from the files in ``root``."""
+    """Return the fields of the row of a claim, such as ``"C7"``, as measured from the files in ``root``."""
     with Evidence(root) as evidence:
         return SimpleNamespace(**measure_claim(claim, reading, evidence))
 

@@ -58,7 +58,8 @@ def mass_on_stop(damping: float = 0.0) -> Cluster:
         contacts=contacts,
         springs=np.zeros(0, SPRING_DOF),
         drives=create_drives((), []),
-        # A free mass: an impulse changes its velocity by 1/m, which moves it by H s/m; the table holds H times that.
+        # A unit impulse changes the velocity of a free mass by 1/m and moves it by H s/m when the fraction s of the
+        # interval H has passed; the table holds H times that.
         response=np.full((1, 1, 1), interval**2 / MASS),
         nodes=collocation(2),
         interval=interval,
@@ -100,7 +101,7 @@ def pressed_mass(gap: float, side: int = 1) -> Cluster:
     cluster.contacts["clearance_minus"] = gap
     cluster.contacts["scale"] = 0.5
 
-    # Accelerations need a second term, which is zero: the mass is free between its contacts.
+    # Accelerations need a second term of the response, which is zero as the mass is free between its contacts.
     response = np.append(cluster.response, np.zeros((1, 1, 1)), axis=2)
     return cluster._replace(
         response=response,

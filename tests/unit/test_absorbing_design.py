@@ -20,7 +20,7 @@ def case(amplitude: float, reflection: float) -> Case:
 
 @pytest.fixture
 def tried(monkeypatch) -> list[float]:
-    """What comes back from the ends that are tried."""
+    """Return a list that receives the reflected fraction of each end that is tried."""
     absorbing._first_end.cache_clear()
     fractions: list[float] = []
     original = absorbing.reflected
@@ -40,6 +40,7 @@ def test_an_end_is_designed_once_for_all_amplitudes(tried):
 
 
 def test_that_no_end_will_do_is_found_once(tried):
+    """No end is tried twice where all ends fail, although two amplitudes ask for one."""
     for amplitude in (1.0, 2.0):
         with pytest.raises(CaseError, match="is reflected, mostly slow waves"):
             case(amplitude, reflection=1e-9)
@@ -47,14 +48,14 @@ def test_that_no_end_will_do_is_found_once(tried):
 
 
 def test_a_lattice_that_is_too_short_for_an_end_is_told_so():
-    """Of 24 cells an end may have 8, and the shortest that is tried has 10."""
+    """An end may have a third of the lattice, 8 of 24 cells, and needs 10: the case is refused."""
     lattice = {"preset": "four-band", "cells": 24, "absorbing": {}}
     with pytest.raises(CaseError, match="an end has 10 cells or more, and at most a third of the lattice"):
         Case.from_table({"lattice": lattice, "contacts": {"sites": 0}})
 
 
 def test_the_length_that_is_given_is_the_one_that_is_named(tried):
-    """A length of the case is tried, whatever part of the lattice it is."""
+    """A length that the case gives is the only one tried, also where it is more than a third of the lattice."""
     lattice = {"preset": "four-band", "cells": 60, "absorbing": {"cells": 25, "reflection": 1e-9}}
     with pytest.raises(CaseError, match="no end of up to 25 cells satisfies it"):
         Case.from_table({"lattice": lattice, "contacts": {"sites": 0}})

@@ -21,7 +21,7 @@ INTERVAL = 2e-4  # s
 
 @pytest.fixture
 def run():
-    """A run of noise on 24 cells; the sites are 15 and 9, the drive is at cell 3."""
+    """Return a run whose velocities (400 samples, 24 cells, 4 masses) are noise; sites 15 and 9, drive at cell 3."""
     case = Case.load(overrides=["lattice.cells=24", "contacts.sites=[15, 9]", "drive.cell=3", "drive.cycles=3"])
     time = np.arange(SAMPLES) * INTERVAL
     noise = np.random.default_rng(1).standard_normal((SAMPLES, 24, 4))
@@ -48,7 +48,7 @@ def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
     assert measured["entropy/energy_weighted"].item() == expected.energy_weighted
     assert np.array_equal(measured["entropy/history"].values, expected.snapshot)
 
-    # Without a linear run it is estimated: half the burst, and 6 cells to the leading site at the wave's speed.
+    # Without a linear run the arrival is estimated: half the burst, and 6 cells to the first site at the wave's speed.
     estimate = 0.5 * model.drive.duration + 6 / model.speed
     start = analyse(run, ("entropy",)).attrs["entropy/start"]
     assert estimate < start < estimate + 2 * INTERVAL
@@ -57,7 +57,10 @@ def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
 @pytest.mark.slow
 @pytest.mark.parametrize(("pixels", "limit"), [(600, 20_000), (7, 60_000)])
 def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit):
-    """Of the field, 307 KB, no more than the limit in bytes is read at once; a row of a map of 7 takes 45 KB."""
+    """The analysis reads at most ``limit`` bytes of the field of 307 KB at once, and its results are the same.
+
+    One row of a map of 7 pixels takes 45 KB.
+    """
     write_netcdf(tmp_path / "run.h5", run)
     whole = analyse(run, options=AnalysisTable(pixels=pixels, snapshot_stride=20))
     read = []
@@ -87,7 +90,7 @@ def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
     fine = analyse(run, options=AnalysisTable(pixels=600))
     coarse = analyse(run, options=AnalysisTable(pixels=8))
 
-    # Of 400 samples and 24 cells, 50 and 3 make a pixel of 8.
+    # A pixel of a map of 8 by 8 pixels has 50 samples and 3 cells.
     means = fine["kinetic_energy"].values.reshape(8, 50, 8, 3).mean(axis=(1, 3))
     assert coarse["kinetic_energy"].values == pytest.approx(means, rel=1e-5)
     assert coarse["time"].values == pytest.approx(fine["time"].values.reshape(8, 50).mean(axis=1))
@@ -111,7 +114,7 @@ def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
 
 
 def test_cells_before_and_after_the_first_site_are_measured_apart(run):
-    # Of a wave that lives before cell 9 alone, nothing is measured behind it.
+    # The wave moves no cell from cell 9 on: the spectrum behind that site is zero.
     run["velocity"].values[:, 8:] = 0.0
     measured = analyse(run, ("wavenumber", "dispersion"))
     assert measured["dispersion_before"].values.max() > 0
@@ -157,7 +160,7 @@ def test_the_ends_of_a_record_are_not_in_the_means(run):
 
 
 def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
-    # From cell 3 it is 6 cells to cell 9, and 5 back across the ends to cell 22.
+    # The drive at cell 3 is 6 cells from cell 9, and 5 cells, across the ends, from cell 22.
     run["sites/cell"].values[:] = [22, 9]
     overrides = ["lattice.cells=24", "contacts.sites=[22, 9]", "drive.cell=3", "drive.cycles=3"]
     ring = Case.load(overrides=[*overrides, "lattice.ends=periodic"])

@@ -1,4 +1,4 @@
-"""Files are whole or not there, whatever writes them and whatever happens."""
+"""Every writer leaves a whole file or none, also on a full disk; a file that cannot be read is named."""
 
 import errno
 import os
@@ -32,7 +32,7 @@ def full_disk(limit: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-# Each writes more than the limits below.
+# Each function writes a file that is longer than the limits in bytes below.
 NUMBERS = np.arange(10_000.0)
 WRITERS = {
     "a.txt": lambda path: write_text(path, "long " * 20_000),
@@ -63,11 +63,11 @@ def test_only_temporary_files_of_processes_that_have_ended_are_removed(tmp_path,
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     monkeypatch.setattr(os, "getpid", lambda: ended.pid)
-    # Left as by a kill: the block is not left.
+    # The context is entered and never left, as in a process that is killed.
     abandoned = atomic_write(tmp_path / "a.png").__enter__()
     here = platform.node()
     others = []
-    # The name of a host may begin as that of this one with a process does.
+    # Another host may have a name that equals this host's name with a number of a process.
     for name in ("elsewhere", f"{here}-{ended.pid}"):
         monkeypatch.setattr(platform, "node", lambda name=name: name)
         others.append(atomic_write(tmp_path / "a.png").__enter__())

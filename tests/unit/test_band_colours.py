@@ -17,7 +17,7 @@ X = np.array([1.0, 2.0, 4.0])
 
 
 def prediction(level: float = 0.2) -> Figure:
-    # Equal energies: only their looks distinguish the curves.
+    # All energies are equal, hence curves coincide and differ in their style alone.
     energies = np.full((3, 4), level)
     data = {"sites/cell": ("site", [5, 9, 12])}
     for kind in ("predicted", "simulated"):
@@ -41,7 +41,7 @@ def law() -> Figure:
 
 def parts() -> Figure:
     figure = style.new_figure(3, 2)
-    # Gaps between them, as measures have, which take no colour of a band.
+    # Measures have gaps between the bands; a gap takes no colour of a band.
     names = [name for band in BANDS for name in (f"band {band}", f"gap {band}")]
     transfer.draw_parts(figure.subplots(), X, names, [X] * len(names))
     return figure
@@ -63,7 +63,7 @@ def test_bands_have_their_colours_by_name(make):
 
 @pytest.mark.parametrize("make", [prediction, law])
 def test_curves_of_a_panel_differ_in_grey(make):
-    """By their dashes or their marks, and in any case by more than their colours."""
+    """Curves of one panel differ in their dashes or marks, hence without colours, too."""
     with style.rc_style():
         figure = make()
     for axes in figure.get_axes():
@@ -71,7 +71,7 @@ def test_curves_of_a_panel_differ_in_grey(make):
         looks = {(line.get_marker(), str(line._dash_pattern)) for line in named}
         assert len(looks) == len(named) > 1 or axes.get_legend() is None
 
-    # Simulated points have no lines to differ by.
+    # Simulated points have no lines and differ in their marks.
     points = [line for axes in figure.get_axes() for line in axes.lines if line.get_linestyle() == "None"]
     of_bands = [line.get_marker() for line in points if line.get_color() != style.BLACK]
     assert len(set(of_bands)) == len(of_bands)
@@ -107,7 +107,7 @@ def test_the_amplitude_of_first_contact_is_apart_from_the_frame():
 
 @pytest.mark.parametrize("make", [panels.band_diagram, runs.bands])
 def test_branches_have_the_colours_of_their_bands(make):
-    """In a diagram alone, and over the group velocity as well."""
+    """Branches have the colours of their bands in a band diagram alone and in the figure with the group velocity."""
     with style.rc_style():
         if make is runs.bands:
             drawn = make(four_band()).get_axes()

@@ -48,7 +48,7 @@ def test_a_zero_is_found_with_few_values(function, most):
 
     found = bracketed_root(value, 0.0, 1.0, TOLERANCE, {})
     assert abs(found - ROOT) <= TOLERANCE
-    # A caller keeps what it computed there.
+    # The zero is one of the arguments: callers keep what they computed at an argument.
     assert found in places
 
 

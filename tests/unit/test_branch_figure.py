@@ -1,4 +1,4 @@
-"""The curve of a branch, and which of its states are drawn as the lowest of their energy."""
+"""Figures of branches: curves through points and tangents, kinds of branches, axes, rows, and what is left out."""
 
 import errno
 from pathlib import Path
@@ -104,14 +104,17 @@ def test_a_branch_keeps_a_corner_where_a_contact_grazes(slope_at_grazing):
 
 
 def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
-    """A branch goes back from 4 J to 2 J at higher frequencies, and on at lower ones."""
+    """The state of the lowest frequency at its energy is marked.
+
+    The branch returns from 4 J to 2 J at higher frequencies, where no state is marked, and goes on at lower ones.
+    """
     branch = branch_of(energy=[1.0, 3.0, 4.0, 3.5, 2.0, 2.5, 5.0], frequency=[1.0, 3.0, 4.0, 5.0, 2.9, 1.0, 5.9])
     assert branch_curves.lowest(branch).tolist() == [True, False, False, False, False, True, True]
 
 
 def test_a_branch_file_names_its_kind():
     for kind in branch_kinds.BRANCH_KINDS:
-        # What the file holds decides nothing then: a share stands for responses.
+        # The stated kind decides, although the variable ``share`` would stand for responses.
         branch = branch_of(share=[1.0]).assign_attrs(branch_kind=kind)
         assert branch_kinds.branch_kind(branch) == kind
     with pytest.raises(ValueError, match="later version"):
@@ -151,7 +154,10 @@ def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
 
 
 def test_fractions_that_are_rounding_have_no_panel():
-    """Of a finite lattice whose contacts have no loss, or which takes up no energy."""
+    """Fractions of energy have no panel where all are NaN or rounding.
+
+    This happens in a finite lattice that takes up no energy or whose contacts have no loss.
+    """
     nothing = np.full((3, 4), np.nan)
     assert not nfrc.has_fractions(xr.Dataset({"share": (("point", "way"), nothing)}))
     for loss, is_shown in ((1e-15, False), (0.02, True)):
@@ -170,7 +176,7 @@ def test_fractions_that_are_rounding_have_no_panel():
     ],
 )
 def test_outputs_on_one_page_are_those_that_all_curves_have(monkeypatch, variables, rows):
-    """Three amplitudes and a phase of masses, and the forces."""
+    """A page has a row for each variable that all curves have: four of masses, which need the lag, one of forces."""
     curves = [xr.Dataset(dict.fromkeys(names, 1.0)) for names in variables]
     assert bool(response_outputs.without_outputs(curves)) == (rows == 0)
 
@@ -199,7 +205,7 @@ def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_pa
 
 
 def test_every_contact_and_every_motion_of_a_condensed_branch_has_a_curve(tmp_path):
-    """Seven of each, more than there are colours; all look different."""
+    """Seven contacts and seven motions, more than there are colours, have curves that all look different."""
     path = tmp_path / "branch-many.h5"
     put_condensed_branch(path, 3, places=7)
     with open_netcdf(path, "branch") as file:
@@ -217,7 +223,7 @@ def test_every_contact_and_every_motion_of_a_condensed_branch_has_a_curve(tmp_pa
 
 
 def test_a_branch_without_points_is_no_file(tmp_path):
-    """One of two is drawn, and the other named; a folder without any refuses the figure by its name."""
+    """A branch without points is not drawn but named; where a folder has no other branch, the figure is named."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
     assert registry.draw(BRANCHES, [tmp_path]) == []
     assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == [registry.BRANCH]
@@ -227,7 +233,7 @@ def test_a_branch_without_points_is_no_file(tmp_path):
 
 
 def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypatch):
-    """The file can be read: that the picture cannot be written must not be reported as bad input."""
+    """A picture that cannot be written raises no ValueError, which would mean bad input: the branch can be read."""
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
 
     def fail(*arguments):
@@ -250,7 +256,11 @@ def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypat
     ],
 )
 def test_printed_special_points_have_the_unit_of_the_parameter(nfrc_section, drive, unit):
-    """Amplitudes of a wave, a force and a wall that moves; frequencies; a key, whose unit the curve has."""
+    """Special points have the unit of the parameter.
+
+    Amplitudes of a wave, a force and a moving wall are in clearances, N and m, frequencies in rad/s; the unit of any
+    other key is an attribute of the curve.
+    """
     table = {
         "lattice": {"preset": "four-band", "cells": 6},
         "contacts": {"sites": [3], "clearance": 1e-3},

@@ -54,7 +54,10 @@ tolerance = 1e-11
 
 @pytest.mark.slow
 def test_a_mass_between_two_stops_has_its_period_in_closed_form():
-    """Between the stops the mass moves with k, beyond them with k + kc about another middle."""
+    """The period is four times the sum of two times, each of a harmonic motion.
+
+    Up to the stop the mass moves with the stiffness k, beyond it with k + kc about another middle.
+    """
     k = 3.0
     kc = 40.0
     m = 2.0
@@ -81,12 +84,15 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
             quarter += np.arccos((clearance - middle) / (amplitude - middle)) / fast
         assert point.frequency == pytest.approx(1 / (4 * quarter), rel=3e-7)
         assert point.energy == pytest.approx(energy, rel=1e-6)
-    # Far in contact, where the harmonics are many.
+    # The last point is far in contact, where the motion has many harmonics.
     assert points[-1].elongations[0] > 2 * clearance
 
 
 def test_a_cubic_spring_has_the_period_of_elliptic_functions():
-    """The oscillator x'' + x + x^3 = 0 is Duffing's."""
+    """Duffing's oscillator x'' + x + x^3 = 0 with the amplitude a has the frequency (1 + a^2)^(1/2)/(4 K(m)).
+
+    K is the complete elliptic integral of the first kind, with the parameter m = a^2/(2 (1 + a^2)).
+    """
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, cubic=1.0)])
     _, points = condensed_branch(system, 0, 1e-3, truncation=1e-10, points=25, largest_step=0.3)
     for point in points:
@@ -94,11 +100,12 @@ def test_a_cubic_spring_has_the_period_of_elliptic_functions():
         frequency = np.sqrt(1 + a**2) / (4 * ellipk(a**2 / (2 * (1 + a**2))))
         assert point.frequency == pytest.approx(frequency, rel=1e-9)
         assert point.energy == pytest.approx(a**2 / 2 + a**4 / 4, rel=1e-9)
-    # Where the cubic force exceeds the linear one.
+    # At the last point the cubic force exceeds the linear one.
     assert points[-1].elongations[0] > 1
 
 
 def test_the_slope_of_the_energy_is_that_between_points():
+    """The chord df/dE between neighbouring points lies between their slopes, within 1 %."""
     _, points = condensed_branch(reduced_model("hertz"), 1, 0.028, points=20, truncation=1e-6)
     # Just after grazing the slope changes within a step.
     with_contact = [point for point in points if point.episodes][3:]
@@ -238,7 +245,7 @@ def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
 @pytest.mark.slow
 def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
     stop = StopRequest()
-    # Before it begins: the first point is kept, and the branch stopped after it.
+    # The stop is requested before the branch begins: the first point is kept, and no other one follows.
     stop.requested = True
     (begun,) = followed(chain_case(), tmp_path / "stopped", stop=stop)
     assert begun.ending.startswith("stopped on request after point 1")
@@ -250,7 +257,7 @@ def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
 
 @pytest.mark.slow
 def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
-    # So few harmonics do not keep to so small a truncation for long.
+    # With 61 harmonics the truncation exceeds 4.4e-7 after some points.
     more = "harmonics = 61\ntruncation = 4.4e-7\ndirection = 'up'\nsmallest_step = 1e-4"
     (failed,) = followed(chain_case("3700.0", points=60, more=more), tmp_path)
     assert failed.ending.startswith("failed: step below")
@@ -268,7 +275,7 @@ def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
 @pytest.mark.parametrize(
     ("change", "key"),
     [
-        # In a pass band.
+        # The frequency lies in a pass band.
         ("1000.0", "nnm.start_frequency"),
         ("", "nnm.start_frequency"),
         ("4000.0]\nstart_sites = [2", "nnm.start_sites"),
@@ -317,7 +324,7 @@ def test_options_that_do_not_go_together_are_refused(nnm, message):
 def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():
     case = breather_case(system="condensed", points=1, truncation=1e-7)
     table = case.model_dump(by_alias=True, exclude_none=True)
-    # Of four masses each: one more than the bound of 40,000 masses allows.
+    # A cell has four masses: the lattice has one cell more than the bound of 40,000 masses allows.
     table["lattice"] |= {"cells": 10_001}
     NnmCase.from_table(table)
 

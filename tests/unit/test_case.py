@@ -16,7 +16,7 @@ from vipetsc.case import Case, CaseError, DesignCase, LawCase, case_id
 from vipetsc.case.resolve import _round_down
 from vipetsc.lattice import Contact
 
-# A lattice of one's own, for which nothing has a default.
+# A lattice with a cell of its own: its contacts, drive and times have no defaults.
 PLAIN = {
     "name": "plain",
     "lattice": {
@@ -92,7 +92,7 @@ def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
     weaker = case.model_copy(update={"drive": case.drive.model_copy(update={"amplitude": 1.0})})
     assert weaker.model().drive.amplitude == 1.0
 
-    # What is sent to another rank is the keys alone.
+    # The keys alone are sent to another rank, without the model.
     sent = pickle.loads(pickle.dumps(case))
     assert sent == case
     assert sent.__dict__.keys() == case.model_dump().keys() == Case.model_fields.keys()
@@ -154,7 +154,7 @@ def test_a_value_of_no_type_of_its_key_is_refused_with_all_types():
     scaled = problems({}, "time.atol='scale'")["time.atol"]
     assert "must be a number or 'scaled' or 'paper'; did you mean 'scaled'?" in scaled
     assert "must be a whole number, a list or a table" in problems({}, "contacts.sites='a'")["contacts.sites"]
-    # A single table in TOML's brackets where there may be several.
+    # ``[drive.more]`` in a file is a single table, where the key takes a list of tables.
     more = problems({"drive": {"more": {"amplitude": 1.0}}})["drive.more"]
     assert more.endswith("must be a valid list of tables; write [[drive.more]]")
     # An item of a list is not a value of the key.
@@ -186,7 +186,7 @@ def test_automatic_sample_intervals_are_round():
 
 
 def test_the_identity_of_a_case_stays_what_folders_on_disk_bear():
-    # Another number here would make the program run again what lies in users' folders.
+    # With another identity the program would not recognise finished runs in users' folders and would run them again.
     assert case_id(Case.from_table(PLAIN)) == "7b0b028bc7785b85"
     assert case_id(Case.from_table(PLAIN, ["drive.amplitude=2.0"])) != case_id(Case.from_table(PLAIN))
 
@@ -275,7 +275,7 @@ def test_errors_travel_between_ranks():
 @pytest.mark.slow
 @given(st.text(max_size=30), st.text(max_size=10))
 def test_any_override_is_taken_or_refused(key, value):
-    """Nonsense raises a CaseError and nothing else."""
+    """An override that makes no sense raises a CaseError with its problems, and no other exception."""
     try:
         Case.load(overrides=[f"{key}={value}"])
     except CaseError as error:
@@ -315,6 +315,6 @@ def test_a_missing_file_of_samples_hides_no_problem_with_times():
 
 
 def test_a_key_whose_name_begins_with_that_of_an_invalid_one_is_checked_too():
-    """The type of ``clearance`` is wrong, and the size of ``clearance_minus``."""
+    """A wrong type of ``clearance`` does not hide that ``clearance_minus`` is too large."""
     found = problems({"contacts": {"clearance": "wide", "clearance_minus": 1e60}})
     assert list(found) == ["contacts.clearance", "contacts.clearance_minus"]

@@ -35,7 +35,7 @@ def test_keywords_give_the_case_of_the_table():
 
 
 def test_what_a_program_holds_is_taken():
-    """Arrays, tuples, numbers of numpy, paths, sections of another case are what a file has; None is a key left out."""
+    """Arrays, tuples, NumPy's numbers, paths and a case's sections stand for a file's values; None leaves a key out."""
     written = {"cell": {"masses": [0.01, 0.004], "springs": SPRINGS}, "cells": 60}
     # The types in which a program holds what a file has as lists and numbers.
     held = {"cell": {"masses": np.array([0.01, 0.004]), "springs": tuple(SPRINGS)}, "cells": np.int64(60), "ends": None}
@@ -114,7 +114,7 @@ def test_every_cell_can_be_drawn():
 
 
 def test_text_in_a_table_is_text():
-    """What a name holds is no markup; rows without a value are left out."""
+    """Titles and values are escaped, hence are no markup; rows without a value are left out."""
     html = html_table("<b>", [("a", "x < y"), ("gone", None), ("none", "")])
     assert "&lt;b&gt;" in html
     assert "x &lt; y" in html

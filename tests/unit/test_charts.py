@@ -16,7 +16,7 @@ from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import ContactPair, System
 
-# In clearances, on either side of rest: no mass is at rest, where the logarithmic chart ends.
+# A displacement in clearances, of either sign and never zero, where the logarithmic chart ends.
 displacement = st.floats(0.2, 5).flatmap(lambda value: st.sampled_from([value, -value]))
 
 
@@ -27,7 +27,7 @@ displacement = st.floats(0.2, 5).flatmap(lambda value: st.sampled_from([value, -
 )
 @settings(max_examples=60)
 def test_charts_encode_decode_and_differentiate(in_clearances, period, kind):
-    """Decoding inverts encoding, and the derivative is that of differences."""
+    """Decoding inverts encoding, and the derivative agrees with central differences."""
     x = CLEARANCE * np.array(in_clearances)
     gap = abs(x[1] - x[0]) / CLEARANCE
     # The grazing chart is singular at grazing itself.
@@ -71,10 +71,10 @@ def masses_in_contact(*pairs: tuple[int | None, int]) -> System:
 @pytest.mark.parametrize(
     ("pairs", "unknowns"),
     [
-        # A ring: its elongations add up to zero.
+        # The contacts form a ring, whose elongations add up to zero.
         (((0, 1), (1, 2), (2, 0)), {1: 0, 2: 1}),
         (((1, 0), (0, 1), (1, 2)), {0: 0, 2: 2}),
-        # A chain, and two contacts of one resonator, of which the last has its place.
+        # The contacts form a chain; then two have one resonator, whose unknown is the elongation of the last one.
         (((0, 1), (1, 2)), {1: 0, 2: 1}),
         (((None, 1), (0, 1)), {1: 1}),
     ],
@@ -96,7 +96,7 @@ def test_the_relative_chart_has_as_many_elongations_as_are_independent(pairs, un
 
 @pytest.mark.parametrize("contact", [0, 1])
 def test_the_root_of_a_gap_is_that_of_the_contact_that_grazes(contact):
-    """Of two contacts of one mass the chart has the root of the nearer one; the other's gap is no unknown."""
+    """The grazing chart of a mass with two contacts has the root of the gap that closes; the other is no unknown."""
     system = masses_in_contact((None, 1), (0, 1))
     # The first contact stands at its clearance of 0.1 m, the other one does not at its 0.11 m.
     x = np.array([0.3, 0.1, 0.05])

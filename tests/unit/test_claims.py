@@ -32,7 +32,7 @@ def contactless_curve(amplitude: list[float] | np.ndarray, value: list[float] | 
 def test_a_criterion_is_met_within_its_bounds_alone(low, width, value):
     high = low + width
     criterion = Criterion("x", "within", (low, high), "", "")
-    # Bounds are met with this much to spare, so that rounding decides nothing.
+    # Bounds have a tolerance of 1e-9, so that rounding does not decide.
     assert criterion.met(value) == (low - 1e-9 <= value <= high + 1e-9)
     assert not criterion.met(float("nan"))
     assert f"{low:.4g} to {high:.4g}" in str(criterion)
@@ -84,13 +84,13 @@ def test_a_growth_ends_at_the_first_value_that_is_high_enough():
     curve = contactless_curve([1.0, 2.0, 4.0, 8.0, 16.0], [0.3, 0.01, 0.6, 0.8, 1.0])
     assert curve.growth_ratio(0.1, 0.5) == 2.0
 
-    # What comes after the peak is no rise to it.
+    # A rise after the peak does not count.
     late = contactless_curve([1.0, 2.0, 8.0, 9.0], [0.01, 1.0, 0.05, 0.6])
     assert late.growth_ratio(0.1, 0.5) == 2.0
 
 
 def test_a_curve_that_stays_on_its_floor_does_not_grow():
-    # Ten times the floor is above all values, as of a sweep in which nothing touches.
+    # Ten times the floor is above all values, as in a sweep without contacts.
     floor = contactless_curve([1.0, 2.0, 4.0], [0.9, 1.0, 1.1])
     assert np.isnan(floor.growth_ratio(10.0, 0.55))
 
@@ -212,7 +212,7 @@ def test_a_number_on_either_side_of_its_threshold_decides(claim, criterion):
         inside = [low / high]
         outside = [(low - 1) / high]
     else:
-        # A hundredth of the larger bound, far above rounding; of a bound at zero a hundredth.
+        # The distance from a bound is a hundredth of the larger bound, or 0.01 where that is zero: far above rounding.
         size = 1e-2 * max(map(abs, finite((low, high)))) or 1e-2
         inside = finite((low + size, high - size))
         outside = finite((low - size, high + size))
@@ -266,7 +266,7 @@ def test_a_broken_file_is_named_and_stops_no_other_claim(tmp_path):
     claims = {row["id"]: row for row in measure_claims(tmp_path)}
     assert claims["C10"]["verdict"] == UNMEASURED
     assert "design.h5" in claims["C10"]["reason"]
-    # A report says the same wherever the files lie.
+    # The text of a report does not depend on the folder of its files.
     assert str(tmp_path) not in claims["C10"]["reason"]
 
     with h5py.File(file, "w") as incomplete:

@@ -25,7 +25,7 @@ OF_RECORD = "largest error of the mean over the record"
 OF_PERIOD = "mean error over a period of the drive"
 OUTSIDE = "largest fraction outside the paper's bands and gaps"
 IN_SPECTRUM = "largest difference of a part's fraction from that in the space-time spectrum"
-# Samples of the fields: 2000 Hz resolve the top band, which ends at 580 Hz.
+# Times of the samples in s: 4000 a second resolve frequencies up to 2000 Hz, and the top band ends at 580 Hz.
 TIME = np.arange(1500) * 2.5e-4
 
 
@@ -57,7 +57,7 @@ def on_an_edge(case: Case) -> np.ndarray:
     return beat[:, None, None] * np.ones((case.lattice.cells, 4))
 
 
-# Errors that a split may have, of energies (part, t).
+# Errors that a split into parts may have: each function takes and returns energies (part, t).
 
 
 def as_it_is(energy: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def put_bands(
     change: Callable[[np.ndarray], np.ndarray],
     laws: Sequence[str] = LAWS,
 ) -> None:
-    """Write the bands' energies of runs with such a ``velocity``, changed for the ``laws``."""
+    """Write the bands' energies of runs with the fields ``velocity(case)``, with an error ``change`` for ``laws``."""
 
     def content(case: Case) -> dict[str, Any]:
         cell = case.lattice.unit_cell()
@@ -163,7 +163,7 @@ def test_energy_is_counted_in_its_own_band():
     energy = part_energies(in_two_bands(case), cell.masses, TIME[1], parts.edges).total.mean(axis=1)
 
     share = dict(zip(parts.names, energy / energy.sum(), strict=True))
-    # What the record's ends spread over other bands is some thousandths.
+    # The ends of the record spread some thousandths of the energy over other bands.
     assert share["band 2"] == pytest.approx(0.7, abs=0.005)
     assert share["band 3"] == pytest.approx(0.3, abs=0.005)
 
@@ -176,7 +176,8 @@ def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch)
     root = np.sqrt(chain.masses())
     assert modal_error(SimpleNamespace(case=case)) < 1e-11
 
-    # Random motions, a thousand times faster than far, and the shapes of single modes.
+    # Thirty random motions, whose velocities in m/s are a thousand times their displacements in m, and thirty shapes
+    # of single modes at rest.
     rng = np.random.default_rng(5)
     u, v = rng.standard_normal((2, 30, 48)) / root
     v *= 1000.0
@@ -196,7 +197,10 @@ def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch)
 
 
 def put_design(root, lam, eta, out_of_phase):
-    """Write a search on a grid of 0.05, the best cell at ``lam`` and 0.045 below ``eta``, if ``out_of_phase`` there."""
+    """Write a search on a grid of 0.05, whose best cell lies at ``lam`` and 0.045 below ``eta``.
+
+    ``out_of_phase`` (lambda, eta) is nonzero in the cells that may be the optimum.
+    """
     folder = root / "design"
     folder.mkdir()
     grid = np.arange(2, 19) * 0.05

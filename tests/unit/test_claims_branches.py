@@ -86,7 +86,7 @@ def test_branches_on_either_side_of_their_thresholds_decide(tmp_path, change, ex
 
 
 def test_the_in_phase_branch_is_held_against_what_it_should_pass(tmp_path):
-    """One energy fold of the 35:1 tongue is missing, which is said; what lies above 6e9 J does not count."""
+    """The reason says that one of the 90 energy folds expected is missing; points above 6e9 J do not count."""
     for law in ("hertz", "bilinear"):
         put_branch(tmp_path, law)
     kind = np.repeat([1, 4, 5, 6, 6], [89, 62, 41, 316, 5])
@@ -115,7 +115,7 @@ def test_a_hertz_branch_without_fold_holds_in_part_and_is_named(tmp_path):
 
 
 def put_backbone(root: Path, exponent: float, scatter: float) -> None:
-    """Write the transfer over the energy, a power with logarithmic ``scatter``, and a branch's slope, a power -1."""
+    """Write a transfer that is a power of the energy with logarithmic ``scatter``, and a branch's slope, a power -1."""
     branch_energy = np.geomspace(0.03, 1e6, 60)
     energy = np.geomspace(0.1, 1e4, 12)
     rough = np.exp(scatter * (-1.0) ** np.arange(12))
@@ -164,7 +164,7 @@ def test_transfer_is_compared_with_the_slope_of_the_branch(tmp_path, exponent, s
 def put_portraits(root: Path, linearity: float) -> None:
     """Write the motion of one site: out of phase at 2 N, then rough, then both masses together at 1e4 N.
 
-    At 15 N it is the linear motion with the factor ``linearity``, and rough for the rest.
+    At 15 N the resonator has the linear motion with the factor ``linearity`` and the rough one with the rest of 1.
     """
     amplitudes = [2.0, 15.0, 1e4, 40.0]
     linearities = {2.0: 1.0, 15.0: linearity, 40.0: 0.0}
@@ -190,7 +190,7 @@ def put_portraits(root: Path, linearity: float) -> None:
         resonator = host
         if drive.amplitude in linearities:
             like = linearities[drive.amplitude]
-            # Above the driven band.
+            # The rough motion has a frequency in rad/s above the driven band.
             rough = np.sin(2700.0 * time)
             resonator = -like * host + (1 - like) * rough
         velocity = np.zeros((len(time), 12, 4))

@@ -186,7 +186,7 @@ def test_fits_of_three_points_do_not_count(decaying):
         set_fits(decaying, SPREAD, points=points)
         assert measure("C8", decaying).verdict == expected
 
-    # Nor are they printed as power laws, whatever their R^2.
+    # Such fits are not printed as power laws either, whatever their R^2.
     found = measure("C7", decaying)
     assert "no power law with 5 sites, spread: too few points (3)" in found.reason
     assert found.value["exponent, 5 sites, spread"] is None

@@ -17,7 +17,7 @@ CELLS = 160
 WAVENUMBERS = 2 * np.pi * np.arange(CELLS // 2 + 1) / CELLS
 DRIVEN = 5 * np.pi / 9
 AMPLITUDES = [0.1, 1.0, 10.0]
-# Shares of a run's energy at new wavenumbers, and of what returns from the site, as the paper has them.
+# Fractions of the energy at new wavenumbers and of the reflected energy at the three amplitudes, as in the paper.
 PAPER_NEW = (0.0, 0.5, 0.1)
 PAPER_REFLECTED = (0.0, 0.2, 0.8)
 
@@ -43,10 +43,10 @@ def put_scattering(
     off_branches: float = 0.0,
     error: float = 0.006,
 ) -> None:
-    """Write runs whose share ``new`` is spread over all wavenumbers, and of which ``reflected`` returns from the site.
+    """Write runs in which fractions of the energy spread over all wavenumbers (``new``) and are ``reflected``.
 
-    ``off_branches`` is the share of the medium run's spectrum that lies off the branches, ``error`` that of the
-    reconstruction by parts of the wavenumbers at the high amplitude.
+    ``off_branches`` is the fraction of the medium run's spectrum that lies off the branches, ``error`` the relative
+    error of the energy reconstructed from parts of the wavenumbers at the high amplitude.
     """
     table = {
         "lattice": {"preset": "diatomic", "cells": CELLS},

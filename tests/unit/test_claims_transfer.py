@@ -20,7 +20,10 @@ ONSET = 17.0
 def put_transfer(
     root: Path, maximum: float = 0.35, floor: float = 1e-4, one_site: float = 0.1, weak_below: float = 0.0
 ) -> None:
-    """Write the transfer of five sites, of at most ``maximum``, and of one; below ``weak_below`` N it is a fiftieth."""
+    """Write the transfer of five sites, of at most ``maximum``, and of one site, of at most ``one_site``.
+
+    It falls as the power -3/2 of the amplitude from the onset on; below ``weak_below`` N it is a fiftieth of that.
+    """
     table = {
         "lattice": {"preset": "four-band"},
         "drive": {"band": 2, "at": "max-group-velocity"},
@@ -39,7 +42,7 @@ def put_transfer(
         if amplitude < weak_below:
             highest *= 0.02
         transfer = highest * (amplitude / ONSET) ** -1.5 if amplitude > ONSET else 0.0
-        # The floor comes from the record's ends, but for a fiftieth.
+        # The floor of the whole record comes from its ends, but for a fiftieth.
         return {"ibtet": 0.02 * floor + transfer, "ibtet_whole": floor + transfer}
 
     put_sweep(root / "interband", table, content, episodes=lambda case: int(case.drive.amplitude > ONSET))
@@ -47,7 +50,7 @@ def put_transfer(
 
 @pytest.mark.slow
 def test_transfer_that_never_sets_in_is_measured(tmp_path):
-    """Where nothing touches there is a floor, but neither an onset nor a maximum."""
+    """Without contacts the transfer has a floor and no onset, and its maximum is that of the floor."""
     put_transfer(tmp_path, maximum=0.0)
     onset = measure("C11", tmp_path)
     assert onset.verdict == IN_PART
@@ -86,7 +89,7 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
 
 
 def put_scatter(root: Path) -> None:
-    """Write four samples of scattered clearances at an amplitude of each law and number of sites.
+    """Write four samples of scattered clearances at one amplitude for each law and number of sites.
 
     The transfer of each sample deviates from the amplitude as its first clearance does from the nominal one.
     """
@@ -125,7 +128,7 @@ def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
         name = f"4 samples of 2 % clearance scatter at {amplitude:.4g} N, {law}"
         mean = found.value[f"mean of {name}"]
         deviation = found.uncertainty[f"deviation of the {name}"]
-        # Four samples of a normal deviation of 2 %: some multiples of it to either side.
+        # Bounds for four samples of a normal deviation of 2 %, of the order of that deviation.
         assert 0 < abs(mean / amplitude - 1) < 0.05
         assert 0.002 < deviation / amplitude < 0.06
 
@@ -159,7 +162,7 @@ def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, ons
 @pytest.mark.slow
 @pytest.mark.parametrize(("weak_below", "expected"), [(0.0, 10**0.25), (90.0, 10.0)])
 def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
-    # Amplitudes are 10^(1/4) apart: one step, or four steps until the transfer is no longer weak.
+    # Amplitudes are 10^(1/4) apart: the onset takes one step, or four where the transfer is weak below 90 N.
     put_transfer(tmp_path, weak_below=weak_below)
     ratio = measure("C11", tmp_path).value["ratio of amplitudes from the floor to half the maximum, hertz"]
     assert ratio == pytest.approx(expected, rel=1e-5)
@@ -178,7 +181,7 @@ def test_transfer_of_another_size_holds_in_part(tmp_path):
 
 
 def put_amplitudes(root: Path, content: Callable[[Case], dict[str, Any]]) -> None:
-    """Write three amplitudes of the four-band lattice with both laws, with fields."""
+    """Write a sweep of the four-band lattice over three amplitudes and both laws, which keeps its fields."""
     table = {
         "lattice": {"preset": "four-band", "cells": 30},
         "drive": {"band": 2, "at": "max-group-velocity", "cycles": 10},

@@ -1,4 +1,4 @@
-"""Contact DoFs and their groups: which of them are solved for together, which are left alone in a step."""
+"""Groups of contact DoFs: DoFs that are solved for together, and groups that a step need not solve for."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from vipetsc.dynamics.propagator.stencil import exchange
 
 
 def as_lists(groups: Groups) -> list[list[int]]:
-    """Return the DoFs of each group: sites count from 0, drives from -1 downwards."""
+    """Return a list of the DoFs of each group: sites count from 0, drives from -1 downwards."""
     return [part.tolist() for part in np.split(groups.numbers, groups.first[1:-1])]
 
 
@@ -35,7 +35,7 @@ def test_clusters_that_cannot_touch_are_left_alone():
 
 
 def test_a_rank_far_from_contacts_and_drives_has_empty_tables():
-    """Tables of no group are empty in every part."""
+    """A rank without groups has tables and responses without entries."""
     model, layout, series, halo = chain_parts("fixed", 1e-4, 1e-14, sites=(4, 12, 20))
     nothing = Groups(numbers=np.zeros(0, np.int64), first=np.zeros(1, np.int64))
 
@@ -48,7 +48,7 @@ def test_a_rank_far_from_contacts_and_drives_has_empty_tables():
 
 
 def test_dofs_within_reach_are_grouped_across_a_periodic_end():
-    """Sites two cells apart are one group at reach 2; in a ring, the last cell is next to the first."""
+    """Sites two cells apart are one group if motions reach 2 cells; in a ring, the last cell is next to the first."""
 
     def grouped(ends: str, reach: int) -> list[list[int]]:
         model = small_case(lattice={"ends": ends}, contacts={"sites": [2, 12, 14, 23]}).model()
@@ -62,7 +62,7 @@ def test_dofs_within_reach_are_grouped_across_a_periodic_end():
 
 
 def test_dofs_whose_next_cells_are_within_reach_are_grouped():
-    """A site between neighbouring cells counts from either cell: 12 to 13 and 14 to 15 are one cell apart."""
+    """A site between neighbouring cells is in both: the sites at 12 and 13 and at 14 and 15 are one cell apart."""
 
     def grouped(ends: str, reach: int) -> list[list[int]]:
         contacts = {"sites": [2, 12, 14, 22], "pair": [1, 1], "next_cell": True}

@@ -32,7 +32,7 @@ def one_substep(cluster: Cluster, substep: Substep) -> Trial:
 
 
 def test_nodes_have_the_order_of_gauss_and_follow_roots():
-    """Eight nodes integrate powers up to 15; those of an onset or exit also the power 3/2 of Hertz's law."""
+    """Eight nodes integrate powers up to 15 exactly, nodes of an onset or exit also the power 3/2 of Hertz's law."""
     table = collocation(4)
     position = table.position
     weight = table.weight
@@ -43,7 +43,7 @@ def test_nodes_have_the_order_of_gauss_and_follow_roots():
     assert weight[EXIT] @ (1 - position[EXIT]) ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
     assert abs(weight[PLAIN] @ position[PLAIN] ** 1.5 - 1 / 2.5) > 1e-8
 
-    # The last two coefficients of a polynomial of lower degree vanish; those of Legendre's own are found.
+    # ``tail`` yields the last two Legendre coefficients: zero for a lower degree, 0 and 1 for the last polynomial.
     x = position[PLAIN]
     assert np.abs(table.tail @ x ** (NODES - 3)).max() < 1e-14
     legendre = np.polynomial.legendre.legval(2 * x - 1, np.eye(NODES)[NODES - 1])
@@ -52,7 +52,7 @@ def test_nodes_have_the_order_of_gauss_and_follow_roots():
 
 @pytest.mark.parametrize("kind", [PLAIN, ONSET, EXIT])
 def test_a_linear_contact_is_an_oscillator(kind):
-    """A mass on a linear stop moves as a sine; the moments of the force are those of that motion."""
+    """A mass m on a linear stop moves as w - 1 = (V/omega) sin omega t, under the force -m omega V sin omega t."""
     cluster = mass_on_stop()
     interval = cluster.interval
     begin = 0.25
@@ -65,17 +65,20 @@ def test_a_linear_contact_is_an_oscillator(kind):
     assert trial.taylor[0, 0] - 1 == pytest.approx(SPEED / RATE * np.sin(phase), rel=1e-9)
     assert trial.taylor[0, 1] / interval == pytest.approx(SPEED * np.cos(phase), rel=1e-10)
 
-    # The moments are those of the force about the end of the step; the first one is the momentum it took.
+    # Moments of the force are taken about the end of the step; the zeroth one is the change of the momentum.
     assert cluster.moments[0, 0] == pytest.approx(MASS * SPEED * (np.cos(phase) - 1), rel=1e-9)
     t = np.linspace(0, length * interval, 20001)
     force = -MASS * RATE * SPEED * np.sin(RATE * t)
-    # The trapezoidal rule over 20000 intervals is itself good to some 1e-9 of the integral.
+    # The trapezoidal rule over 20000 intervals has an error of some 1e-9 of the integral.
     assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - begin - t / interval), t), rel=1e-7)
     assert cluster.energy[0] == 0.0
 
 
 def test_a_cubic_spring_moves_a_mass_as_jacobis_cosine():
-    """u = A cn(omega t, 1/2) with omega^2 = A^2 c/m exactly, of an order above 14; the estimate is no smaller."""
+    """The exact motion under the force -c u^3 is u = A cn(omega t, 1/2) with omega^2 = A^2 c/m.
+
+    The error falls with an order above 14, and its estimate is not smaller.
+    """
     omega = 1e4
     amplitude = 1e-3
     cubic = MASS * (omega / amplitude) ** 2
@@ -96,7 +99,7 @@ def test_a_cubic_spring_moves_a_mass_as_jacobis_cosine():
         error = np.abs(end - exact(begin + phase)) / [amplitude, amplitude * omega]
         errors.append(error.max())
 
-        # All of the spring's work comes back, and none is booked.
+        # A spring dissipates nothing: no energy is booked.
         assert cluster.energy[0] == 0.0
         assert cluster.moments[0, 0] == pytest.approx(MASS * (end[1] - v), rel=1e-9, abs=1e-9 * MASS * abs(v))
         allowed = cluster.rtol * np.abs(trial.v[0]).max() + cluster.atol
@@ -116,7 +119,9 @@ def cluster_on(part: str) -> Cluster:
 
 @pytest.mark.parametrize("part", ["stop", "spring"])
 def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
-    """Picard's iteration contracts below h omega = 13: of 60 nothing is kept, and a shorter substep has the same bits.
+    """A substep after one that did not converge has the bits of a substep in a new cluster.
+
+    Picard's iteration contracts below h omega = 13 and does not converge for 60.
 
     Forces that have grown may still converge in the next substep; its rounding would then depend on a trial in vain.
     """
@@ -132,7 +137,7 @@ def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
 
 
 def test_a_motion_that_overflows_does_not_stop_the_next_substep():
-    """Beside motions near the largest float every change is infinite, over a scale below 1 m."""
+    """A motion near the largest float, divided by a scale below 1 m, overflows; the next substep converges."""
     cluster = mass_on_stop()
     cluster.contacts["scale"] = 1e-4
     assert not collocate(cluster, cluster.trial, Substep(PLAIN, 1e5 / RATE / cluster.interval))
@@ -140,7 +145,7 @@ def test_a_motion_that_overflows_does_not_stop_the_next_substep():
 
 
 def test_a_spring_that_comes_to_rest_has_changed_by_its_elongation_over_the_scale():
-    """As any other change: the size of waves, 1e-5 m, is the scale of an elongation of 0."""
+    """A change of 3e-6 m to an elongation of 0 is measured in the scale of the spring, 1e-5 m: it is 0.3."""
     cluster = mass_on_cubic_spring(1.0)
     cluster.springs["scale"] = 1e-5
     cluster.trial.w[0] = 3e-6
@@ -149,7 +154,7 @@ def test_a_spring_that_comes_to_rest_has_changed_by_its_elongation_over_the_scal
 
 
 def test_springs_accelerate_the_sites_next_to_them():
-    """w'' has what the spring's force at its elongation does at once: H^2/mass times it, over H^2."""
+    """w'' at a site is the free motion's second derivative less c u^3/m, for a spring of the elongation u nearby."""
     cubic = mass_on_cubic_spring(2e3)
     open_stop = mass_on_stop()
     open_stop.contacts["mode"] = FREE
@@ -176,7 +181,7 @@ def test_damping_takes_the_energy_that_is_booked():
     v = trial.taylor[0, 1] / cluster.interval
     lost = 0.5 * MASS * (SPEED**2 - v**2 - (RATE * x) ** 2)
     assert cluster.energy[0] == pytest.approx(lost, rel=1e-9)
-    # Of an initial energy of 1/2 m v^2 at least 2 % is lost: the comparison is not one of roundings.
+    # More than 2 % of the initial energy m v^2/2 is lost: the comparison is not one of roundings.
     assert lost > 1e-2 * MASS * SPEED**2
 
 
@@ -187,10 +192,11 @@ def test_the_error_estimate_falls_as_the_order_says():
         cluster = mass_on_stop()
         trial = one_substep(cluster, Substep(PLAIN, length))
         ratios.append(error_ratio(cluster, trial, length))
-    # The last two coefficients fall as h^6 and h^7, times the length.
+    # The estimate is the last two coefficients, which fall as h^6 and h^7, times the length h.
     assert 6 < np.log2(ratios[0] / ratios[1]) < 8.5
 
-    # rtol |w'_minus| + atol: 1e-10 * 0.5 + 1e-12 till now, 1e-10 * 1.0 + 1e-12 with twice the approach velocity.
+    # The error allowed is rtol |w'_minus| + atol, with the approach velocity w'_minus: 1e-10 * 0.5 + 1e-12 above, and
+    # 1e-10 * 1.0 + 1e-12 here.
     cluster.contacts["approach"] = 1.0
     assert error_ratio(cluster, cluster.trial, 0.4) == pytest.approx(ratios[1] * 5.1e-11 / 1.01e-10)
 
@@ -210,7 +216,7 @@ def test_a_sites_acceleration_is_that_of_the_free_motion_and_of_the_force():
 
 
 def test_responses_are_added_up_over_all_terms():
-    """A constant force F on an oscillator: m omega^2 w = F (1 - cos omega t), m omega w' = F sin omega t."""
+    """A constant force F moves an oscillator by m omega^2 w = F (1 - cos omega t), m omega w' = F sin omega t."""
     omega_h = 1.2
     terms = 8
     cluster = mass_on_stop()

@@ -53,7 +53,7 @@ hits = [sum(scaled.stats.cache_hits.values()), sum(twice.entry.stats.cache_hits.
 print(json.dumps([values, hits, environment == dict(os.environ) and folder == numba.config.CACHE_DIR]))
 """
 
-# To load numba and what it compiles with takes most of the time of a process that asks.
+# Loading numba takes most of the time of a process that runs ASK, hence one process loads it and forks for each run.
 SERVER = f"""
 import os, sys, numba
 sys.dont_write_bytecode = True  # files change within the second by which Python tells versions of them apart
@@ -72,7 +72,7 @@ for folder in sys.stdin:
 
 @pytest.fixture
 def ask(package, tmp_path):
-    """Call a function that imports the package in a copy of a Python that has loaded numba and no more.
+    """Return a function that imports the package in a fork of a Python process that has loaded numba alone.
 
     It returns values of the kernels, their cache hits, and whether the import changed nothing outside.
     """
@@ -116,13 +116,16 @@ def package(tmp_path):
 
 
 def environment_of(folder: Path) -> dict[str, str]:
-    """The environment of a process in which the package below is imported, with a user's cache of its own."""
+    """Return the environment of a process that imports the package in ``folder``, with the user's cache there, too."""
     return {"PYTHONPATH": ".", "XDG_CACHE_HOME": str(folder / "of-user")}
 
 
 @pytest.mark.slow
 def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_path):
-    """Hits are those of the kernel in ``inner``, of the one in ``outer`` that calls it, and of the callback."""
+    """A kernel is loaded from the cache until its file, a file that it calls or a constant that it uses changes.
+
+    The three hits are of the kernel in ``inner``, of the kernel in ``outer`` that calls it, and of the callback.
+    """
     folder = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
 
@@ -130,11 +133,11 @@ def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_pa
     (folder / "plain.py").write_text("import scipy\n")
     assert ask() == [[12.0, 7.0], [1, 1, 1], True]
 
-    # A kernel that others call.
+    # A change of a kernel that others call compiles all of them.
     (folder / "inner.py").write_text(INNER.replace("SCALE * x", "SCALE * x + 1.0"))
     assert ask() == [[15.0, 8.0], [0, 0, 0], True]
 
-    # Kernels that none calls.
+    # A change of a file whose kernels no other file calls compiles that file alone.
     (folder / "outer.py").write_text(OUTER.replace("+ SHIFT", "+ SHIFT + 0.0"))
     assert ask() == [[15.0, 8.0], [1, 0, 0], True]
     (folder / "constants.py").write_text(CONSTANTS.replace("2.0", "3.0"))
@@ -145,7 +148,7 @@ def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_pa
     # Four versions of inner.py, and five of outer.py.
     assert len(list(tmp_path.glob("of-user/vipetsc/kernels-*"))) == 4 + 5
 
-    # Those of an equal package elsewhere, whose files are of another time, are the same.
+    # An equal package elsewhere, whose files have other times, finds the same kernels.
     shutil.copytree(folder, tmp_path / "elsewhere" / "vipetsc", copy_function=shutil.copyfile)
     assert ask(tmp_path / "elsewhere") == [[31.0, 12.0], [1, 1, 1], True]
 
@@ -155,7 +158,7 @@ def test_a_kernel_is_translated_only_where_python_calls_it():
     quadruple = kernel.Kernel(lambda x: double(double(x)), numba.njit, {})
     assert quadruple(3.0) == 12.0
 
-    # As part of its caller it has no machine code, and none was compiled for Python.
+    # ``double`` is compiled into its caller: it has neither machine code of its own nor an entry for Python.
     (found,) = double.overloads.values()
     assert not found.library.codegen._engine.is_symbol_defined(found.fndesc.llvm_func_name)
     assert "entry" not in vars(double)
@@ -172,7 +175,7 @@ def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
 
 @pytest.fixture
 def forgotten():
-    """What is known of folders for kernels is forgotten before and after a test, which has others."""
+    """Clear the caches of functions that choose a folder for kernels, before and after a test with other folders."""
     functions = (kernel_cache.kernel_cache, kernel_cache.can_keep, kernel_cache.obstacle, kernel_cache.remove_oldest)
     for function in functions:
         function.cache_clear()
@@ -183,7 +186,7 @@ def forgotten():
 
 @pytest.mark.usefixtures("forgotten")
 def test_kernels_are_in_the_users_cache_or_else_in_the_package(package, tmp_path, monkeypatch):
-    """Where modes of lattices are kept, too; on nodes without a home in a package that can be written."""
+    """Kernels are in the user's cache, as modes of lattices are, or in the package if that cache cannot be written."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of-user"))
     kernels = kernel_cache.kernel_cache(package, package / "outer.py")
     assert kernels.parent == cache_folder() == tmp_path / "of-user" / "vipetsc"
@@ -254,7 +257,7 @@ def test_a_cache_that_cannot_be_written_is_named_once(caplog, monkeypatch):
     (record,) = caplog.records
     assert f"compiling kernels at every start; the cache {folder} cannot be written" in record.getMessage()
 
-    # Of several ranks the first says it for all.
+    # Rank 1 is silent, since rank 0 says it for all.
     kernel_cache.can_keep.cache_clear()
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "1")
     assert not kernel_cache.can_keep(folder)
@@ -275,7 +278,7 @@ def test_kernels_work_without_a_cache(tmp_path):
 
 @pytest.mark.slow
 def test_that_kernels_are_compiled_is_said_once(package, tmp_path):
-    """The first process says it in one line, on the first rank alone; the next finds the kernels and says nothing."""
+    """The first process reports the compiling in one line, on rank 0 alone; the next finds the kernels, silently."""
 
     def say(**environment: str) -> list[str]:
         environment = environment_of(tmp_path) | environment

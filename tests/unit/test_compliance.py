@@ -29,9 +29,9 @@ RICH = UnitCell(
 # The pair carries the lattice's tension, so that a static force at one site moves the others.
 TENSE = replace(four_band("calibrated"), host=0, resonator=3)
 CELLS = {"four-band": four_band("calibrated"), "diatomic": diatomic(), "rich": RICH, "tense": TENSE}
-# In bands and gaps, far above all bands, damped, with negative real parts, and almost imaginary.
+# Frequencies in rad/s in bands and gaps, far above all bands, damped, with negative real parts, almost imaginary.
 FREQUENCIES = [123.4, 1023.27, 1700.0, 3000.0 - 3j, 9000.0, 40000.0, -800.0 - 20j, 50.0 - 200j]
-# The paper's drive, in band 2.
+# The frequency of the paper's drive in rad/s, in band 2.
 DRIVEN = 1023.27
 
 
@@ -41,7 +41,7 @@ def chain_of(cell: UnitCell, cells: int, sites: Sequence[int], ends: str = "fixe
 
 
 def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference over the largest value."""
+    """Return the largest difference over the largest expected value."""
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
@@ -55,7 +55,7 @@ def site_rows(chain: Chain) -> np.ndarray:
     return rows
 
 
-# A chain of one cell, of two, and contacts at ends, next to each other and far apart.
+# Chains (cells, sites) of one and two cells, and with contacts at ends, next to each other and far apart.
 FINITE = [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))]
 
 
@@ -95,7 +95,7 @@ def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
     for omega in (0.0, 400 - 40j, DRIVEN - 40j, 3100.0 - 90j, 8000.0):
         assert relative_error(WaveCompliance(chain).at(omega), infinite.at(omega)) < 1e-10
 
-    # On the real axis it is the limit from below, where waves go outwards.
+    # On the real axis the compliance is the limit from below, where waves go outwards.
     on_axis = infinite.at(DRIVEN)
     assert relative_error(on_axis, infinite.at(DRIVEN - 1e-6j)) < 1e-6
     assert infinite.at(-DRIVEN)[0, 0, 1] == on_axis[0, 0, 1].conj()
@@ -138,7 +138,7 @@ def test_an_incident_wave_leaves_with_its_flux(name, band, direction):
 
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize(("band", "direction"), [(1, 1), (2, 1), (2, -1)])
-# An elastic spring, and one that takes energy.
+# The first spring is elastic, the second one takes energy.
 @pytest.mark.parametrize("spring", [3e3, 3e3 * (1 + 0.2j)])
 def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band, direction, spring):
     cell = CELLS[name]
@@ -153,7 +153,7 @@ def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band
     leaving = compliance.outgoing(omega, spring * w, wave, 1.0)
     assert leaving.sum() + taken == pytest.approx(wave.flux, rel=1e-11)
     assert leaving.min() >= 0
-    # Beyond the sites the fields are those of the waves that leave: w comes out of them too.
+    # The displacements by the incident wave and the springs' forces have the same w.
     u = wave.field(chain.sites) + compliance.field(omega, spring * w, chain.sites)
     assert np.allclose(u[:, cell.resonator] - u[:, cell.host], w, rtol=1e-11)
 
@@ -172,12 +172,12 @@ def test_the_flux_is_energy_times_group_velocity():
 
 
 def test_a_long_lattice_costs_what_a_short_one_does():
-    """The number of unknowns does not grow, and with losses the answers are those of the infinite lattice."""
+    """The number of unknowns does not grow with the cells; with losses a long lattice is as an infinite one."""
     cell = CELLS["four-band"]
     long = chain_of(cell, 1_000_000, (500_000,))
     assert WaveCompliance(chain_of(cell, 40, (20,))).cells == [0, 20, 39]
     assert WaveCompliance(long).cells == [0, 500_000, 999_999]
-    # Such a wave, at 429 cells/s, falls e times within 4300 cells.
+    # A wave of this frequency, at 429 cells/s, decays by a factor e within 4300 cells.
     omega = DRIVEN - 0.1j
     assert relative_error(WaveCompliance(long).at(omega), WaveCompliance(long, infinite=True).at(omega)) < 1e-11
 
@@ -187,12 +187,12 @@ def test_a_long_ring_has_the_sum_over_its_bloch_waves():
     cells = 10_007
     ring = chain_of(cell, cells, (5,), "periodic")
     expected = bloch_sum(cell, 2 * np.pi * np.arange(cells) / cells, DRIVEN)
-    # Undamped, a frequency lies near poles, whose distances cancel digits.
+    # Without damping the frequency lies near poles, and differences between it and them lose digits.
     assert WaveCompliance(ring).at(DRIVEN)[0, 0, 0] == pytest.approx(expected, rel=1e-7)
 
 
 def test_an_infinite_lattice_is_at_rest_beyond_static_forces():
-    """Opposite forces stretch the cells between them; beyond, all cells are shifted alike on either side."""
+    """Static forces at two pairs strain the cells between them; beyond, all cells of a side are shifted alike."""
     compliance = WaveCompliance(chain_of(CELLS["four-band"], 30, (10, 14)), infinite=True)
     field = compliance.field(0.0, [1.0, -0.3], [-60, -20, 9, 15, 40, 90])
     assert field[0] == pytest.approx(field[1], rel=1e-9)

@@ -33,7 +33,7 @@ OMEGA = 0.77
 
 
 class DefinedCompliance:
-    """G = b^T (K - omega^2 M)^-1 b of a system with dense matrices, solved for at each frequency."""
+    """Compliance G = b^T (K - omega^2 M)^-1 b of a system with dense matrices, solved for at each frequency."""
 
     def __init__(self, masses: np.ndarray, stiffness: np.ndarray, rows: np.ndarray) -> None:
         self.masses = masses
@@ -53,7 +53,7 @@ def random_harmonics(forces: SiteForces, order: int, seed: int, symmetry: Symmet
     """Random harmonics (pairs, order + 1) that pass the clearances; ``at rest`` ones are odd and at rest at phase 0."""
     rng = np.random.default_rng(seed)
     z = rng.normal(size=(forces.pairs, order + 1)) + 1j * rng.normal(size=(forces.pairs, order + 1))
-    # They fall as those of a smooth motion, and the first one passes the clearances.
+    # Harmonics fall as in a smooth motion, and the first one passes the clearances.
     z *= 0.7 ** np.arange(order + 1)
     z[:, 0] = 0.2 * z[:, 0].real
     z[:, 1] += 2
@@ -74,7 +74,7 @@ def random_balance(forces: SiteForces, order: int, symmetry: Symmetry) -> Harmon
 
 
 def harmonics_of(samples: np.ndarray, orders: int) -> np.ndarray:
-    """One-sided harmonics of a period sampled uniformly."""
+    """Return the one-sided harmonics (..., orders) of a period sampled uniformly along the last axis."""
     harmonics = np.fft.rfft(samples)[..., :orders] / samples.shape[-1] * 2
     harmonics[..., 0] /= 2
     return harmonics
@@ -96,7 +96,7 @@ def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
     pairs = list(zip(w, forces.contacts, strict=True))
     sampled = np.array([law.elastic_force(w - s.plus) - law.elastic_force(-w - s.minus) for w, s in pairs])
     potential = [(law.elastic_energy(w - s.plus) + law.elastic_energy(-w - s.minus)).mean() for w, s in pairs]
-    # 2**18 samples of a force that begins linearly: its kinks are off by half a sample, squared.
+    # A kink of the force lies up to half a sample beside one of the 2**18 samples; the error goes with its square.
     assert series.forces == pytest.approx(harmonics_of(sampled, 2 * order + 1), abs=1e-9 * np.abs(sampled).max())
     assert series.potential == pytest.approx(potential, rel=1e-9)
     assert np.abs(series.loss).max() < 1e-10
@@ -118,7 +118,7 @@ def test_a_dissipative_contact_loses_the_work_of_its_force(law):
 
     series = forces.series(np.array([[0.0, 1.0]], complex), OMEGA)
 
-    # w = cos theta passes -1/2 and 1/2 with |w'| = sqrt(3)/2 and is back there symmetrically.
+    # w = cos theta passes -1/2 and 1/2 with |dw/dtheta| = sqrt(3)/2 and returns there symmetrically.
     theta = np.linspace(-np.pi / 3, np.pi / 3, 400001)
     approach = OMEGA * np.sqrt(0.75)
     force = law.force(np.cos(theta), 0.5, -OMEGA * np.sin(theta), approach)
@@ -149,7 +149,7 @@ def test_derivatives_are_those_of_the_residual(law, symmetry):
     rate = balance.rate(x, OMEGA, shift)
 
     assert_derivatives_by_differences(balance, x, shift, jacobian)
-    # Of a force with a floor of the approach velocity, a small part of the derivative is left out.
+    # The derivative of a force with a floor of the approach velocity omits a small part.
     if not law.approach_floor:
         step = 1e-6
         ahead = balance.residual(x, OMEGA + step, shift)
@@ -159,7 +159,7 @@ def test_derivatives_are_those_of_the_residual(law, symmetry):
 
 @pytest.mark.parametrize("symmetry", ["odd", "any"])
 def test_a_drive_adds_its_term_to_the_residual_of_every_motion(symmetry):
-    """The residual is linear in the linear motion, and its part is that of all the orders that this motion has."""
+    """The residual is linear in the driven linear motion: with and without it, residuals differ by ``drive_term``."""
     forces = hardening_forces()
     balance = random_balance(forces, 5, symmetry)
     x = balance.pack(random_harmonics(forces, 5, 2, symmetry))
@@ -175,7 +175,7 @@ def test_a_drive_adds_its_term_to_the_residual_of_every_motion(symmetry):
 def assert_derivatives_by_differences(
     balance: HarmonicBalance, x: np.ndarray, shift: np.ndarray, jacobian: np.ndarray
 ) -> None:
-    """``jacobian`` agrees with central differences of the residual, whose error is 1e-8 with this step."""
+    """Assert that ``jacobian`` agrees with central differences of the residual, whose error is 1e-8 with this step."""
     step = 1e-6
     columns = []
     for e in np.eye(balance.size):
@@ -187,7 +187,7 @@ def assert_derivatives_by_differences(
 
 @pytest.mark.parametrize("law", [CONSERVATIVE[1], DISSIPATIVE[0]])
 def test_a_growing_perturbation_has_the_derivative_of_its_frozen_growth(law):
-    """Over one episode, exp(mu theta) dz is a perturbation like another, and mu = i shifts the orders by one."""
+    """A perturbation exp(mu theta) dz with mu = i has the derivative of a periodic one whose orders are one higher."""
     series = SiteForces([Stops.both(law, 0.5)]).series(np.array([[0.1, 1.0, 0.2j, 0.1]]), OMEGA)
     orders = np.arange(-3, 4)
     growing = series.jacobian(1j, orders[:-1])
@@ -219,7 +219,7 @@ def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_re
     assert series.forces[0] == pytest.approx([6.0, 3.0, 0.0], abs=1e-13)
     assert series.closed == [1.0]
 
-    # Its loss goes with the approach velocity of an onset that there is not.
+    # The loss depends on the approach velocity of an onset, which a permanent contact does not have.
     with pytest.raises(ArithmeticError, match="never separates"):
         SiteForces([Stops.both(DISSIPATIVE[0], 1.0)]).series(z, OMEGA)
 
@@ -234,7 +234,7 @@ def test_the_solution_does_not_depend_on_the_shift():
     x = balance.pack(random_harmonics(forces, 5, 2, "odd"))
     z = balance.unpack(x)
     force = balance.series(x, OMEGA).forces[:, :6]
-    # Any motion is a solution under the linear motion Z + G F.
+    # Any motion Z with contact forces F is a solution under the linear motion Z + G F.
     linear = z + np.einsum("kij,jk->ik", balance.compliance.at(np.arange(6) * OMEGA), force)
     for shift in (balance.shift(OMEGA), -balance.shift(OMEGA)):
         assert balance.residual(x, OMEGA, shift, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)
@@ -263,11 +263,11 @@ def test_a_weight_multiplies_the_compliance_of_harmonics_above_the_first(symmetr
 
 
 def test_the_shift_is_the_effective_mass_of_the_system_whatever_the_weight():
-    """The compliance is shifted by k^2 omega^2 m, and G falls as -1/(omega^2 m) beyond all modes."""
+    """Far above all modes the shift of order k is k^2 omega^2 m with the effective mass m: there G = -1/(omega^2 m)."""
     forces = hardening_forces()
     whole = random_balance(forces, 9, "odd")
     mass = 1 / np.diag(whole.compliance.rows @ whole.compliance.rows.T).mean()
-    # Its stiffnesses are of the order 10, so that at 1e3 rad/s the inertia alone is left.
+    # Stiffnesses are of the order 10 N/m: at 1e3 rad/s the inertia alone counts.
     omega = 1e3
     for weight in (0.1, 1.0):
         shift = whole.weighted(weight).shift(omega)
@@ -283,7 +283,7 @@ def gap_motions(**options: object) -> ConservativeMotions:
 
 
 def record_weights(monkeypatch) -> list[float]:
-    """The weights with which the harmonics above the first are tried from now on."""
+    """Return a list that receives each weight with which the harmonics above the first are tried from now on."""
     tried: list[float] = []
     weighted = HarmonicBalance.weighted
 
@@ -306,7 +306,7 @@ def test_the_harmonics_above_the_first_are_brought_in_by_growing_weights(monkeyp
 
 def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(monkeypatch):
     tried = record_weights(monkeypatch)
-    # No change is small enough: steps of 0.1 times powers of 0.4, until the next one is below the smallest.
+    # No change is small enough: steps are 0.1 times powers of 0.4, until the next one is below the smallest step.
     monkeypatch.setattr(conservative, "FURTHEST", 0.0)
     reason = r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first, the motion changes by more than"
     with pytest.raises(ContinuationError, match=reason) as error:
@@ -351,7 +351,7 @@ def test_a_weight_cut_to_1_in_vain_is_followed_by_a_smaller_one(monkeypatch):
 
     monkeypatch.setattr(HarmonicFrame, "solve", fail_once_at_1)
     gap_motions().in_gap(2.1, np.array([1.0]))
-    # Of the step of 0.0744 to the weight 1 a fraction of 0.4, then 1.6 times as much, and what is left.
+    # The step of 0.0744 to the weight 1 is cut to 0.4 of it; the next one, 1.6 times as long, ends at 1.
     assert tried == pytest.approx([0.1, 0.26, 0.516, 0.9256, 1.0, 0.95536, 1.0])
 
 
@@ -367,11 +367,14 @@ def coupled_masses(masses: int, coupling: float) -> ConservativeMotions:
 @pytest.mark.parametrize("coupling", [0.3, 1.0])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_contacts_that_feel_one_another_have_the_motion_of_one_mass_on_its_share_of_the_springs(sign, coupling):
-    """By symmetry: in phase the spring between two equal masses is at rest, out of phase its middle is."""
+    """Two equal masses move as one mass on 1 + 2 c - c N/m in phase and 1 + 2 c + c N/m out of phase.
+
+    The spring c between them is not strained in phase; out of phase its middle is at rest.
+    """
     omega = 1.05 * np.sqrt(1 + 3 * coupling)
     point = coupled_masses(2, coupling).in_gap(omega, np.array([1.0, sign]))
 
-    # To the wall and to the neighbour there are springs of the same stiffness.
+    # A mass has springs of the stiffness ``coupling`` to a wall and to its neighbour, and one of 1 N/m.
     share = 1 + 2 * coupling - sign * coupling
     compliance = DefinedCompliance(np.ones(1), np.array([[share]]), np.eye(1))
     forces = SiteForces([Stops.both(CONSERVATIVE[1], 1.0)])
@@ -382,7 +385,7 @@ def test_contacts_that_feel_one_another_have_the_motion_of_one_mass_on_its_share
 
 
 def test_a_motion_with_other_signs_is_not_taken_for_the_one_that_is_asked_for():
-    """From each pair's own motion Newton's method finds three masses in phase here, though the middle one has -1."""
+    """A motion in phase, to which Newton's method converges here, is refused where the middle mass has the sign -1."""
     with pytest.raises(ContinuationError, match="no breather at"):
         coupled_masses(3, coupling=1.0).in_gap(2.20605, np.array([1.0, -1.0, 1.0]))
 
@@ -401,7 +404,7 @@ def test_the_state_of_rest_is_no_motion():
 
 
 def test_folds_are_sought_where_both_motions_have_contact():
-    """The frequency of linear motions changes by rounding alone, whose sign tells nothing."""
+    """Frequencies of linear motions differ by rounding alone, hence a change of sign between them is no fold."""
     motions = one_mass(truncation=1e-3)
     linear = motions.from_mode(np.array([0.99]), 1.0)
     touching = motions.from_mode(np.array([1.05]), 1.0)
@@ -430,7 +433,7 @@ def one_mass(**options: object) -> ConservativeMotions:
 
 
 def test_a_start_whose_guess_needs_fewer_harmonics_than_the_motion_has_enough():
-    """The guess is within the bounds of the truncation, the motion found with its harmonics is not."""
+    """A motion whose truncation is too large with the harmonics of its guess gets more harmonics."""
     motions = one_mass(truncation=4e-4)
     z = np.array([1.01])
     guess = motions._guess(motions.one_harmonic(z), 1.0)

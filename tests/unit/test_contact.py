@@ -1,4 +1,4 @@
-"""The compiled contact law against its formulas, the search of a step for changes, and landings."""
+"""The compiled contact law against its formulas, the search for changes within a step, landings, and the tracker."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ RESTITUTION = 0.7
 HERTZ = Contact("hertz", STIFFNESS, RESTITUTION)
 MASS = 0.003
 LAWS = pytest.mark.parametrize("law", ["hertz", "bilinear"])
-# Length of a step in which changes are searched for.
+# Length in s of a step in which changes are searched for.
 STEP = 1e-3
 
 
 def closed_sites(contact: Contact, count: int, approach: float, mass: float = 1.0) -> np.ndarray:
-    """Sites of which the last one is closed on the side of its ``approach`` velocity, the others are free."""
+    """Return ``count`` sites; the last one is closed on the side of its ``approach`` velocity in m/s."""
     contacts = create_contacts(contact, [CLEARANCE] * count, mass)
     contacts["mode"][-1] = CLOSED if approach > 0 else -CLOSED
     contacts["approach"][-1] = approach
@@ -81,7 +81,7 @@ def test_energy_force_and_gradient_belong_together(law):
     slope = (elastic_force(record, x + h) - elastic_force(record, x - h)) / (2 * h)
     assert elastic_force_and_slope(record, x) == pytest.approx((force, slope), rel=1e-6)
 
-    # The force is continued as an odd function, for searches; there is no energy without contact.
+    # The force is continued as an odd function, which searches need; the energy is zero without contact.
     assert elastic_force(record, -x) == -force
     assert elastic_force_and_slope(record, -x)[1] == elastic_force_and_slope(record, x)[1]
     assert elastic_energy(record, -x) == 0.0
@@ -100,7 +100,7 @@ def motion_at(w: np.poly1d, t: float) -> np.ndarray:
     return np.array([[0.0, 0.0, 0.0], [w(t), w.deriv()(t), w.deriv(2)(t)]])
 
 
-# An excursion beyond the clearance between two times, as a parabola; its height is CURVATURE * HALF_WIDTH^2.
+# A parabola that exceeds the clearance from MIDDLE - HALF_WIDTH to MIDDLE + HALF_WIDTH s, by CURVATURE * HALF_WIDTH^2.
 MIDDLE = 0.6e-3
 HALF_WIDTH = 1e-4
 CURVATURE = 40.0
@@ -185,7 +185,7 @@ def test_the_extremes_of_a_contact_that_turns_within_a_step_are_those_of_its_tur
 
 def test_clipping_begins_where_g_falls_through_zero():
     approach = 0.01
-    # Out of the contact, faster and faster.
+    # The site leaves the contact faster and faster.
     w = np.poly1d([CLEARANCE + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])
     start = motion_at(w, 0.0)
     end = motion_at(w, STEP)
@@ -241,7 +241,7 @@ def test_a_landing_on_a_near_miss_is_searched_again_until_it_is_missed():
 
 
 def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
-    """With a goal below the tolerance, the last attempt that still halves the distance is followed by another."""
+    """Below the tolerance another attempt follows while the distance halves, until it is below the goal."""
     tolerance = 1e-10
     goal = 1e-14
     attempt, outcome = search.correct(landing_at(0.5), 1e-11, 1.0, tolerance, goal)
@@ -252,13 +252,13 @@ def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
 
 
 def create_tracker() -> ImpactTracker:
-    """The tracker of the sites 4 and 9, both free, with a floor of the approach velocity of 0.05 m/s."""
+    """Return a tracker of the free sites 4 and 9, with a floor of the approach velocity of 0.05 m/s."""
     contact = Contact("hertz", STIFFNESS, RESTITUTION, approach_floor=0.05)
     return ImpactTracker(create_contacts(contact, [CLEARANCE, CLEARANCE], MASS), (4, 9))
 
 
 def pull(tracker: ImpactTracker, start: float) -> None:
-    """Let the second site of a tracker go from ``start`` m back to its clearance, so fast that the contact pulls."""
+    """Move the second site of a tracker from ``start`` m back to its clearance, so fast that the contact pulls."""
     tracker.end[1] = start, 0.0, 0.0
     tracker.accept_step(STEP)
     # g = 1 + 0.45 (-0.2/0.05) < 0.
@@ -288,7 +288,7 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     assert episode[["site", "side", "onset", "approach_velocity"]].item() == (9, -1, 0.2, -0.01)
     assert episode["loss"] == 0.25
     assert np.isnan(episode["separation"])
-    # The interpolant of the second step goes somewhat deeper than its start.
+    # The interpolant of the second step goes somewhat deeper than the start of that step.
     assert episode["indentation"] == pytest.approx(0.5 * CLEARANCE, rel=0.05)
     assert episode["force"] > STIFFNESS * (0.5 * CLEARANCE) ** 1.5
     assert tracker.counts["pulled"].tolist() == [0, 1]
@@ -331,7 +331,7 @@ def test_the_contact_time_is_that_of_an_integrated_impact(law):
 
     comes_to_rest.terminal = True
     impact = solve_ivp(rates, (0, 1), [0.0, speed], rtol=1e-10, atol=1e-13, events=comes_to_rest)
-    # A conservative impact goes out as it came in.
+    # A conservative impact takes as long after the turn as before it.
     assert 2 * impact.t[-1] == pytest.approx(impact_time(contacts[0], speed), rel=1e-6)
 
 

@@ -15,7 +15,7 @@ from vipetsc.lattice import Contact
 
 
 def integrated_restitution(contact: Contact) -> float:
-    """Speed after an impact over the speed before it, by the compiled force."""
+    """Return the speed after an impact over the speed before it, from the motion under the compiled force."""
     speed = 0.3
     contacts = closed_sites(contact, 1, speed)
 
@@ -23,7 +23,7 @@ def integrated_restitution(contact: Contact) -> float:
         return [z[1], -contact_force(contacts, 0, CLEARANCE + z[0], z[1])[0] / MASS]
 
     def separates(t: float, z: np.ndarray) -> float:
-        # It begins at zero, too.
+        # The indentation is zero at the start, too.
         return z[0] if t > 1e-6 else 1.0
 
     separates.terminal = True
@@ -60,7 +60,8 @@ def test_the_exact_damping_meets_every_restitution():
 def test_the_strongest_damping_parts_the_masses_where_its_force_vanishes(factor, asked):
     contact = Contact("hertz", STIFFNESS, asked, factor=factor)
     c = 1.6 * (1 - asked) / asked
-    # With 1 - c e = exp(-q) the equation has its root at q = c + 1 - log(1 + c), to terms of exp(-q).
+    # With 1 - c e = exp(-q) the equation for the effective restitution e has the root q = c + 1 - log(1 + c), up to
+    # terms of the order exp(-q).
     expected = (1 - np.exp(np.log1p(c) - c - 1)) / c
     assert contact.effective_restitution == pytest.approx(expected, rel=1e-10)
 
@@ -72,7 +73,7 @@ def test_the_manual_has_a_table_of_effective_restitutions():
     def numbers(line: str) -> list[float]:
         return [float(cell) for cell in line.split("|")[2:-1]]
 
-    # The line between the two is the table's rule.
+    # The line between the two rows of numbers is the table's rule.
     asked = numbers(lines[first])
     printed = numbers(lines[first + 2])
     found = [round(Contact("hertz", STIFFNESS, restitution).effective_restitution, 3) for restitution in asked]

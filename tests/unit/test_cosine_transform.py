@@ -11,18 +11,18 @@ from vipetsc.spectra.cosine_transform import CosineTransform
 @settings(max_examples=60)
 @given(st.integers(2, 200), st.integers(0, 5), st.booleans(), st.integers(0, 99))
 def test_it_is_the_first_kind_of_any_length(rows, columns, strided, seed):
-    """Of columns that lie together or not."""
+    """The transform of contiguous or strided columns is SciPy's discrete cosine transform of type 1."""
     values = np.random.default_rng(seed).standard_normal((rows, columns))
     values = np.asfortranarray(values) if strided else values
     transform = CosineTransform(rows, columns)
     expected = fft.dct(values, type=1, axis=0)
     assert np.allclose(transform(values), expected, rtol=0, atol=1e-13 * rows)
-    # Of fewer columns, in the memory that the first call has left.
+    # A second call, of fewer columns, uses the memory of the first one.
     assert np.allclose(transform(values[:, 1:]), expected[:, 1:], rtol=0, atol=1e-13 * rows)
 
 
 def test_rounding_stays_small_in_a_long_record():
-    """A weak cosine added to a strong one, 1e-9 of it in amplitude; 5534 is twice a prime."""
+    """Two cosines of amplitudes 1 and 1e-9 have their coefficients to 1e-13 and 1e-14; 5534 is twice a prime."""
     for last in (4420, 4421, 5534):
         angle = np.pi * np.arange(last + 1) / last
         record = np.cos(101 * angle) + 1e-9 * np.cos(3333 * angle)

@@ -16,7 +16,7 @@ CYCLES = 10
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
-    """Of the built-in lattice one rank is as fast as two, as was measured; of one ten times as long it is not."""
+    """One rank is as fast as two for the built-in lattice, as was measured, and slower for one ten times as long."""
     short = Case.load(overrides=[f"time.engine={engine}"])
     long = short.varied(overrides=["lattice.cells=3000"])
 
@@ -33,9 +33,10 @@ def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
 
 
 def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: float) -> Model:
-    """Equal masses on springs, whose frequency (k/m)^1/2 the drive has, and stops that ``over`` times less reaches.
+    """Return the model of a chain of equal masses that is driven at (k/m)^1/2, with the stops of ``contacts``.
 
-    There the relative displacement of neighbours is as large as the displacement: 2 sin(kappa/2) = 1.
+    The displacement is ``over`` times the clearance. At this frequency 2 sin(kappa/2) = 1, hence the relative
+    displacement of neighbours has the amplitude of the displacement.
     """
     spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
     table = {
@@ -45,7 +46,7 @@ def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: flo
         "time": {"end": 0.2},
     }
     model = Case.from_table(table).model()
-    # Without gaps the one clearance is that of both sides.
+    # A model without gaps has one clearance for both sides.
     gaps = np.array(model.gaps or [2 * model.chain.clearances])
     gaps = np.where(np.isfinite(gaps), model.scale / over, np.inf)
     return replace(model, gaps=tuple(map(tuple, gaps.tolist())))
@@ -61,7 +62,7 @@ def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: flo
     ],
 )
 def test_contacts_are_expected_of_every_pair_at_every_stop(contacts, stops):
-    """A burst of twice the clearance is beyond it for half of its cycles, and once in each at each stop."""
+    """A burst whose largest displacement is twice the clearance touches each stop once in half of its cycles."""
     burst = {"cycles": CYCLES}
     assert expected_episodes(chain_with_a_stop(contacts, burst, over=2.0)) == pytest.approx(stops * CYCLES / 2)
     assert expected_episodes(chain_with_a_stop(contacts, burst, over=0.99)) == 0.0

@@ -1,4 +1,4 @@
-"""Which departures of contacts count as images of one another, and how many families of them two orbits differ by."""
+"""Departures of contacts: the images of one departure form a family, and two orbits differ by a number of families."""
 
 import pytest
 
@@ -23,12 +23,15 @@ def test_symmetries_keep_the_length_and_move_by_half_a_period(image):
 
 @pytest.mark.parametrize("other", [Departure(0.03, 0.11), Departure(0.05, 0.1), Departure(0.28, 0.1)])
 def test_contacts_at_other_instants_or_of_other_lengths_are_none(other):
-    """A quarter of a period later is no symmetry of an orbit that comes to rest, either."""
+    """A contact of another length or at another instant, such as a quarter of a period later, is no image."""
     assert families([A, other]) == {1: 2}
 
 
 def test_short_contacts_are_compared_by_their_depth():
-    """The depth is the square of the length: by rounding in it the lengths of grazing contacts differ by more."""
+    """Contacts are equal if the squares of their lengths are, as the depth goes with the square.
+
+    Rounding of the depth changes the length of a grazing contact by much more.
+    """
     assert families([Departure(0, 1e-6), Departure(0, 2e-6)]) == {2: 1}
     assert families([Departure(0, 1e-2), Departure(0, 2e-2)]) == {1: 2}
 
@@ -41,7 +44,7 @@ def test_images_that_appear_together_are_one_change():
 
 
 def test_orbits_of_another_symmetry_are_as_many_changes_as_families():
-    """An orbit with three contacts of their own is another one than that of three pairs, or of one pair more."""
+    """Three contacts without images differ from rest by three families, and from three pairs of images by six."""
     three = [Departure(0.01 * i, 0.1 + 0.01 * i) for i in range(3)]
     doubled = three + [departure._replace(middle=departure.middle + 0.5) for departure in three]
     assert changed_families([], three) == 3
@@ -50,12 +53,15 @@ def test_orbits_of_another_symmetry_are_as_many_changes_as_families():
 
 
 def test_what_an_arc_cuts_off_goes_on_as_its_mirror_image():
-    """From rest to rest over half a period: closed at the start, in the middle and at the end."""
+    """A contact that the end of an arc from rest to rest cuts off is as long again beyond it, by reflection.
+
+    The three contacts are closed at the start, in the middle and at the end of half a period.
+    """
     spans = [(0.0, 0.05), (0.2, 0.3), (0.45, 0.5)]
     assert within_arc(spans, 0.5, rest_after=True) == [
         Departure(0.0, pytest.approx(0.1)),
         Departure(0.25, pytest.approx(0.1)),
         Departure(0.5, pytest.approx(0.1)),
     ]
-    # A quarter ends at the centre, where nothing is mirrored.
+    # An arc over a quarter of a period ends at the centre, where contacts are not reflected.
     assert within_arc([(0.2, 0.25)], 0.25, rest_after=False) == [Departure(0.225, pytest.approx(0.05))]

@@ -17,7 +17,7 @@ def test_a_spring_without_a_cubic_part_begins_no_breather():
 
 
 def test_the_amplitude_on_a_cubic_spring_is_that_of_its_first_harmonic():
-    """Of c (a cos theta)^3 the first harmonic is 3/4 c a^3: a = -g 3/4 c a^3."""
+    """The force c (a cos theta)^3 has the first harmonic 3/4 c a^3, and the balance a = -g 3/4 c a^3 yields a."""
     g, cubic = -1e-4, 1e9
     forces = SiteForces([], [Spring(0, 1, 1e4, cubic=cubic)])
     expected = (-4 / (3 * g * cubic)) ** 0.5

@@ -1,4 +1,4 @@
-"""Scatter is drawn as it was asked for, is the same for a seed wherever it is drawn, and changes nothing else."""
+"""Scatter has the distribution asked for, is the same for the same seed, and changes no other quantity."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_mean_and_deviation_are_those_asked_for(distribution, size):
         assert largest <= np.sqrt(3)
     else:
         assert largest > 4
-    # That of a lognormal number with the relative deviation c is 3 c + c^3.
+    # The skewness of a lognormal number with the relative deviation c is 3 c + c^3.
     skewness = np.mean((drawn - 1) ** 3) / 0.1**3
     assert skewness == pytest.approx(0.301 if distribution == "lognormal" else 0.0, abs=0.05)
 
@@ -102,7 +102,7 @@ def test_the_resolved_case_holds_what_was_drawn():
 def test_sites_move_by_whole_cells():
     case = draw({"sites": [10, 30], "clearance": CLEARANCE}, seed=2, sites={"absolute": 2.0})
     assert case.contacts.sites != [10, 30]
-    # Three deviations.
+    # The bound is three deviations.
     assert np.abs(np.subtract(case.contacts.sites, [10, 30])).max() <= 6
 
 
@@ -198,7 +198,7 @@ def test_a_cell_with_scattered_springs_keeps_their_nonlinear_parts_and_dashpots(
 
 
 def test_a_cell_with_scattered_masses_keeps_all_that_its_springs_have():
-    # Every number that a spring may have, a further term of its force among them.
+    # Every optional number of a spring, coefficients of its force among them.
     numbers = {field.name: 0.5 + i for i, field in enumerate(fields(Spring)) if isinstance(field.default, float)}
     assert {"damping", "quadratic", "cubic"} <= numbers.keys()
     springs = (Spring(0, 0, 3.0, next_cell=True, **numbers), Spring(0, 1, 4.0))
@@ -270,7 +270,7 @@ def transfer_of_members() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def ensemble(tmp_path_factory):
-    """The finished sweep of these transfers, each with 1e-4 of floor."""
+    """Return the ensemble of a finished sweep with the transfers of ``transfer_of_members``, each plus 1e-4."""
     transfer = transfer_of_members().ravel()
 
     def outcome(number: int, case: Case) -> dict[str, Any] | str:
@@ -326,7 +326,7 @@ def test_fits_and_pictures_have_means_in_place_of_single_samples(ensemble):
 
 
 def test_a_modulus_scales_the_stiffness_of_sites_with_radii_of_their_own():
-    """Each site's stiffness follows from the modulus of all and its own radius."""
+    """The stiffness of each site follows from the common modulus and the site's own radius."""
     material = {"sites": [5, 9], "clearance": CLEARANCE, "modulus": 1e8, "each": {"radius": [0.004, 0.005]}}
     plain = draw(material).contacts
     drawn = draw(material, modulus={"relative": 0.1}).contacts
@@ -342,7 +342,7 @@ def test_a_modulus_is_not_drawn_where_each_site_has_its_own():
 
 
 def test_radii_of_the_sites_complete_the_material_of_all():
-    """A cell without a preset, whose sites have radii, takes modulus and Poisson ratio of all, also with a scatter."""
+    """Sites with radii of their own take the common modulus and Poisson ratio, also with scatter, without a preset."""
     springs = [{"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 6e3}]
     contacts = {"sites": [5, 9], "clearance": CLEARANCE, "modulus": 1e8, "poisson": 0.3}
     lattice = {"cells": 20, "cell": {"masses": [0.01, 0.004], "springs": springs}}

@@ -20,7 +20,7 @@ def test_bins_shown_at_the_papers_wavenumber():
 def test_bins_shown_hold_the_driven_ones(part, count, shown):
     """The bin of the driven wavenumber and a neighbour are among those shown, which are in order and differ.
 
-    Of one bin that is shown, or that there is, this is the driven one alone.
+    If one bin is shown, or there is one alone, it is the driven one.
     """
     bins = shown_bins(part * np.pi, count, shown)
 

@@ -1,4 +1,4 @@
-"""The engine's rates, motion of sites and energies against matrices assembled here; sums of PETSc's stages."""
+"""The engine's rates, motion of sites and energies against assembled matrices; sums of PETSc's stages."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
     contact = float(lattice.model.contact.potential(3e-5, lattice.clearance))
     assert energies.kinetic == pytest.approx(kinetic, rel=1e-12)
     assert energies.spring == pytest.approx(0.5 * u @ assembled_stiffness(lattice.chain) @ u, rel=1e-12)
-    # Energies are summed in whole units, of which the contact's is a small number.
+    # Energies are summed in whole units, and the contact's energy is a small number of them.
     assert energies.contact == pytest.approx(contact, rel=1e-10)
     assert energies.work[0] == lattice.work
     assert energies.dissipated[0] == sum(lattice.losses)
@@ -155,7 +155,7 @@ def test_energies_beyond_all_scales_saturate_the_sums():
 
 
 def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
-    """Energies that are cut off at ``LARGEST`` do not overflow: 2^14 of them are 2^64, which is 0 in 64 bits."""
+    """Sums of energies that are cut off at ``LARGEST`` saturate; 2^14 of them would add up to 2^64, 0 in 64 bits."""
     model = small_case(lattice={"cells": 2**14, "damping": {"mass": 1.0}}).model()
     layout = Layout(model, MPI.COMM_SELF, dashpots=True)
     sums = EnergyMeter(model, layout).sums(np.full(layout.size, np.nan))
@@ -194,7 +194,7 @@ def test_stages_are_added_as_petsc_adds_them(size, count):
     assert compiled.array.tobytes() == by_petsc.array.tobytes()
     assert compiled.array.tobytes() != start.tobytes()
 
-    # PETSc's own sum would not leave out NaN times zero.
+    # A stage without weight is left out, hence its NaN, too; PETSc's own sum would be NaN.
     stages[0].set(np.nan)
     compiled.maxpy([0.0, 1.0], [stages[0], registered])
     assert np.isfinite(compiled.array).all()
@@ -206,7 +206,7 @@ def test_stages_are_added_as_petsc_adds_them(size, count):
     ("ranks", "hook", "expected"), [(1, sys.__excepthook__, 0), (2, sys.__excepthook__, 1), (2, print, 0)]
 )
 def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypatch, ranks, hook, expected):
-    """The hook is installed at the call, not at the import, and another hook than Python's own stays."""
+    """``simulate`` installs the hook at its call, on several ranks, and keeps a hook that is not Python's own."""
     installed = []
     monkeypatch.setattr(run, "install_abort_hook", lambda: installed.append(1))
     monkeypatch.setattr(run, "MPI", SimpleNamespace(COMM_WORLD=SimpleNamespace(size=ranks)))

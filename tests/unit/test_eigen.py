@@ -24,7 +24,7 @@ WHOLE = UnitCell((1.0, 1.0), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 1.
 
 
 class RecordingTransformation:
-    """A spectral transformation that records with what it is to be solved."""
+    """A spectral transformation that records its type and the solver that is set for it."""
 
     def __init__(self, ranks: int) -> None:
         self.comm = SimpleNamespace(size=ranks)
@@ -89,7 +89,7 @@ def matrices_of(ends: str, cells: int = 12) -> LatticeMatrices:
 
 @pytest.mark.parametrize("ends", ["free", "periodic"])
 def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
-    """At 0 the matrix of whole numbers is singular without any rounding, and the rigid motion has the frequency 0."""
+    """At the frequency 0 of the rigid motion the matrix of whole numbers is exactly singular; the mode is found."""
     matrices = matrices_of(ends)
     modes = modes_near(matrices, 1, 0.0)
     assert modes.frequency.tolist() == [0.0]
@@ -98,7 +98,7 @@ def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
 
 
 def test_the_lowest_frequency_of_a_fixed_lattice_is_not_taken_for_zero():
-    # Long waves of 400 cells: omega^2 = 1.5e-5 of the largest one, far above rounding.
+    # A long wave: chain of mass 2 and spring 1 a cell, omega^2 = (pi/401)^2/2, which is 6e-6 of the largest omega^2.
     matrices = matrices_of("fixed", 400)
     (frequency,) = modes_near(matrices, 1, 0.0).frequency
     assert frequency == pytest.approx(np.pi / 401 / np.sqrt(2), rel=1e-4)
@@ -106,7 +106,7 @@ def test_the_lowest_frequency_of_a_fixed_lattice_is_not_taken_for_zero():
 
 
 def test_both_copies_of_a_mode_of_a_ring_are_found():
-    """Waves to the left and to the right have one frequency, of which a Krylov space may miss one."""
+    """Waves to the left and to the right have one frequency; a Krylov space may miss one of these two modes."""
     matrices = matrices_of("periodic")
     modes = modes_near(matrices, 3, 0.0)
     assert modes.frequency[0] == 0.0
@@ -118,7 +118,7 @@ def test_both_copies_of_a_mode_of_a_ring_are_found():
 
 
 def record_searches(monkeypatch) -> list[int]:
-    """The number of modes that each search from now on is asked for."""
+    """Return a list that receives the number of modes that each search from now on is asked for."""
     slepc = load_slepc()
     wanted: list[int] = []
 
@@ -137,7 +137,7 @@ def test_further_copies_are_sought_one_at_a_time_until_none_is_nearer(monkeypatc
     modes_near(matrices, 3, 0.0)
     assert wanted[0] == 3
     assert set(wanted[1:]) == {1}
-    # A ring's three lowest modes are all that there are so near: one search finds a farther one, and none more.
+    # No further mode of the ring is as near as the three lowest: one search finds a farther one, and none follows.
     assert len(wanted) == 2
     matrices.destroy()
 
@@ -160,8 +160,11 @@ def test_all_modes_of_a_lattice_may_be_asked_for():
 
 
 def test_modes_keep_their_digits_beside_one_that_was_hit_exactly(monkeypatch):
-    """The iterated eigenvalue of the mode that is hit exceeds the others as far as the shift is small."""
-    # PETSc's own solver loses most there.
+    """Modes keep small residuals where the shift is the frequency of one of them.
+
+    The iterated eigenvalue 1/(omega^2 - shift) of that mode exceeds all others by many orders.
+    """
+    # PETSc's own solver loses more digits than the other ones.
     monkeypatch.setattr(eigen, "ON_ONE_RANK", ("petsc",))
     matrices = matrices_of("fixed", 4)
     hit = modes_near(matrices, matrices.rows, 1.0).frequency[3]
@@ -180,6 +183,6 @@ def test_all_modes_but_one_may_be_asked_for():
 
 
 def test_of_two_places_that_are_equal_but_for_rounding_the_first_one_counts():
-    """The place and the sign of a mode of a symmetric lattice do not depend on rounding errors."""
+    """The first of two places that are equal but for rounding counts, so that rounding decides no place or sign."""
     values = np.array([[0.2, 1.0, 0.5, 1.0 + 1e-14], [1.0 + 1e-14, 0.1, 1.0, 0.0], [0.0, 0.1, 0.9, 1.0]])
     assert first_largest(values).tolist() == [1, 0, 3]

@@ -35,7 +35,7 @@ FAILING = 5
 
 
 def transfer_of(case: Case) -> float:
-    """A number that tells the members apart."""
+    """Return a number that differs between all members."""
     sites = len(case.contacts.sites)
     return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
 
@@ -43,7 +43,7 @@ def transfer_of(case: Case) -> float:
 def put_sweep(
     folder: Path, plan: Sweep, failing: Collection[int] = (), transfer: Callable[[Case], float] = transfer_of
 ) -> Path:
-    """A finished sweep whose members were not simulated, but have all that an ensemble holds."""
+    """Write a finished sweep whose members have prescribed measures, without a simulation, and return its folder."""
 
     def outcome(number: int, case: Case) -> dict[str, Any] | str:
         if number in failing:
@@ -184,14 +184,14 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
 
     wave = LinearRun.of(data, {"work": 0.0}, (), ())
 
-    # Half a sampling interval, 5 ms.
+    # The sampling interval is 5 ms, and the bound is half of it.
     assert wave.arrival == pytest.approx(peak, abs=0.0026)
     assert wave.statistics == {"work": 1.0}
     assert leading_cell(case) == 7
     assert wave.arrival_at(7) == wave.arrival[6]
     assert wave.arrival_at(0) is None
 
-    # Block by block it is that of all samples; the case is read once for all of them.
+    # The envelope of blocks is that of all samples; the case is read once for all blocks.
     samples = data.sizes["time"]
     blocks = np.sqrt(envelope_squares(data, [3, samples // 2, samples]))
     assert np.array_equal(blocks.max(axis=0), wave.envelope)

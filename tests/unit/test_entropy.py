@@ -8,14 +8,14 @@ from scipy.special import erf
 
 from vipetsc.spectra import entropy, local_entropy, padded_length, transform
 
-# Centre of the wavelet, and the wavenumbers of the nodes.
+# Centre of the wavelet, and the wavenumbers in rad/cell of its nodes.
 KC = 12.0
 KAPPA = np.pi * np.arange(1, 61) / 60
 AVERAGES = ("energy_weighted", "masked", "joint")
 
 
 def bits(power: np.ndarray) -> np.ndarray:
-    """Entropy in bits of shares along the first axis."""
+    """Return the entropy in bits of the fractions of ``power`` along the first axis."""
     share = power / power.sum(axis=0)
     log = np.log2(share, out=np.zeros_like(share), where=share > 0)
     return -np.sum(share * log, axis=0)
@@ -32,7 +32,7 @@ def packet(centre: float, kappa: float = 5 * np.pi / 9) -> np.ndarray:
 
 
 def scattering_run(samples: int = 12) -> np.ndarray:
-    """A packet that leaves others behind as it travels."""
+    """Return velocities (sample, cell) of a packet that travels forwards and leaves a growing backward one behind."""
     fields = []
     for t in range(samples):
         left_behind = packet(300 - 9 * t, kappa=1.1)
@@ -42,7 +42,7 @@ def scattering_run(samples: int = 12) -> np.ndarray:
 
 @pytest.mark.parametrize("kappa", [np.pi / 3, 5 * np.pi / 9, 2.5])
 def test_a_tone_has_the_entropy_of_its_gaussian_over_the_nodes(kappa):
-    """Far from its ends, 4 S = kc/kappa |Psi(kc kappa_0/kappa)|^2."""
+    """Far from its ends, a tone of the wavenumber kappa_0 has 4 S = kc/kappa |Psi(kc kappa_0/kappa)|^2 at the nodes."""
     x = np.arange(6000)
     # Ends that fade add no other wavenumbers.
     fade = 0.5 * (erf((x - 300) / 60) - erf((x - 5700) / 60))
@@ -54,15 +54,18 @@ def test_a_tone_has_the_entropy_of_its_gaussian_over_the_nodes(kappa):
 
 @pytest.mark.slow
 def test_white_noise_approaches_its_limit():
-    """S is exponential about its mean E: H over cells and nodes is log2 cells + H(E / sum E) - (1 - gamma)/ln 2."""
+    """The spectrum S of white noise is exponentially distributed about its mean E at each node.
+
+    Its entropy over cells and nodes is hence log2 cells + H(E / sum E) - (1 - gamma)/ln 2, with Euler's gamma.
+    """
     cells = 20_000
     found = entropy(noise((10, cells)))
     eta = np.pi * (np.arange(20_000) + 0.5) / 20_000
     mean = KC / KAPPA * np.exp(-((KC * eta[:, None] / KAPPA - KC) ** 2)).sum(axis=0)
     limit = np.log2(cells) + bits(mean) - (1 - np.euler_gamma) / np.log(2)
-    # Ten samples of 20,000 cells, of which some hundred are correlated at the smallest wavenumber.
+    # Ten samples of 20,000 cells; at the smallest wavenumber some hundred neighbouring cells are correlated.
     assert found.joint == pytest.approx(limit, abs=0.02)
-    # Neighbouring nodes are correlated, so the shares within one cell are more alike than those of the whole.
+    # Neighbouring nodes are correlated: the fractions within one cell are more alike than those of all cells.
     assert limit - np.log2(cells) < found.energy_weighted < np.log2(60)
 
 
@@ -83,7 +86,7 @@ def test_the_local_entropy_is_that_of_the_wavelet_transform():
 
 @pytest.mark.parametrize("stride", [2, 3])
 def test_fewer_cells_have_the_entropy_that_they_have_among_all(stride):
-    """Nothing is lost by the folding; only the padded line may be a little longer."""
+    """Every second or third cell has the entropy of the same cell among all, up to the length of the padded line."""
     signal = scattering_run(3)
     whole_local, whole_weight = local_entropy(signal)
     local, weight = local_entropy(signal, stride)
@@ -151,7 +154,7 @@ def test_the_entropy_does_not_depend_on_the_amplitude(seed, factor):
 def test_the_entropy_moves_with_the_field():
     local, weight = local_entropy(packet(250.0)[None])
     moved_local, moved_weight = local_entropy(packet(310.0)[None])
-    # Sixty cells on.
+    # The packet has moved by sixty cells.
     assert moved_local[0, 250:371] == pytest.approx(local[0, 190:311], abs=1e-8)
     assert moved_weight[0, 250:371] == pytest.approx(weight[0, 190:311], rel=1e-8)
 
@@ -159,7 +162,7 @@ def test_the_entropy_moves_with_the_field():
 def test_snapshots_do_not_see_each_other():
     signal = scattering_run()
     local, weight = local_entropy(signal)
-    # They are transformed together: the first one falls on many places of such a chunk.
+    # Snapshots are transformed in chunks: the first one has various places in a chunk here.
     for first in (1, 4, 7, 11):
         late_local, late_weight = local_entropy(signal[first:])
         assert np.array_equal(local[first:], late_local)

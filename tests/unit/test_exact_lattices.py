@@ -1,4 +1,4 @@
-"""Exact steps, with dashpots and cells that differ too, against the matrix exponential of the whole lattice."""
+"""Exact steps against the matrix exponential of the whole lattice, also with dashpots and with cells that differ."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ def test_a_step_is_the_exponential_within_its_bound(ends, differing, damped, int
         apply_propagator(stencil, state, records.columns, out)
         step[:, column] = out.ravel()
 
-    # A velocity counts as omega u.
+    # Errors of displacements are multiplied by omega_max, so that they compare with those of velocities.
     scale = np.repeat([series.omega_max_h / interval, 1.0], size // 2)
     error = np.abs(step - exponential(model.chain, interval)) * scale[:, None] / scale
     assert error.sum(axis=1).max() <= series.truncation + 2e-14
     assert series.truncation < tolerance
 
 
-# Sites of any pairs: the cell's, ground and a mass, masses of neighbours, two contacts in one cell, next to others.
+# Pairs at sites with these indices of cells: ground and a mass, masses of one cell or of neighbours, both directions.
 PAIRS = {
     0: Pair(-1, 1),
     1: Pair(0, 3, next_cell=True),
@@ -81,7 +81,7 @@ PAIRS = {
 
 
 def with_any_pairs(model: Model) -> Model:
-    """The model with contacts of ``PAIRS``, one more in cell 12, and one in the last cell."""
+    """Return the model with contacts of ``PAIRS``, a second one in cell 12, and one in the last cell."""
     ends_on_ring = model.chain.ends == "periodic"
     pairs = PAIRS | {CELLS - 1: Pair(2, 0, next_cell=True) if ends_on_ring else Pair(-1, 3)}
     sites = (*pairs, 11)
@@ -90,7 +90,7 @@ def with_any_pairs(model: Model) -> Model:
 
 
 def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
-    """The forms (number, dof, cell) that take w of a site, or the displacement of a driven mass (-1 - drive)."""
+    """Return forms (number, dof, cell) that yield w of a site, or the displacement of a driven mass (-1 - drive)."""
     chain = model.chain
     forms = np.zeros((len(numbers), chain.cell.dofs, chain.cells))
     for form, number in zip(forms, numbers, strict=True):
@@ -110,7 +110,10 @@ def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("pairs", ["the cell's pair", "any pairs"])
 @LATTICES
 def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, pairs):
-    """Contacts and driven masses near an end and across the joint of a ring are among those compared."""
+    """Free motion, impulses and responses of all contact DoFs at 0.7 of a step are those of the matrix exponential.
+
+    Contacts and driven masses near an end and across the joint of a ring are among them.
+    """
     model = unlike_lattice(ends, CELLS, differing, dashpots=float(damped))
     if pairs == "any pairs":
         model = with_any_pairs(model)
@@ -131,7 +134,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
     for cluster in range(len(groups.first) - 1):
         expand_free_motion(tables, cluster, records.columns, taylor)
 
-    # At 0.7 of the step.
+    # The motion is compared at 0.7 of the step.
     step = exponential(model.chain, 0.7 * series.interval)
     exact = (step @ state.ravel()).reshape(2 * d, n)
     forms = displacement_forms(model, groups.numbers)
@@ -143,7 +146,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
     masses = model.chain.masses().reshape(n, d)
     powers = 0.7 ** (1 + np.arange(response.shape[2]) * (1 if damped else 2))
     for i, form in enumerate(forms):
-        # An impulse on the DoF at 0.3 of the step.
+        # An impulse on the DoF at 0.3 of the step has acted for 0.7 of it at the end.
         moments = 0.7 ** np.arange(2 * series.terms)[None]
         out = np.zeros((2 * d, n))
         apply_impulses(tables, i, moments, out)
@@ -151,7 +154,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
         for part, expected in zip(out.reshape(2, -1), exact.reshape(2, -1), strict=True):
             np.testing.assert_allclose(part, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
 
-        # What the DoFs of its cluster respond.
+        # The responses of the DoFs in the same cluster are power series in the time since the impulse.
         cluster = np.searchsorted(groups.first, i, side="right") - 1
         members = slice(*groups.first[cluster : cluster + 2])
         expected = forms[members].reshape(-1, d * n) @ exact[: d * n] * series.interval

@@ -34,7 +34,7 @@ CHANGES = {
     "initial motion": ({"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}}, "initial.kind"),
     "many drives": ({"drive": {"more": [{"frequency": 1000.0, "cell": 2}]}}, "drive.more"),
     "moved wall": ({"drive": {"end": "left"}}, "drive.end"),
-    # Narrow in frequency, as ``predict`` needs a wave to be.
+    # The chirp is narrow in frequency, since ``predict`` refuses other waves.
     "other waveforms": (
         {"drive": {"waveform": "chirp", "frequency": 1000.0, "bandwidth": 100.0, "duration": 0.2}},
         "drive.waveform",
@@ -58,7 +58,7 @@ VERB_SECTIONS = {
         "unknowns": [{"quantity": "amplitude", "bounds": [0.1, 100.0]}],
     },
 }
-# Normal modes drive nothing: their cases are tried apart.
+# Cases of normal modes and designs have no drive and are tested separately.
 DRIVEN = [kind for kind in VERB_CASES if kind not in (NnmCase, DesignCase)]
 
 
@@ -70,14 +70,14 @@ def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> se
     for section, values in changes.items():
         table[section] = table.get(section, {}) | values
     if "cell" in table.get("lattice", {}):
-        # A cell of one's own has no defaults to take these from.
+        # A cell that is no preset has no defaults for these sections.
         table["contacts"] = {"sites": [9], "clearance": 1e-3, "stiffness": 1e4}
         table["drive"] = {"frequency": 1.0}
         table["time"] = {"end": 10.0, "sample_interval": 0.125}
 
     try:
         case = kind.from_table(table)
-        # Of a sweep, members are checked as they are built.
+        # A sweep checks its members as it builds them.
         if kind.section == "sweep":
             case.members()
     except CaseError as error:

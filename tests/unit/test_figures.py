@@ -37,7 +37,7 @@ UNITS = {"displacement": "m", "velocity": "m/s"}
 
 
 class RunShape(NamedTuple):
-    """What a run holds: ``sites``, the ``window`` of cells kept, every so many samples, episodes, fields."""
+    """Contents of a run: ``sites`` (cells, from 1), first and last recorded cell, field stride, episodes, fields."""
 
     sites: tuple[int, ...] = (8, 16)
     window: tuple[int, int] = (1, CELLS)
@@ -62,17 +62,17 @@ def case_of(shape: RunShape) -> Case:
 
 
 def travelling_wave(cells: np.ndarray, time: np.ndarray) -> dict[str, np.ndarray]:
-    """Displacements and velocities (t, cell, dof) of a packet at 430 cells/s and 1023 rad/s, of 1 mm."""
+    """Return displacements and velocities (t, cell, dof) of a packet of 1 mm at 430 cells/s and 1023 rad/s."""
     x = cells[None, :, None]
     t = time[:, None, None]
-    # Of the second band of the built-in cell, so that measures of its bands have something to show.
+    # The frequency lies in the second band of the built-in cell, so that measures of its bands are not zero.
     phase = 1.8 * x - 1023.0 * t + 0.3 * np.arange(4)
     envelope = np.exp(-(((x - 430 * t) / 5) ** 2))
     return {"displacement": 1e-3 * envelope * np.cos(phase), "velocity": 1.023 * envelope * np.sin(phase)}
 
 
 def impacts(episodes: int) -> dict[str, np.ndarray]:
-    """The table of episodes at two sites on both sides; the last one has not ended."""
+    """Return columns (episode,) of contacts at two sites on both sides, of which the last one has not ended."""
     values = np.linspace(0.01, 0.04, episodes)
     table = {
         "site": np.resize([1, 2], episodes),
@@ -100,7 +100,7 @@ def write_run(path: Path, shape: RunShape = WHOLE) -> None:
             data = file.create_dataset(name, data=values)
             data.attrs["units"] = units
             if not dims:
-                # As the store does: xarray takes the names of dimensions from HDF5's scales.
+                # The store writes scales, from which xarray takes the names of dimensions.
                 data.make_scale(name)
             for axis, dim in enumerate(dims):
                 data.dims[axis].attach_scale(file[dim])
@@ -122,7 +122,7 @@ def write_run(path: Path, shape: RunShape = WHOLE) -> None:
         energy = np.minimum(time / time[-1], 0.5)
         for name in ("kinetic", "spring", "contact", "dissipated"):
             put(f"energy/{name}", energy, "J", "time")
-        # Half of it is dissipated, so that no curve lies on the axis.
+        # Half of the work is dissipated, so that no curve lies on the axis.
         put("energy/work", 2 * energy, "J", "time")
         put("energy/dissipated_by_site", np.zeros((SAMPLES, len(shape.sites))), "J", "time", "site")
         put("sites/cell", np.array(shape.sites, int), "1", "site")
@@ -147,7 +147,7 @@ SHAPES = {
 }
 NO_SITES = "the lattice has no contact sites"
 NO_MODES = "needs the analysis of a run with all displacements and velocities"
-# What cannot be drawn is no file, for a reason.
+# Figures that a shape of run does not have, and their reasons.
 WITHOUT = {
     "no sites": {"phase": NO_SITES, "impacts": NO_SITES},
     "no impacts": {"impacts": "no contact closed in this run"},
@@ -161,13 +161,13 @@ WITHOUT = {
         "phase": "displacement and velocity were not both recorded",
     },
 }
-# Those of which everything can be measured.
+# Shapes of runs of which everything can be measured.
 COMPLETE = ("whole", "no impacts", "every third sample")
 
 
 @pytest.fixture(scope="module", params=SHAPES, ids=lambda name: name.replace(" ", "-"))
 def measured(request, tmp_path_factory):
-    """A folder with a run and its analysis, and the name of the run's shape."""
+    """Return a folder with a run and its analysis, and the name of the run's shape."""
     folder = tmp_path_factory.mktemp("run")
     write_run(folder / "run.h5", SHAPES[request.param])
     measure_run(folder)
@@ -176,7 +176,7 @@ def measured(request, tmp_path_factory):
 
 def assert_not_blank(path: Path) -> None:
     image = imread(path)[..., :3]
-    # A page of one colour has none.
+    # The deviation of a page of one colour is zero.
     assert image.std() > 0.005
     # Nothing is cut off: the outermost pixels belong to the page.
     edge = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
@@ -187,7 +187,7 @@ def assert_not_blank(path: Path) -> None:
 @pytest.mark.parametrize("name", figure_names("run"))
 def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypatch):
     folder, shape = measured
-    # Laid out as ever: what is cut off there is cut off in a coarse picture.
+    # A lower resolution changes no layout: text that is cut off in a fine picture is cut off in a coarse one.
     monkeypatch.setattr(style, "SCREEN", 100)
     paths = draw("run", [folder], [name])
     if name in WITHOUT.get(shape, {}):
@@ -202,13 +202,13 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypat
 
 def test_what_cannot_be_drawn_is_said(measured):
     folder, shape = measured
-    # Exactly these: a reason without a cause would keep a picture from being drawn.
+    # The reasons are exactly these: a further one would keep a picture from being drawn.
     assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
 
 
 @pytest.mark.slow
 def test_all_of_a_picture_can_be_read(tmp_path):
-    """Every picture of a run: no text outside the page or over other text, labelled axes, lettered panels."""
+    """No picture of a run has text outside the page or over other text, axes without labels or unnamed panels."""
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with rc_style(), Files() as files:
@@ -234,7 +234,7 @@ def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with h5py.File(tmp_path / "run.h5") as run:
-        # From the velocities of the file, by the formula.
+        # The reference is the formula with the velocities of the file.
         kinetic = kinetic_energy(run["velocity"][...], four_band().masses)
 
     with xarray.open_dataset(tmp_path / "analysis.h5", engine="h5netcdf") as data:
@@ -244,14 +244,14 @@ def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
         # Fields are stored in single precision.
         assert np.allclose(data.kinetic_energy, kinetic, rtol=1e-7)
         assert np.allclose(data.wavenumber_content.sum("wavenumber"), kinetic.sum(axis=1), rtol=1e-6)
-        # The wave stays in the band that is driven.
+        # The wave has no energy in bands above the driven one.
         assert 0 <= float(data.ibtet) < 0.05
 
     with xarray.open_dataset(tmp_path / "analysis.h5", engine="h5netcdf", group="bands") as bands:
         total = trapezoid(kinetic.sum(axis=1))
         assert bands.energy.dims == ("part", "sample")
         assert trapezoid(bands.total) == pytest.approx(total, rel=1e-12)
-        # Only what lies above the bands is not taken at every sample.
+        # The part above the bands alone is not measured at every sample.
         assert trapezoid(bands.energy.sum("part")) == pytest.approx(total, rel=1e-3)
 
 
@@ -260,7 +260,7 @@ def test_ranks_divide_the_figures_among_them(tmp_path):
     write_run(tmp_path / "run.h5")
     written = []
     for rank in range(2):
-        # Every second picture, as the ranks of a run of two.
+        # Each of two ranks draws every second picture.
         paths = draw("run", [tmp_path], formats=("pdf",), turns=count(rank, 2))
         written += [path.name for path in paths]
     drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path], Files())}
@@ -286,7 +286,7 @@ def test_a_figure_that_a_source_does_not_have_is_refused(source, name, message):
 
 
 def test_panels_of_a_large_grid_have_letters_as_far_as_there_are_numerals():
-    """Fourteen rows, as of a sweep over as many wavenumbers."""
+    """Of fourteen rows of panels, as in a sweep over fourteen wavenumbers, twelve have letters and numerals."""
     with rc_style():
         grid = new_figure(4, 14).subplots(14, 2)
         for axes in grid.flat:
@@ -302,12 +302,12 @@ def test_a_file_that_is_no_run_is_not_measured(tmp_path):
         file["x"] = 1
     with pytest.raises(ValueError, match="not a run"):
         measure_run(tmp_path)
-    # Half of an analysis would be taken for the whole one.
+    # An incomplete analysis would be taken for the whole one.
     assert not (tmp_path / "analysis.h5").exists()
 
 
 def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
-    """Of beads the next one, of a mass on the ground the ground: neither cell is blank."""
+    """A cell of one mass is drawn with the next cell's mass that its contact joins to it, or with the ground."""
     cell = UnitCell(masses=(0.01,), springs=(), host=0, resonator=0)
     texts = []
     # -1 is the ground.
@@ -329,7 +329,7 @@ def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
     [((), True), ((Pair(0, 0, next_cell=True),), False), ((Pair(0, 0, next_cell=True), Pair(0, 1)), True)],
 )
 def test_a_resonator_in_its_host_has_stops_where_it_meets_the_host(pairs, has_stops):
-    """A grain that meets the next one alone has none around its resonator."""
+    """A grain whose contacts join it to the next grain alone is drawn without stops around its resonator."""
     cell = UnitCell(masses=(0.01, 0.02), springs=(Spring(0, 1, 1e3),), host=0, resonator=1)
     with rc_style():
         axes = new_figure(5, 2).subplots()
@@ -342,7 +342,7 @@ def test_a_resonator_in_its_host_has_stops_where_it_meets_the_host(pairs, has_st
     assert texts.count("$m_{2}$") == 1
 
 
-# Five masses, of which two are tied to the next cell, and a chain with a pair of masses apart from it.
+# A cell of five masses, two of which have springs to the next cell; and a chain with a separate pair of masses.
 ODD_CELL = UnitCell(
     masses=(0.01, 0.02, 0.03, 0.004, 0.005),
     springs=(
@@ -383,7 +383,7 @@ def test_any_cell_can_be_drawn(tmp_path, cell):
 
 
 def height_with_warnings(folder: Path, warnings: Sequence[str]) -> int:
-    """Height in pixels of a picture of the run in ``folder`` with these warnings."""
+    """Return the height in pixels of a picture of the run in ``folder`` with these warnings."""
     with h5py.File(folder / "run.h5", "a") as file:
         file.attrs["warnings"] = json.dumps(list(warnings))
     (path,) = draw("run", [folder], ["ledger"])
@@ -395,15 +395,15 @@ def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
     write_run(tmp_path / "run.h5")
     plain = height_with_warnings(tmp_path, [])
     wide = "a sentence that is wider than the picture " * 4
-    # Lines are about 0.16 inches high: three at least, and not more than four where there are many.
+    # Lines are about 0.16 inches high: these warnings take three lines or more, and any number of them four at most.
     assert height_with_warnings(tmp_path, ["one", wide, "one"]) >= plain + 3 * 0.15 * SCREEN
-    # They differ in letters: sentences that differ in numbers alone are counted, and stand once.
+    # Warnings differ in letters here, since those that differ in numbers alone are counted and stand once.
     many = [f"warning {chr(number)}" for number in range(300, 600)]
     assert height_with_warnings(tmp_path, many) <= plain + 4 * 0.17 * SCREEN
 
 
 def test_a_note_leaves_the_picture_above_it_as_it_is(tmp_path):
-    """Also the legend of a whole page, which belongs to the page and not to the page with its strip."""
+    """A note adds a strip below and moves no pixel above it, not even a legend at the lower end of the page."""
     pixels = []
     for number, label in enumerate(("", "a warning\nand another one")):
         with rc_style():
@@ -416,12 +416,12 @@ def test_a_note_leaves_the_picture_above_it_as_it_is(tmp_path):
             pixels.append(imread(save(figure, tmp_path / f"{number}.png"))[..., :3])
     plain, noted = pixels
     assert len(noted) > len(plain)
-    # The strip is added below; nothing above it moves.
+    # The upper rows of pixels are those of the page without a note.
     np.testing.assert_array_equal(noted[: len(plain)], plain)
 
 
 def test_fonts_of_a_pdf_are_outlines(tmp_path):
-    """Editors and printers take TrueType; bitmap fonts, Type 3, they do not."""
+    """Fonts are embedded as TrueType, which editors and printers accept, and not as Type 3."""
     with rc_style():
         figure = new_figure(2, 2, r"plain and $\kappa^2$")
         figure.subplots()
@@ -433,7 +433,7 @@ def test_fonts_of_a_pdf_are_outlines(tmp_path):
 @pytest.mark.parametrize("low", [1e-7, 0.3, 2.0, 900.0])
 @pytest.mark.parametrize("ratio", [1.3, 4.0, 30.0, 1e3, 1e12])
 def test_logarithmic_axes_have_three_labels_or_more(low, ratio, tmp_path):
-    """Of any range; none over another, also on a small panel."""
+    """Logarithmic axes of any range have three labels or more, none over another, also on a small panel."""
     with rc_style():
         figure = new_figure(2.4, 1.5)
         axes = figure.subplots()
@@ -443,7 +443,7 @@ def test_logarithmic_axes_have_three_labels_or_more(low, ratio, tmp_path):
 
 
 def test_a_decade_without_room_for_a_label_has_a_tick():
-    """Labels at 0.001, 0.1 and 1 alone would be read as evenly spaced."""
+    """The decade 0.01, for whose label there is no room, has a tick: without it labels would seem evenly spaced."""
     axis = new_figure(2, 2).subplots().xaxis
     label_log_axis(axis, 6e-4, 5.0, length=1.2)
     assert axis.get_majorticklocs().tolist() == [0.001, 0.1, 1.0]

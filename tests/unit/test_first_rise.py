@@ -42,7 +42,7 @@ def starting_gap(mantissas: tuple[float, ...], exponents: tuple[float, ...], sta
 @example((0.0, 0.0, 0.5, -1.0, 0.0, 1.0), (0.0, 0.0, -3.0, -2.25, 0.0, -1.0), "below")
 @settings(max_examples=400)
 def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
-    """Against dense sampling: nothing above the interpolant's error is missed, or comes before what is found."""
+    """No sampled gap above the interpolant's error is missed, and none comes before the change that is found."""
     coefficients = starting_gap(mantissas, exponents, start)
     margin = interpolation_error(coefficients)
 
@@ -50,7 +50,7 @@ def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
 
     sampled = np.linspace(0, 1, 4001)[1:]
     gap = Polynomial(coefficients)(sampled)
-    # A hundredth more than the margin: on the margin itself rounding decides.
+    # Gaps count from 1.01 margins on, since rounding decides on the margin itself.
     clearly_above = np.nonzero(gap > 1.01 * margin + ROUNDING)[0]
     if clearly_above.size:
         assert outcome != NONE
@@ -66,7 +66,7 @@ def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
 
 
 def test_a_hump_next_to_a_dip_in_one_quarter_of_a_step_is_found():
-    """A contact that has just opened closes again and opens, all within the first fifth of a step."""
+    """The gap of a contact that has just opened rises through zero and falls again in the first fifth of a step."""
     position, outcome = first_rise((0.0, -4.6e-4, 5.0e-2, -0.31, 2.2e-4, 1.4e-3))
 
     assert outcome == CROSSING
@@ -74,9 +74,12 @@ def test_a_hump_next_to_a_dip_in_one_quarter_of_a_step_is_found():
 
 
 def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
-    """Slope (x - 0.05)(x - 0.15), so that 0.05 is a largest value and the gap rises again within the same quarter."""
+    """A maximum of the gap that is smaller than the interpolant's error is found before the root behind it.
+
+    The slope (x - 0.05)(x - 0.15) has a maximum at 0.05, and the gap rises again within the same quarter of the step.
+    """
     rise = Polynomial.fromroots([0.05, 0.15]).integ().coef
-    # The coefficient of order 5 makes the error 1e-5, ten times the gap's largest value.
+    # The coefficient of order 5 makes the error 1e-5, ten times the value 1e-6 at the maximum.
     coefficients = np.append(rise, [0.0, 1e-3])
     coefficients[0] = 1e-6 - Polynomial(coefficients)(0.05)
 
@@ -87,7 +90,10 @@ def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
 
 
 def test_the_second_hump_of_a_gap_is_found():
-    """Slope -(x - 0.1)(x - 0.45)(x - 0.9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
+    """The change before the second maximum is found, where the first one is below zero.
+
+    The slope -(x - 0.1)(x - 0.45)(x - 0.9) has maxima at 0.1, of -2e-3, and at 0.9, of 2.3e-3.
+    """
     slope = -Polynomial.fromroots([0.1, 0.45, 0.9])
     coefficients = np.append(slope.integ().coef, 0.0)
     coefficients[0] = -2e-3 - slope.integ()(0.1)
@@ -103,7 +109,7 @@ def test_the_second_hump_of_a_gap_is_found():
     ("largest_in_errors", "expected"), [(0.5, EXTREMUM), (-0.5, EXTREMUM), (-2, NONE), (2, CROSSING)]
 )
 def test_a_gap_that_nearly_closes_is_left_to_the_flow(largest_in_errors, expected):
-    """A largest value at 0.4, within the interpolant's error of zero, is an extremum; beyond it, a change or none."""
+    """A maximum near 0.4 is an extremum if it is zero up to the interpolant's error, else a crossing or no change."""
     coefficients = np.array([0.0, 0.8, -1.0, 0.0, 0.0, -0.02])
     turns = Polynomial(coefficients).deriv().roots()
     inside = (turns.imag == 0) & (turns.real > 0) & (turns.real < 1)
@@ -119,7 +125,7 @@ def test_a_gap_that_nearly_closes_is_left_to_the_flow(largest_in_errors, expecte
 
 @pytest.mark.parametrize("rounding", [1e-17, 0.0, -1e-17])
 def test_a_step_that_starts_on_a_near_miss_leaves_it(rounding):
-    """A start on an extremum below zero, whose slope is a rounding, is no change: the gap falls from there."""
+    """A gap that starts at a maximum below zero, with a slope that is zero but for rounding, has no change."""
     assert first_rise((-1e-4, rounding, -1.0, 0.0, 0.5, 0.3)) == (1.0, NONE)
 
 
@@ -128,6 +134,6 @@ def test_the_tableau_is_the_one_of_dop853():
     for name in ("A", "B", "E3", "E5"):
         ours = getattr(dop853, name)
         reference = getattr(DOP853, name)
-        # SciPy's tables also hold the stages of a dense output, which the flow has no use for.
+        # SciPy's tables also have the stages of a dense output, which the flow does not use.
         same_part = reference[tuple(slice(n) for n in ours.shape)]
         assert np.array_equal(ours, same_part), name

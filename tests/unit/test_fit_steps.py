@@ -1,4 +1,4 @@
-"""What a fit computes less often: derivatives of coefficients, derivatives at its end, and digits that noise hides."""
+"""Work that a fit saves: derivatives of coefficients, the Jacobian at its end, and digits that noise hides."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_fit_ends_where_scipys_does_with_one_jacobian_less(precision):
 
 
 def test_a_bad_model_of_a_step_does_not_end_a_fit():
-    """Little is gained where derivatives are wrong: that is no sign of the end."""
+    """A fit goes on from a start at which wrong derivatives make a step gain little, and ends at the same minimum."""
 
     def wrong(x: np.ndarray) -> np.ndarray:
         return 1e-4 * slopes(x) if np.array_equal(x, start) else slopes(x)
@@ -63,7 +63,7 @@ def test_a_bad_model_of_a_step_does_not_end_a_fit():
     assert found == pytest.approx(right, rel=1e-6)
 
 
-# Of a moved wall, what its force depends on.
+# The quantities on which the force of a moved wall depends.
 OF_WALL = ("spring", "amplitude", "mass")
 
 
@@ -72,9 +72,12 @@ OF_WALL = ("spring", "amplitude", "mass")
     [*(("two sides", quantity) for quantity in QUANTITIES), *(("wall", quantity) for quantity in OF_WALL)],
 )
 def test_derivatives_of_coefficients_are_differences_of_cases(name, quantity):
-    """Far from the start, where those that are the same everywhere are computed, by a difference of another width."""
+    """Derivatives of a model's coefficients agree with central differences of cases, far from the start of the fit.
+
+    Derivatives that do not depend on the place are computed once, at the start, by differences of another width.
+    """
     base = base_of(name)
-    # The other parameter changes what the first one's derivatives may depend on.
+    # A second parameter moves too, since derivatives by the first one may depend on it.
     parameters = [p._replace(low=0.2 * p.start, high=5 * p.start or 1.0) for p in sought(base, quantity, "all")]
     parameters += [p._replace(low=0.1 * p.start, high=5 * p.start) for p in sought(base, "spring", "each")[:1]]
     if quantity == "spring":
@@ -124,6 +127,6 @@ def test_a_start_that_is_no_case_leaves_derivatives_to_the_place_where_they_are_
 def test_motions_are_as_exact_as_the_noise_needs():
     assert FINAL.tolerances(0.02).motion == EXACT.motion
     assert GROWING.tolerances(0.02).motion == ROUGHEST
-    # Of records without noise the estimate is far smaller than any tolerance.
+    # For records without noise the estimate of the error is far smaller than any tolerance.
     assert GROWING.tolerances(1e-9).motion == EXACT.motion
     assert GROWING.tolerances(1e-5).motion == pytest.approx(1e-9)

@@ -1,4 +1,4 @@
-"""Output folders are begun, replaced and resumed by what they hold, whatever had happened in them before."""
+"""Output folders: claims that begin, resume, replace or refuse them, also after kills; locks between processes."""
 
 import logging
 import os
@@ -19,9 +19,9 @@ from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, Claim,
 from vipetsc.io.lock import locked
 
 ROOT = Path(__file__).parents[2]
-# A file that shows of which kind a folder is.
+# A file by which the kind of a folder is recognised.
 SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
-# Cases of the results that are there, and of those that a command is to make.
+# The case of the results in a folder, and the case of a later command.
 OLD = "a = 1\n"
 NEW = "a = 2\n"
 
@@ -42,7 +42,7 @@ def names_in(folder: Path) -> set[str]:
 
 @pytest.fixture
 def run(tmp_path):
-    """A folder with a run of OLD and its analysis, and a file of the user's."""
+    """Return a folder with a run of the case OLD, its analysis, and a file of the user's."""
     folder = tmp_path / "run"
     with claim(folder, RUN, OLD):
         for name in ("run.h5", "summary.json", "analysis.h5", "notes.txt"):
@@ -80,7 +80,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
 
 
 def test_the_same_case_is_resumed_and_nothing_is_touched(run):
-    # With the time of its last change: a file that is written again to the same bytes would differ.
+    # The time of the last change would differ if the file were written again with the same bytes.
     before = (run / "case.toml").stat()
     for resume in (False, True):
         with claim(run, RUN, OLD, resume=resume) as work:
@@ -98,7 +98,7 @@ def test_another_case_is_refused_with_the_difference(run, resume):
 def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
     message = "contains no run to resume; omit --resume"
     assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
-    # Not even the folder above it was created.
+    # The folder above it was not created either.
     assert not names_in(tmp_path)
 
 
@@ -115,7 +115,7 @@ def test_the_caller_decides_which_cases_differ(tmp_path):
 
 
 def replacing(folder: Path) -> Iterator[Claim]:
-    """Make new results in a folder that holds old ones, to the last but one step."""
+    """Make new results in a folder with old ones and yield the claim before they are published."""
     with claim(folder, RUN, NEW, force=True) as work:
         assert not work.going_on
         assert work.folder == folder / ".new"
@@ -139,11 +139,11 @@ def test_new_results_replace_the_old_ones_whole(run):
 
 
 class KilledError(Exception):
-    """Stands for a kill: what comes after is not done."""
+    """An exception that stands for a kill: no later step is done."""
 
 
 def publish_and_be_killed(folder: Path, monkeypatch, renamings: int) -> bool:
-    """Replace a folder's results and be killed after so many ``renamings``; whether it came to that."""
+    """Replace a folder's results, be killed after so many ``renamings``, and return whether there were more of them."""
     remaining = renamings
 
     def rename(source, target, replace=os.replace):
@@ -164,8 +164,8 @@ def publish_and_be_killed(folder: Path, monkeypatch, renamings: int) -> bool:
 
 
 def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch, tmp_path):
-    """The names change one by one: the command is killed before each of them, before the removal, and not at all."""
-    # Twelve are more than there are: the last of these commands comes to its end.
+    """The next command finishes a swap of results that was killed before any of its renamings or its removal."""
+    # A swap has fewer than twelve renamings: the last of these commands is not killed.
     for renamings in range(12):
         folder = tmp_path / f"killed-{renamings}"
         shutil.copytree(run, folder)
@@ -178,7 +178,7 @@ def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch
         assert (folder / "run.h5").read_text() == content
         if renamings:
             assert names_in(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, renamings
-    # Otherwise there are more renamings than were tried.
+    # If the last command was killed, a swap has more renamings than were tried.
     assert not killed
 
 
@@ -209,7 +209,7 @@ def test_new_results_that_were_begun_are_dropped_by_force(run):
 def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
     for name in ("parts", "figures"):
         (tmp_path / name).mkdir()
-    # Names as processes that were killed leave them, on this host and on others.
+    # Killed processes leave files with such names, on this host and on others.
     for name in (".lock", ".run.h5.part", ".run.h5.host-7-ab.part", "figures/.ledger.png.host-7-cd.part"):
         (tmp_path / name).touch()
     (tmp_path / ".parts.old").mkdir()
@@ -259,7 +259,7 @@ def held(folder: Path) -> Iterator[subprocess.Popen]:
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdin=pipe, stdout=pipe) as process:
         try:
-            # It has the lock as soon as it has printed.
+            # The process prints when it has the lock.
             process.stdout.readline()
             yield process
         finally:
@@ -267,7 +267,7 @@ def held(folder: Path) -> Iterator[subprocess.Popen]:
 
 
 class Clock:
-    """Stands for the module ``time``: to sleep takes none; ``meanwhile`` is called with the number of the sleep."""
+    """A clock in place of the module ``time``, whose sleeps take no time and call ``meanwhile`` with their number."""
 
     def __init__(self, meanwhile: Callable[[int], None] = lambda turn: None) -> None:
         self.meanwhile = meanwhile
@@ -284,7 +284,7 @@ class Clock:
 
 
 def written_at(folder: Path) -> dict[Path, int]:
-    """When each file and each folder in a folder was written: a file that comes and goes changes its folder's time."""
+    """Return the time in ns of the last change of each file and folder; a file that comes and goes changes a folder."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
@@ -302,7 +302,7 @@ def written_at(folder: Path) -> dict[Path, int]:
     ],
 )
 def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command, monkeypatch):
-    """The other process is named with its host; a lock that a killed process has left is nobody's."""
+    """Every verb refuses a folder that another process has locked and names it; locks of killed processes are free."""
     monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.1)
 
     with held(run) as process:
@@ -322,7 +322,10 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
 
 @pytest.mark.parametrize("folder_is_new", [False, True])
 def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, monkeypatch, folder_is_new):
-    """After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending."""
+    """A command waits some seconds for a lock and then takes it.
+
+    After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending.
+    """
     folder = tmp_path / "new" if folder_is_new else run
     with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
         # The holder ends while this process waits for the third time.
@@ -337,7 +340,7 @@ def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, mon
             assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} ")
     assert clock.turns == 3
 
-    # A new folder was created by the other, removed by it, and created and removed again by this one.
+    # The other process created a new folder and removed it; this process created it again and removed it.
     assert folder.exists() != folder_is_new
     (message,) = caplog.messages
     assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in message
@@ -348,7 +351,7 @@ def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_aga
     try_to_lock = lock._try_to_lock
     removed = []
 
-    # As the holder does between the creation of the folder by this process and its lock.
+    # The holder removes the folder after this process has found or created it and before this process locks it.
     def remove_once(path):
         if not removed:
             path.rmdir()
@@ -363,7 +366,7 @@ def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_aga
 
 
 def test_a_folder_that_its_holder_removes_while_it_is_created_is_created_again(tmp_path, monkeypatch):
-    """The folder exists when the system is asked to create it, and does not when Python looks whether it is one."""
+    """The folder is created again if it exists when ``mkdir`` is called and is gone when Python looks for it."""
     folder = tmp_path / "new"
     mkdir = os.mkdir
     refused = []
@@ -387,17 +390,17 @@ def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run,
     refused = pytest.raises(FolderError, match="is working in it; wait until it has ended")
     with held(run), refused, locked(MPI.COMM_SELF, run):
         pass
-    # It looks often and logs once.
+    # The command looks often and logs once.
     (message,) = caplog.messages
     assert "waiting up to 5 s" in message
     assert clock.turns >= 20
-    # It gives up at its first look after the time that it has announced.
+    # The command gives up at its first look after the time that it has announced.
     assert 5 <= clock.seconds < 5 + 2 * lock.LOOK_EVERY
 
 
 @pytest.mark.parametrize("below", [".", "new"])
 def test_a_link_to_a_folder_that_is_missing_is_refused(tmp_path, monkeypatch, below):
-    """A folder cannot be created there: the command must not try again and again."""
+    """A link to a missing folder is refused after a few attempts, since no folder can be created there."""
     (tmp_path / "link").symlink_to(tmp_path / "missing")
     mkdir = os.mkdir
     tried = []
@@ -417,7 +420,7 @@ def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    # As on a file system without locks.
+    # A file system without locks refuses so.
     monkeypatch.setattr("vipetsc.io.lock._acquire", refuse)
     with pytest.raises(PermissionError), locked(MPI.COMM_SELF, tmp_path / "a" / "b"):
         pass

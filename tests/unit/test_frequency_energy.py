@@ -37,7 +37,7 @@ def branch_of(frequency: np.ndarray, grazing: int = GRAZING) -> xr.Dataset:
 
 
 def drawn(branch: xr.Dataset) -> Axes:
-    """The panel of frequencies of a ``branch``, with the limits of energy that its page sets."""
+    """Return the axes with frequencies of a ``branch`` over the range of its energies."""
     axes = Figure(figsize=(3.4, 2.3)).subplots()
     energy = branch["energy"].values
     axes.set(xscale="log", xlim=(energy.min(), energy.max()))
@@ -47,7 +47,7 @@ def drawn(branch: xr.Dataset) -> Axes:
 
 
 def points_within(axes: Axes, branch: xr.Dataset, box) -> int:
-    """How many of a fine row of points on the curve of a ``branch`` lie in a ``box`` on the page."""
+    """Return how many of 1000 points on the curve of a ``branch`` lie in a ``box`` on the page."""
     fine = np.linspace(0.0, 1.0, 1000)
     frequency = np.interp(fine, PLACE, branch["frequency"].values)
     points = axes.transData.transform(np.column_stack([100.0**fine, frequency]))
@@ -55,7 +55,7 @@ def points_within(axes: Axes, branch: xr.Dataset, box) -> int:
 
 
 def test_the_inset_on_grazing_covers_nothing_of_the_branch():
-    """A branch that rises at its end alone lies in the lower right corner, which is tried first."""
+    """The inset covers no point of a branch that fills the lower right corner, the place that is tried first."""
     branch = branch_of(100.0 + 50.0 * PLACE**8)
     axes = drawn(branch)
     (inset,) = axes.child_axes
@@ -64,7 +64,7 @@ def test_the_inset_on_grazing_covers_nothing_of_the_branch():
 
 @pytest.mark.parametrize("rise", [0.5, -0.4])
 def test_the_inset_shows_a_tenth_of_the_frequency_beyond_grazing(rise):
-    """Of a branch that rises, and of one that falls, as of a contact that is pressed at rest."""
+    """The inset ends where the frequency has risen by a tenth, or fallen, as with a contact that is pressed at rest."""
     branch = branch_of(100.0 * (1 + rise * np.maximum(PLACE - PLACE[GRAZING], 0.0)))
     (inset,) = drawn(branch).child_axes
     shown = inset.lines[0].get_ydata()
@@ -79,7 +79,7 @@ def test_the_legend_is_beside_a_branch_that_falls():
 
 
 def test_an_orbit_is_in_the_region_of_its_own_point():
-    """The branch comes back to the energy of an earlier point, which is in another region."""
+    """The title of an orbit has the region of the orbit's point, though another point of its energy is in another."""
     branch = branch_of(100.0 + 50.0 * PLACE).assign(number=("point", np.arange(POINTS)))
     branch["energy"][30] = branch["energy"][10]
     branch["region"][20:] = 3

@@ -1,4 +1,4 @@
-"""Which half-traces of Floquet multipliers may come to a level between two points of a branch."""
+"""Half-traces of Floquet multipliers: those that may cross a level between two points of a branch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_all_real_half_traces_may_cross_a_level():
 
 
 def test_a_pair_that_stays_complex_crosses_none():
-    """Its multipliers, a quadruple off the real axis and off the unit circle, are not 1 where its real part is."""
+    """A complex pair whose real part passes 1 is no crossing: its four multipliers are off the real axis, not at 1."""
     before = point(-0.5, 0.9 - 0.2j, 0.9 + 0.2j)
     after = point(-0.5, 1.1 - 0.2j, 1.1 + 0.2j)
     assert real_half_traces(before, after) == [0]

@@ -1,4 +1,4 @@
-"""Hill's method: what a count of zeros says, and growth where the determinant is large."""
+"""Hill's method: zeros of the determinant by its turns along a contour, and growth where the determinant is large."""
 
 import numpy as np
 import pytest
@@ -15,13 +15,16 @@ from vipetsc.modes.balance.stops import Stops
     ("half_turns", "count"), [(0.0, 0), (-2.1, 2), (0.1, 0), (-1.5, -1), (2.0, -1), (1.0, -1), (np.nan, -1)]
 )
 def test_only_a_whole_number_of_turns_counts_zeros(half_turns, count):
-    """D turns by half a circle in the negative sense for a zero; a pole, or no number, decides nothing."""
+    """Each zero beyond the line turns D by half a circle in the negative sense.
+
+    Other turns, which a pole or a value that is not finite causes, are no count: -1.
+    """
     logs = np.array([0.0, 1j * np.pi * half_turns])
     assert ContourLine(np.array([0.0, 0.5]), logs, (1.0, 1.0)).zeros_beyond() == count
 
 
 def test_growth_is_found_where_the_determinant_is_cut_off(monkeypatch):
-    """Beside a stiff spring D is e^60: its phases alone would not do for guesses of the exponents."""
+    """An uncoupled stiff contact, by which D is e^60 and its logarithm cut off, does not change the fastest growth."""
     monkeypatch.setattr(hill, "LARGEST_LOG", 20.0)
     order = 41
     touching = Stops.both(Contact("bilinear", 30.0), 1.0)

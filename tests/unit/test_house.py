@@ -1,4 +1,4 @@
-"""Sizes of functions and files; names that say what they hold; the manual."""
+"""Rules of the source code: sizes of functions and files, names, prints, links of the manual, marks of tests."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MOST_STATEMENTS_IN_A_FUNCTION = 50
 MOST_ARGUMENTS = 7
 # Decorators of compiled functions.
 COMPILED = {"njit", "jit", "cfunc", "kernel", "disjoint", "inlined"}
-# Words that were a dialect of this package; the field has names for what they held.
+# Words that this package once used as names in place of the field's terms.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}
 DIALECT |= {"told", "made", "way", "beside", "around", "known", "lot"}
 
 
-# To parse the package takes a second, and six tests look at the same trees.
+# Parsing the package takes a second, and six tests use the same trees.
 @cache
 def nodes() -> list[tuple[str, ast.AST]]:
     """Return every node of every syntax tree of the package with its file."""
@@ -39,7 +39,7 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
 
 
 def statements(function: ast.FunctionDef) -> int:
-    """Count the statements of a function without its docstring, those of the functions in it among them."""
+    """Count the statements of a function, with those of functions inside it and without its docstring."""
     count = sum(isinstance(node, ast.stmt) for node in ast.walk(function))
     has_docstring = ast.get_docstring(function) is not None
     # The definition itself is a statement, too.
@@ -49,7 +49,7 @@ def statements(function: ast.FunctionDef) -> int:
 def is_compiled(function: ast.FunctionDef) -> bool:
     """Return whether a decorator compiles the function."""
     for decorator in function.decorator_list:
-        # @njit and @njit(...), @numba.njit and @njit.
+        # Decorators have the forms @njit, @njit(...) and @numba.njit.
         name = decorator.func if isinstance(decorator, ast.Call) else decorator
         text = name.attr if isinstance(name, ast.Attribute) else getattr(name, "id", "")
         if text in COMPILED:
@@ -73,7 +73,7 @@ def test_kernels_take_records():
     """No compiled function takes more than 7 arguments."""
     counts = {name: len(function.args.args) for name, function in functions() if is_compiled(function)}
 
-    # A decorator of another name would empty the list without a word.
+    # With decorators of other names the list would be empty and the test would pass.
     assert len(counts) > 40
     assert {name: count for name, count in counts.items() if count > MOST_ARGUMENTS} == {}
 
@@ -135,7 +135,7 @@ def test_no_two_classes_have_one_name():
 
 
 def test_numbers_of_ranks_stand_where_scripts_test_looks_for_them():
-    """scripts/test chooses the files for a number of ranks by the lines with marks, each of which has its numbers."""
+    """Each mark ``parallel`` has its numbers of ranks in its line, by which scripts/test chooses files."""
     for path in (ROOT.parent / "tests/mpi").glob("test_*.py"):
         text = path.read_text(encoding="utf-8")
         with_numbers = re.findall(r"mark\.parallel\((?:\d|\[\d(?:, \d)*\])\)", text)

@@ -62,7 +62,7 @@ def rows_with(index, row):
 )
 def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
     problems = problems_of(record_in(written(tmp_path, rows)))
-    # No other key: one bad row must not be reported as several problems.
+    # One bad row is one problem.
     assert list(problems) == [f"identify.records[1].{key}"]
     assert part in problems[f"identify.records[1].{key}"]
 
@@ -132,7 +132,9 @@ def test_contacts_are_not_sought_in_silence_nor_where_they_touch(tmp_path):
 
 
 def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
-    """Names, numbers, comments, semicolons, factors and a rate; datasets of one and of two dimensions."""
+    """Columns by name or number, with comments, semicolons, decimal commas, factors or a rate, and datasets of one or
+    two dimensions yield the same times and values.
+    """
     times = 1e-3 * np.arange(20)
     values = np.sin(np.arange(20.0))
     text = tmp_path / "r.csv"
@@ -168,7 +170,7 @@ def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
 
 
 def test_parameters_go_into_the_case(tmp_path):
-    """Groups share a value, the others keep theirs; the case that comes out is one that every verb reads."""
+    """Sites of a group get one value, others keep theirs, and the resulting case can be written and read again."""
     unknowns = [
         {"quantity": "clearance", "of": [[1, 3]], "bounds": [1e-5, 1e-2]},
         {"quantity": "restitution", "of": "each", "bounds": [0.1, 1.0]},
@@ -195,7 +197,7 @@ def test_parameters_go_into_the_case(tmp_path):
     assert chain.cell.masses[1] == 0.003
     assert [spring.damping for spring in chain.cell.springs][:2] == [0.2, 0.0]
     assert case.drive.amplitude == 33.0
-    # A mass that changes must not change the frequency of what drove the measurement.
+    # The drive of the measurement keeps its frequency, although a mass and hence the bands have changed.
     assert case.drive.frequency == plan.base.drive.frequency
     assert Case.from_toml(case.to_toml()) == case
 
@@ -212,7 +214,7 @@ def test_an_initial_state_of_many_masses_is_refused(tmp_path):
 
 
 def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
-    """Other clearances on the side w < 0, by site and of all; dashpots between masses and the ground."""
+    """Clearances on the side w < 0, of some sites or of all, and dashpots to the ground go into the case."""
     base = lattice_table(contacts={"clearance_minus": 9e-4})
     record = record_in(written(tmp_path))
     bounds = {"bounds": [1e-5, 1e-2], "start": 1e-3}
@@ -233,7 +235,10 @@ def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
 
 
 def test_sites_without_a_stop_on_the_side_minus_keep_their_numbers(tmp_path):
-    """The clearance of the side - is sought where one is; numbers of other sites stay finite, and those are refused."""
+    """A clearance on the side w < 0 is sought at sites with a stop there, and refused at others.
+
+    Numbers of the other sites stay in the case, whose model has no stop there.
+    """
     unknown = {"quantity": "clearance_minus", "of": [[1]], "bounds": [1e-4, 1e-2]}
     record = record_in(written(tmp_path))
     base = lattice_table(contacts={"clearance_minus": 9e-4, "each": {"side": ["both", "plus", "both"]}})
@@ -251,7 +256,7 @@ def test_coordinates_and_values_are_inverse(tmp_path):
     for parameter in plan.parameters:
         z = parameter.to_coordinate(parameter.start)
         assert parameter.from_coordinate(z) == pytest.approx(parameter.start)
-        # Central differences of coordinates of order one: their error, h^2, is below the tolerance.
+        # Coordinates are of order one: the error of central differences, h^2, is below the tolerance.
         h = 1e-6
         slope = (parameter.from_coordinate(z + h) - parameter.from_coordinate(z - h)) / (2 * h)
         assert parameter.slope(z) == pytest.approx(slope, rel=1e-6)
@@ -275,7 +280,7 @@ def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
 
 
 def test_columns_of_the_printed_table_stand_below_their_headings():
-    """Whatever the length of names, values and intervals: a group of sites, numbers with signs and exponents."""
+    """Columns start or end with their headings for names, values and intervals of any length."""
     columns = {
         "parameter": ["clearance_minus 1+2+3+12", "restitution", "cubic", "clearance 4"],
         "value": [-1.234567e-10, 0.7, -9.876543e10, 1e-3],
@@ -304,7 +309,7 @@ def test_columns_of_the_printed_table_stand_below_their_headings():
 
 
 def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_path):
-    """A fraction of a positive parameter, but a fraction of the range between the bounds on a linear scale."""
+    """The error is a fraction of a positive parameter, or of the range between the bounds on a linear scale."""
     plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
     columns = {
         "parameter": [parameter.name for parameter in plan.parameters],
@@ -323,7 +328,10 @@ def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_
 
 
 def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
-    """The drive acts as stiffness times its motion, which no load cell measures; of a force the sensor is as before."""
+    """A force sensor is accepted for a driving force and refused for a moved wall.
+
+    A moved wall acts by a stiffness times its motion, which no load cell measures.
+    """
     sensors = [SENSOR, {"quantity": "force", "column": "v"}]
     wall = {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "frequency": 300.0}
     record = record_in(written(tmp_path), sensors=sensors)
@@ -341,7 +349,7 @@ def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     [
         (np.array([b"a"] * 20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
         (1j * np.arange(20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
-        # A file without samples, of which those from a time on are asked for.
+        # The file has no samples, and ``begin`` asks for samples from a time on.
         (np.zeros(0), {"begin": 0.1}, "file", "leaves 0 samples"),
         (np.zeros((20, 2)), {}, "sensors[1].column", 'is an array of 20 x 2; write "v[1]"'),
     ],
@@ -366,7 +374,7 @@ def test_the_size_of_a_data_set_is_checked_before_it_is_read(tmp_path, monkeypat
 
 
 def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):
-    """The number of a force's drive is one among the drives of the record, of which the case has the first."""
+    """A force sensor may name a drive that the record adds to those of the case."""
     path = written(tmp_path, [f"{1e-3 * k:.4f},{np.sin(k):.6f},{np.cos(k):.6f}" for k in range(20)], "t,v,f")
     sensors = [SENSOR, {"quantity": "force", "column": "f", "drive": 2}]
     second = {"more": [{"frequency": 1000.0, "cycles": 4, "cell": 3}]}

@@ -1,4 +1,4 @@
-"""Imports point down the house, in no circle, and the lower floors know neither PETSc nor MPI."""
+"""Imports between the parts of the package point down, in no circle, and serial parts load neither PETSc nor MPI."""
 
 import ast
 import subprocess
@@ -13,7 +13,7 @@ import pytest
 import vipetsc
 
 ROOT = Path(vipetsc.__file__).parent
-# From the top floor down: a part may import itself and what stands after it.
+# Parts from the top down: a part may import itself and parts after it.
 FLOORS = (
     "__main__",
     "cli",
@@ -45,19 +45,19 @@ FORBIDDEN = {"petsc4py", "slepc4py", "mpi4py"}
 
 
 def module_of(path: Path) -> str:
-    """The name of a file's module below the package; a folder's ``__init__`` bears the folder's name."""
+    """Return the name of a file's module below the package; a folder's ``__init__`` has the folder's name."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     if parts[-1] == "__init__" and len(parts) > 1:
         parts = parts[:-1]
     return ".".join(parts)
 
 
-# Modules of examples are a user's: cases name them, and nothing imports them.
+# Modules of examples stand for a user's modules: cases name them, and the package does not import them.
 SOURCES = [path for path in sorted(ROOT.rglob("*.py")) if path.parent != ROOT / "examples"]
 MODULES = {module_of(path): path for path in SOURCES}
 
 
-# Five tests ask for the same files, and to parse all of them takes a second.
+# Five tests use the same files, and parsing all of them takes a second.
 @cache
 def imported(path: Path) -> list[str]:
     """Every name that a file imports, inside functions and for type checkers too."""
@@ -90,7 +90,7 @@ def arrows(module: str) -> set[str]:
 
 
 def part(module: str) -> str:
-    """The part of the package, which has a floor, that a module belongs to."""
+    """Return the part of the package, a name in FLOORS, that a module belongs to."""
     return module.split(".")[0]
 
 
@@ -124,9 +124,9 @@ def test_modules_import_in_no_circle():
 
 
 def room(module: str) -> str:
-    """A folder within a part, such as dynamics.ts, with all its modules; other modules stand for themselves.
+    """Return the folder of a module within its part, such as dynamics.ts, or the module if there is no such folder.
 
-    Parts as wholes have no circle: arrows between them point down.
+    Whole parts need not be tested: imports between them point down.
     """
     parts = module.split(".")
     if ROOT.joinpath(*parts[:2]).is_dir():
@@ -136,7 +136,7 @@ def room(module: str) -> str:
 
 @pytest.mark.slow
 def test_folders_import_in_no_circle():
-    """A folder is imported as a whole: two modules of it may not lie above and below a third one outside."""
+    """Folders import each other in no circle: a module outside lies above all modules of a folder or below all."""
     rooms: dict[str, set[str]] = {}
     for module in MODULES:
         rooms.setdefault(room(module), set()).update(map(room, arrows(module)))
@@ -170,7 +170,7 @@ def test_figures_wait_with_matplotlib():
 
 @pytest.mark.slow
 def test_no_function_hides_a_module():
-    """No package hands out a name of one of its modules: importing the module would replace it."""
+    """No package has an attribute with the name of one of its modules: importing the module would replace it."""
     names = sorted(module for module in MODULES if not module.startswith("__"))
     run_python(f"""
 import importlib, inspect, petsc4py

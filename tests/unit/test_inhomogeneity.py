@@ -15,7 +15,7 @@ ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 
 
 def scattered_chain(ends: str = "fixed", seed: int = 1) -> Chain:
-    """A damped four-band lattice, every mass, spring and dashpot of which is another."""
+    """Return a damped four-band lattice whose masses, springs and dashpots all differ."""
     springs = []
     for number, spring in enumerate(four_band().springs):
         springs.append(replace(spring, damping=0.1 * number))
@@ -131,7 +131,7 @@ def test_rayleigh_damping_is_added_to_the_dashpots_of_a_case():
     assert cell.grounding == pytest.approx((0.02, 0.3 + 0.04))
     assert Case.from_toml(case.to_toml()) == case
 
-    # At the wavenumber pi the spring to the next cell has 4 c of its mass.
+    # At the wavenumber pi the dashpot c to the next cell adds 4 c to the diagonal.
     bloch = UnitCell(cell.masses, cell.springs, 0, 1, cell.grounding).damping_matrix(np.pi)
     assert bloch == pytest.approx(np.array([[4 * 0.59 + 0.07, -0.05], [-0.05, 0.39]]))
 

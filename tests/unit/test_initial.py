@@ -34,7 +34,7 @@ def case_with(**sections: dict[str, Any]) -> Case:
 @pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_modes_solve_the_eigenvalue_problem(ends):
-    """Counted and found one by one, they are those of dense matrices, copies on a ring too."""
+    """Modes, found one by one by their numbers, are those of dense matrices, also pairs of one frequency on a ring."""
     chain = Chain(four_band(), 50, ends)
     numbers = range(1, 201)
     frequencies = np.array([mode_frequency(chain, number) for number in numbers])
@@ -47,7 +47,7 @@ def test_modes_solve_the_eigenvalue_problem(ends):
     residual = shapes @ stiffness - frequencies[:, None] ** 2 * masses * shapes
     assert np.abs(residual).max() < 1e-9 * frequencies[-1] ** 2 * masses.max()
     assert np.abs(shapes).max(axis=1) == pytest.approx(1.0)
-    # They are different ones: together they span all.
+    # Shapes are independent: together they span all motions.
     assert np.linalg.matrix_rank(shapes, tol=1e-6) == 200
     # A lattice that is not fixed moves as a whole.
     assert (frequencies[0] == 0) == (ends != "fixed")
@@ -75,7 +75,7 @@ def test_modes_of_a_long_chain_are_those_in_closed_form(ends, number):
         shape = np.cos(phase * (np.arange(LONG) + 0.5))
     omega = 2 * np.sqrt(STIFFNESS / MASS) * np.sin(phase / 2)
 
-    # The error of the square is that of rounding of the largest one, 4 k/m.
+    # The error of omega^2 is the rounding of the largest one, 4 k/m.
     assert mode_frequency(chain, number) ** 2 == pytest.approx(omega**2, rel=0, abs=1e-14 * STIFFNESS / MASS)
     assert number_near(chain, omega * (1 + 1e-7 / number)) == number
     found = mode_shape(chain, number).ravel()
@@ -91,7 +91,7 @@ def test_a_case_may_name_the_mode_near_a_frequency(ends):
         initial={"kind": "mode", "near": 300.0, "amplitude": 1e-3},
         time={"end": 0.01},
     )
-    # Half a spacing of the 20,000 modes, which is largest in the middle of the band.
+    # The spacing of the modes is largest at low frequencies; half of it is pi/40,000 sqrt(k/m) = 0.12 rad/s.
     assert case.initial.frequency == pytest.approx(300, abs=0.2)
     assert case.initial.number == number_near(case.model().chain, 300.0)
 
@@ -101,7 +101,7 @@ def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
     u, v = packet.on(Chain(four_band(), 1000), 0, 1000)
     envelope = np.hypot(u, v / bloch(four_band(), 1.2).frequency[1]).max(axis=1)
     x = np.arange(1000) - 500
-    # Waves of a band of wavenumbers have somewhat different frequencies and shapes.
+    # The waves of the packet differ somewhat in frequency and shape.
     assert envelope.max() == pytest.approx(1.0, rel=0.02)
     assert np.sqrt(np.average(x**2, weights=envelope**2)) == pytest.approx(20 / np.sqrt(2), rel=0.02)
     assert np.average(x, weights=envelope**2) == pytest.approx(0, abs=0.1)
@@ -283,7 +283,7 @@ def test_an_orbit_beyond_the_lattice_is_refused(branch):
     ],
 )
 def test_a_lossy_stop_without_clearance_is_refused_where_the_state_is_at_rest(branch, sites, join, is_at_rest):
-    """The dissipation divides by the approach velocity, which is zero there."""
+    """A stop with losses and no clearance is refused at rest: its force divides by the approach velocity, then zero."""
     contacts = {"sites": sites, "clearance": 0.0, "side": "plus", "restitution": 0.7, "stiffness": 1e6} | join
     changes = {"contacts": contacts, "initial": {"kind": "file", "path": str(branch)}}
     if is_at_rest:
@@ -294,7 +294,7 @@ def test_a_lossy_stop_without_clearance_is_refused_where_the_state_is_at_rest(br
 
 
 def test_a_lattice_that_nothing_drives_may_absorb_at_its_first_cell():
-    """An end is refused that covers a packet, and not for the cell of a drive that there is not."""
+    """An absorbing end may cover cell 1, a drive's default cell, if nothing drives, and must not cover a packet."""
     ends = {"end": "both", "cells": 5, "strength": 50.0}
     absorbing = FOUR_BAND | {"absorbing": ends}
     for initial in (PACKET, {"kind": "mode", "number": 3, "amplitude": 1e-3}):

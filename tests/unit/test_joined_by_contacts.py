@@ -1,4 +1,4 @@
-"""Cells with springs of their own that contacts alone join: what they have, and what they are refused for."""
+"""Lattices whose cells contacts alone join: modes of a cell, features that are refused, branches and responses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def table(**sections: dict[str, Any]) -> dict[str, Any]:
 
 
 def problem_of(kind: type, **sections: dict[str, Any]) -> tuple[str, str]:
-    """Key and remedy of the one problem of a case."""
+    """Return key and remedy of the only problem of a case."""
     with pytest.raises(CaseError) as error:
         kind.from_table(table(**sections))
     [problem] = error.value.problems
@@ -63,7 +63,7 @@ def test_bands_say_what_there_is():
     numbers = bands_table(CELL)
     assert numbers["bands"] == numbers["gaps"] == []
     assert numbers["cell_modes"] == pytest.approx([0.0, LOCAL], rel=1e-12)
-    # What a cell with bands, or without any spring, had before.
+    # Tables of a cell with bands, or without any spring, have no modes of a cell.
     assert "cell_modes" not in bands_table(four_band()) | bands_table(UnitCell((1.0,), (), 0, 0))
 
 
@@ -112,7 +112,7 @@ def test_what_needs_waves_is_refused(sections, key, reason):
 
 
 def test_what_springs_within_cells_have_is_accepted():
-    """Dashpots beside them, parts that are not linear, cells that differ."""
+    """Springs within cells may have dashpots and nonlinear parts, and cells may differ."""
     spring = INSIDE | {"damping": 0.1, "cubic": 1e9}
     lattice = {
         "cell": {"masses": [4e-3, 2e-3], "springs": [spring]},
@@ -124,7 +124,7 @@ def test_what_springs_within_cells_have_is_accepted():
 
 @pytest.mark.parametrize("speed", [1e-6, 1.0])
 def test_a_struck_grain_has_the_faster_of_its_spring_and_its_contact(speed):
-    """By the square root of the sum of its springs over its mass, or by the duration of the contact."""
+    """A struck grain has the larger of two frequencies: (k/m)^(1/2) by its springs, and pi over the contact time."""
     struck = {"kind": "velocity", "cell": 1, "velocity": speed}
     given = table(contacts=PRESSED | {"precompression": None}, initial=struck)
     del given["drive"]
@@ -162,7 +162,7 @@ def chain_of(pairs: tuple[Pair, ...]) -> Chain:
 
 
 def test_bodies_are_what_springs_and_pressed_contacts_hold_together():
-    """The ground first, then grain and resonator of each cell."""
+    """Numbers of bodies are those of the ground, then of grain and resonator of each cell."""
     between, ground = Pair(0, 0, next_cell=True), Pair(-1, 0)
     pressed, apart = (-1e-5, np.inf), (1e-5, np.inf)
     assert bodies_of(chain_of((between,)), [apart]) == [0, 1, 1, 2, 2]
@@ -182,7 +182,10 @@ def modes_case(modes: list[int], contacts: dict[str, Any] | None = None, ends: s
 @pytest.mark.parametrize("ends", ["free", "fixed"])
 @pytest.mark.parametrize(("contacts", "still"), [({}, 1), (APART, 4)])
 def test_branches_begin_where_a_motion_oscillates(ends, contacts, still):
-    """A pressed chain moves as a whole, whatever its ends are: no spring goes to a wall. Apart each grain does."""
+    """Rigid motions are refused by their numbers: one of a pressed chain with any ends, four of four separate grains.
+
+    No spring joins an end to a wall.
+    """
     modes = list(range(1, 9))
     with pytest.raises(CaseError, match="can move as a rigid body") as error:
         NnmCase.from_table(modes_case(modes, contacts, ends))
@@ -194,7 +197,11 @@ def test_branches_begin_where_a_motion_oscillates(ends, contacts, still):
 
 
 def test_modes_of_a_pressed_chain_are_those_of_masses_in_masses():
-    """With free ends kappa = j pi/n; the two branches solve (pull + k2 - m1 w^2)(k2 - m2 w^2) = k2^2."""
+    """The modes of n pressed grains have kappa = j pi/n with free ends.
+
+    Both branches solve (q + k2 - m1 w^2)(k2 - m2 w^2) = k2^2 with q = 4 k sin^2(kappa/2) and the slope k of the
+    contact's force, 3/2 times the stiffness times the square root of the precompression.
+    """
     slope = 1.5 * 1e7 * 1e-4**0.5
     expected = []
     for j in range(4):
@@ -208,7 +215,7 @@ def test_modes_of_a_pressed_chain_are_those_of_masses_in_masses():
 @pytest.mark.parametrize(
     ("springs", "mode", "is_still"),
     [
-        # A spring between the pair: it moves as a whole. A third mass, at whose spring the model holds the resonator.
+        # A spring between the pair alone lets it move as a whole; a spring to a third mass holds the resonator.
         ([INSIDE], 1, True),
         ([INSIDE], 2, False),
         ([INSIDE, {"start": 2, "end": 3, "stiffness": 1e3}], 1, False),
@@ -235,7 +242,10 @@ def response(**sections: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_responses_are_those_of_a_pressed_chain():
-    """Pressed contacts are its springs; apart on one side alone, mean forces push grains with their resonators away."""
+    """Pressed contacts are springs of the chain; contacts apart are accepted on both sides alone.
+
+    The mean force of a contact on one side pushes grains, which no spring holds, apart.
+    """
     case = NfrcCase.from_table(response())
     assert case.are_contacts_springs and not case.nfrc.infinite
     assert NfrcCase.from_table(response(contacts=APART)).nfrc.symmetric

@@ -1,4 +1,4 @@
-"""What pictures keep between them: parsed formulas, fonts without tables of typesetting, small pictures of a report."""
+"""Savings of pictures: formulas parsed once, fonts without typesetting tables, small pictures of a report."""
 
 import io
 

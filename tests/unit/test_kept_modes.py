@@ -1,4 +1,4 @@
-"""Modes kept between runs: the bits of those computed, of the same lattice alone, and never an error."""
+"""Modes kept between runs have the bits of computed ones, serve the same lattice alone, and never cause an error."""
 
 import os
 from dataclasses import replace
@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def in_a_later_run(chain, monkeypatch):
-    """The modes of ``chain`` as a later process gets them, which may not compute any."""
+    """Return the modes of ``chain`` as a later process reads them; computing them again fails the test."""
     module._kept.cache_clear()
     with monkeypatch.context() as later:
         later.setattr(module, "linear_modes", lambda chain: pytest.fail("computed again"))
@@ -81,7 +81,7 @@ def test_a_damaged_file_is_computed_again(damage, folder):
 
     module._kept.cache_clear()
     np.testing.assert_array_equal(kept_modes(CHAIN).vectors, computed)
-    # And it is whole again.
+    # The file is whole again.
     assert len(path.read_bytes()) > 8 * computed.size
 
 
@@ -97,7 +97,7 @@ def test_the_folder_is_bounded_and_keeps_what_was_used_last(folder, monkeypatch)
         before = {*folder.iterdir()}
         keep(name)
         (path,) = {*folder.iterdir()} - before
-        # Times of files are too coarse to tell these calls apart.
+        # Times of files are too coarse to order these calls, hence they are set.
         os.utime(path, (1e9 - age, 1e9 - age))
     os.utime(first, (1e9 - 30, 1e9 - 30))
 

@@ -1,4 +1,4 @@
-"""Ticks that are placed once: the pixels of matplotlib's own, fewer placements, new ones where something moves."""
+"""Ticks that are placed once give matplotlib's own pixels, with fewer placements, and move where axes change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def pixels(figure: Figure) -> np.ndarray:
 
 @pytest.fixture
 def placements(monkeypatch) -> Counter[str]:
-    """How often ticks are placed, and their labels measured."""
+    """Return counts of how often ticks are placed and their labels are measured."""
     counts: Counter[str] = Counter()
     for name in ("_update_ticks", "_get_ticklabel_bboxes"):
         own = getattr(Axis, name)
@@ -63,7 +63,7 @@ def test_a_picture_has_the_same_pixels_from_fewer_placements(placements):
 
 @pytest.mark.parametrize("change", ["limits", "frame", "resolution"])
 def test_ticks_are_placed_anew_where_something_moves(change):
-    """What is drawn after a change is what matplotlib draws of it."""
+    """After a change of limits, frame or resolution the pixels are those of matplotlib without kept ticks."""
 
     def changed(figure: Figure) -> np.ndarray:
         pixels(figure)

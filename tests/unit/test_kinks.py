@@ -1,4 +1,4 @@
-"""Kinks in the force of a contact that is pressed at rest: where they are found, and substeps that end on them."""
+"""Kinks in the force of a contact that is pressed at rest: their positions, and substeps that end on them."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ from vipetsc.dynamics.propagator.kinks import first_kink
 from vipetsc.dynamics.propagator.nodes import EXIT
 from vipetsc.dynamics.propagator.substeps import Substep
 
-# What first_kink returns without a kink.
+# The value of first_kink if there is no kink.
 NONE = 2.0
 
 
@@ -23,13 +23,13 @@ NONE = 2.0
 @pytest.mark.parametrize(
     ("motion", "kink"),
     [
-        # At constant velocity: through the kink, away from it, or not as far.
+        # Motions of constant velocity go through the kink, away from it, or not as far.
         ([0.2, -1.0], 0.2),
         ([-0.2, 1.0], 0.2),
         ([-0.2, -1.0], NONE),
         ([0.2, 1.0], NONE),
         ([1.2, -1.0], NONE),
-        # On the kink at the beginning: the direction decides, and it may come back.
+        # Motions that begin on the kink, within 2e-11, have one only where they come back.
         ([0.0, 1.0, -2.0], 0.5),
         ([0.0, -1.0, 2.0], 0.5),
         ([0.0, 1.0, 0.0], NONE),
@@ -38,7 +38,7 @@ NONE = 2.0
         ([-2e-11, 1.0, -2.0], 0.5),
         ([1e-10, -1.0, 2.0], 1e-10),
         ([-1e-10, 1.0, -2.0], 1e-10),
-        # The substep ends on it; it opens and closes inside; it touches from either side.
+        # The substep ends on the kink, or has two of them inside, or the motion turns before it.
         ([1.0, -1.0], NONE),
         ([-1.0, 1.0], NONE),
         ([1.0 - 2e-11, -1.0], NONE),
@@ -61,13 +61,13 @@ def test_a_kink_is_found_where_a_pressed_contact_opens_or_closes(side, gap, moti
 
     assert first_kink(cluster, cluster.trial, length) == pytest.approx(kink, rel=1e-9)
 
-    # Other contacts have modes, which are searched for elsewhere.
+    # Contacts that are not permanent have modes, whose changes another search finds.
     cluster.contacts["mode"] = side * CLOSED
     assert first_kink(cluster, cluster.trial, length) == NONE
 
 
 class SubstepsOnKinks:
-    """The loop that ends substeps on kinks, in Python, with kinks and substeps that a test prescribes.
+    """The loop that ends substeps on kinks, run in Python, with kinks and substeps that a test prescribes.
 
     ``lengths`` are those of the substeps that were tried; ``state`` is the cluster's.
     """
@@ -111,7 +111,7 @@ def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut
 
 
 def test_repetitions_end_although_each_substep_has_a_kink(monkeypatch):
-    # Rounding could keep a kink just inside for ever.
+    # Rounding could keep a kink just inside of every substep.
     loop = SubstepsOnKinks(monkeypatch, [0.9] * (MOST_ATTEMPTS + 5))
     assert loop.end(0.4).length == pytest.approx(0.4 * 0.9**MOST_ATTEMPTS)
     assert len(loop.lengths) == MOST_ATTEMPTS

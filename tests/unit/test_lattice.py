@@ -1,4 +1,4 @@
-"""Bands, matrices, contacts and drives of lattices: closed forms, other routes to the same, published numbers."""
+"""Bands, matrices, contacts and drives of lattices against closed forms, other computations and published numbers."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def cells(draw):
     positive = st.floats(0.1, 10)
     mass = st.integers(0, n - 1)
     masses = tuple(draw(st.lists(positive, min_size=n, max_size=n)))
-    # The line connects the masses: one that nothing holds would move by itself.
+    # The line connects all masses: a mass without springs would have the frequency 0.
     springs = [Spring(i, i + 1, draw(positive)) for i in range(n - 1)]
     for _ in range(draw(st.integers(1, 2))):
         springs.append(Spring(draw(mass), draw(mass), draw(positive), next_cell=True))
@@ -50,7 +50,7 @@ def test_diatomic_bands_have_their_closed_form():
     mean = (a / m1 + k / m2) / 2
     product = (a * k - k**2) / (m1 * m2)
     upper = mean + np.sqrt(mean**2 - product)
-    # By Vieta's rule, since the lower root would be a difference of large numbers.
+    # The lower root follows from Vieta's rule, since it is a difference of large numbers else.
     expected = np.sqrt(np.stack([product / upper, upper], axis=-1))
     assert np.allclose(bloch(diatomic(), KAPPA).frequency, expected, rtol=1e-9, atol=1e-3)
 
@@ -65,13 +65,13 @@ def test_diatomic_bands_have_their_closed_form():
 )
 def test_pass_bands_and_gaps_are_the_published_ones(cell, edges):
     found = pass_bands(cell)
-    # Published to two decimals.
+    # The published edges have two decimals.
     assert np.ravel([(band.low, band.high) for band in found]) == pytest.approx(edges, abs=0.006)
     assert np.ravel(gaps(found)) == pytest.approx(edges[1:-1], abs=0.006)
 
 
 def test_published_drive_frequencies_and_speeds():
-    # The wavenumber that the paper drives.
+    # The paper drives the wavenumber 5 pi/9.
     optical = bloch(diatomic(), 5 * np.pi / 9)
     assert optical.frequency[1] == pytest.approx(5520.026, abs=1e-3)
     assert optical.group_velocity[1] == pytest.approx(1587, abs=0.5)
@@ -83,13 +83,13 @@ def test_published_drive_frequencies_and_speeds():
 
 
 def test_the_stiffness_of_a_contact_is_hertzs():
-    """Two spheres of 100 MPa and 5 mm have 2 E sqrt(r)/(3 (1 - nu^2)): 3 * 0.91 = 2.73."""
+    """A contact of 100 MPa, r = 5 mm and nu = 0.3 has 2 E sqrt(r)/(3 (1 - nu^2)), with 3 (1 - nu^2) = 2.73."""
     assert contact_stiffness(1e8, 0.005, 0.3) == pytest.approx(2e8 * np.sqrt(0.005) / 2.73)
 
 
 def test_long_waves_travel_at_the_static_speed():
     """At kappa = 0 the speed is the square root of the cell's stiffness in series over its mass."""
-    # The springs from one cell to the next, one after the other.
+    # One spring of 2e4 N/m and two of 1e4 N/m lie in series between a mass and its image in the next cell.
     series = 1 / (1 / 2e4 + 2 / 1e4)
     assert bloch(four_band(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(series / 0.015), rel=1e-6)
     assert bloch(diatomic(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(9e4 / 0.09), rel=1e-6)
@@ -98,7 +98,7 @@ def test_long_waves_travel_at_the_static_speed():
 @pytest.mark.parametrize("cell", [four_band(), four_band("calibrated"), diatomic()])
 def test_waves_at_a_frequency_lie_on_the_branch(cell):
     _, frequency, speed = max_group_velocity(cell, 2)
-    # One wave: bands do not overlap at this frequency.
+    # There is one wave, since bands do not overlap at this frequency.
     ((band, kappa, found),) = waves_at(cell, frequency)
     assert band == 2
     assert found == pytest.approx(speed, rel=1e-6)
@@ -115,10 +115,10 @@ def test_no_wave_travels_in_a_gap(cell):
 @given(cells(), st.floats(-np.pi, np.pi))
 def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
     k = cell.stiffness_matrix(kappa)
-    # To the bit, as eigh reads one triangle alone.
+    # The matrix is Hermitian to the bit, since eigh reads one triangle alone.
     assert np.array_equal(k, k.conj().T)
     assert np.linalg.eigvalsh(k).min() > -1e-9 * np.abs(k).max()
-    # A cell that moves as a whole stretches nothing, and waves to the left are as those to the right.
+    # A cell that moves as a whole strains no spring; waves to the left have the frequencies of waves to the right.
     assert np.allclose(cell.stiffness_matrix(0.0) @ np.ones(cell.dofs), 0, atol=1e-9)
     assert np.allclose(bloch(cell, kappa).frequency, bloch(cell, -kappa).frequency, atol=1e-6)
 
@@ -132,7 +132,7 @@ def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, k
     residual = cell.stiffness_matrix(kappa) @ point.vectors - m @ point.vectors * point.frequency**2
     assert np.abs(residual).max() < 1e-8
 
-    # Where branches meet, a difference quotient crosses from one to the other.
+    # Where branches meet, a difference quotient would take one value from each of two branches.
     squared = np.sort(point.frequency**2)
     is_apart = np.diff(squared).min() > 1e-2 and squared[0] > 1e-2
     if is_apart:
@@ -158,7 +158,7 @@ def test_fixed_ends_are_free_ones_with_springs_to_walls(cell, n):
     fixed = Chain(cell, n, "fixed").stiffness_matrix().toarray()
     free = Chain(cell, n, "free").stiffness_matrix().toarray()
     assert np.array_equal(fixed, fixed.T)
-    # Moved as a whole, a free chain stretches nothing.
+    # A free chain that moves as a whole strains no spring.
     assert np.allclose(free.sum(axis=1), 0, atol=1e-9)
 
     walls = np.zeros(n * cell.dofs)
@@ -174,7 +174,7 @@ def test_a_springs_slope_and_energy_are_derivative_and_integral_of_its_force():
     z = np.linspace(-2e-3, 2e-3, 9)
     h = 1e-6
 
-    # Central differences, exact for a cubic but for h^2 of its third derivative.
+    # Central differences of a cubic have no error but h^2/6 times its third derivative.
     slope = (spring.nonlinear_force(z + h) - spring.nonlinear_force(z - h)) / (2 * h)
     force = (spring.nonlinear_energy(z + h) - spring.nonlinear_energy(z - h)) / (2 * h)
     assert spring.nonlinear_slope(z) == pytest.approx(slope, rel=1e-5, abs=1e-4)
@@ -190,8 +190,8 @@ def test_a_spring_is_linear_without_further_terms_and_odd_without_a_quadratic_on
 
 
 def test_cell_problems_are_all_named():
-    # A spring from a mass to itself, one to a mass that is not there and of negative stiffness, a contact of one
-    # mass.
+    # The problems are a negative mass, a spring from a mass to itself, a spring of negative stiffness to a mass that
+    # does not exist, and a contact of a mass with itself.
     springs = (Spring(0, 0, 1.0), Spring(0, 5, -1.0))
     keys = {key for key, _ in cell_problems((1.0, -1.0), springs, 1, 1)}
     assert keys == {"masses[2]", "springs[1]", "springs[2].stiffness", "springs[2]", "contact"}
@@ -212,13 +212,13 @@ def test_a_cell_with_a_problem_is_refused():
 def test_a_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
     """The paper's window 1 - cos has the peak 2, Hann's half of it."""
     burst = ToneBurst(3.0, 100.0, 30, envelope)
-    # 30 cycles at 100 rad/s.
+    # The burst has 30 cycles at 100 rad/s.
     assert burst.duration == pytest.approx(0.6 * np.pi)
 
     t = np.linspace(-0.1, burst.duration + 0.1, 200_001)
     force = burst.force(t)
     assert np.all(force[(t <= 0) | (t >= burst.duration)] == 0)
-    # No crest of the oscillation need be at the window's.
+    # The oscillation need not have a crest where the window has its peak.
     assert np.abs(force).max() == pytest.approx(3 * peak, rel=5e-3)
     middle = 0.3 * burst.duration
     assert burst.force(middle) == pytest.approx(3 * peak / 2 * (1 - np.cos(2 * np.pi * 0.3)) * np.sin(100 * middle))
@@ -234,7 +234,7 @@ def test_the_scale_of_the_wave_is_linear_in_the_drive():
 
 
 def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
-    """By Green's function of the whole lattice, for lattices and drives that differ in one thing each."""
+    """The scale is the peak force times the largest |Green's function| of the whole lattice for the driven mass."""
     burst = ToneBurst(2.0, 1206.34, 30)
     # A complex frequency gives the waves the length of the burst.
     omega = 1206.34 * (1 - 1j / 30)
@@ -251,7 +251,7 @@ def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
 def test_a_contacts_force_is_the_slope_of_its_potential(law):
     contact = Contact(law, 1e6)
     d = 2e-3
-    # Beyond either stop, just beyond it, and between them.
+    # Elongations in m beyond either stop, just beyond it, and between the stops.
     w = np.array([-3e-3, -2.2e-3, -1e-3, 0.0, 1e-3, 2.2e-3, 3e-3])
     h = 1e-8
 
@@ -300,17 +300,20 @@ def test_a_fast_separation_pulls_unless_it_is_clipped_or_the_approach_has_a_floo
     assert contact.dissipation_factor(-1.0, 0.1) < 0
     assert Contact("hertz", 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
     floored = Contact("hertz", 1e6, 0.7, approach_floor=0.5)
-    # The floor takes the sign of the approach: c/0.5 = 0.9, against the approach.
+    # The floor of 0.5 m/s takes the sign of the approach: with the rate 1 m/s, g = 1 - c/0.5 and c = 0.45.
     assert floored.dissipation_factor(1.0, -1e-12) == pytest.approx(1 - 0.9)
 
 
 @pytest.mark.parametrize("cells", [100, 235, 400])
 def test_the_wave_of_a_long_ring_is_that_of_a_short_one(cells):
-    """A short burst decays before it is once round: the ring's length does not matter, nor does the driven cell."""
+    """The scale of a short burst depends neither on the length of a ring nor on the driven cell.
+
+    The burst decays before it has travelled once along the ring.
+    """
     burst = ToneBurst(1.0, 1023.3, 8)
     short = Chain(four_band("calibrated"), 64, "periodic").wave_scale(burst)
 
     ring = Chain(four_band("calibrated"), cells, "periodic")
     assert ring.wave_scale(burst) == pytest.approx(short, rel=1e-6)
-    # A ring has no first cell.
+    # All cells of a ring are equivalent.
     assert ring.wave_scale(burst, cell=cells // 3) == pytest.approx(short, rel=1e-6)

@@ -1,4 +1,4 @@
-"""The layout that measures the text next to axes once, against the one that measures it in each of two passes."""
+"""The layout that measures the text of axes once, against matplotlib's, which measures it in each of two passes."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from vipetsc.figures.style import new_figure, rc_style, save
 
 @pytest.mark.parametrize("wide", [False, True])
 def test_axes_are_placed_as_by_the_layout_that_measures_everything_twice(wide):
-    """To a fiftieth of an inch, the axes of colour bars too."""
+    """Axes, those of colour bars too, have the places of matplotlib's layout within a fiftieth of an inch."""
 
     def pages():
         with rc_style():
@@ -37,7 +37,7 @@ def test_axes_are_placed_as_by_the_layout_that_measures_everything_twice(wide):
 
 
 def test_a_note_below_a_picture_leaves_the_picture_as_it_is(tmp_path):
-    """Colour bars too, whose frames are less than their place."""
+    """A note adds a strip below and moves neither axes nor a colour bar, whose frame is smaller than its place."""
     pictures = []
     for note in ("", "a note"):
         with rc_style():
@@ -49,13 +49,13 @@ def test_a_note_below_a_picture_leaves_the_picture_as_it_is(tmp_path):
 
     plain, noted = pictures
     assert len(noted) > len(plain)
-    # Edges of lines and letters may be in other fractions of a pixel.
+    # Edges of lines and letters may move by fractions of a pixel.
     differing = np.abs(noted[: len(plain)].astype(int) - plain).max(axis=2) > 64
     assert differing.mean() < 0.01
 
 
 def test_text_is_measured_again_where_ticks_change(monkeypatch):
-    """The layout shrinks these axes to where they have labels of fewer letters."""
+    """Text is measured again for axes that the layout shrinks so far that their tick labels have fewer letters."""
     measured = []
     original = Axes.get_tightbbox
 

@@ -26,9 +26,9 @@ CUBIC_CELL = {
         ({"clearance": 4e-4, "clearance_minus": 1e-4}, [2.0]),
         ({"clearance": 1e-4, "clearance_minus": 4e-4}, [2.0]),
         ({"clearance": 1e-4, "clearance_minus": 4e-4, "side": "minus"}, [0.5]),
-        # To ground, of whose motion the envelope, that of the cell's pair, shows nothing.
+        # The contact is to ground, and the envelope is that of the cell's pair: the distance is unknown.
         ({"clearance": 4e-4, "pair": [0, 2]}, np.inf),
-        # Pressed at rest: there is no linear motion without the contact.
+        # These contacts touch or are pressed at rest: no motion is linear without the contact.
         ({"clearance": 1e-4, "precompression": 3e-4, "side": "plus", "restitution": 1.0}, np.inf),
         ({"clearance": 0.0, "side": "plus", "restitution": 1.0}, np.inf),
     ],

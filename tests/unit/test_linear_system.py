@@ -8,7 +8,7 @@ from vipetsc.dynamics.propagator.linear_system import solve_in_place
 
 @pytest.mark.parametrize("size", [1, 2, 9])
 def test_a_system_is_solved(size):
-    """Its residual is rounding, also where the first pivot is zero and rows differ by ten orders of magnitude."""
+    """The residual is rounding, also where the first pivot is zero and rows differ by ten orders of magnitude."""
     random = np.random.default_rng(size)
     matrix = random.standard_normal((size, size)) * 10.0 ** random.uniform(-5, 5, (size, 1))
     if size > 1:
@@ -22,7 +22,7 @@ def test_a_system_is_solved(size):
 
 
 def test_pivots_are_the_largest():
-    """Without an exchange of rows the small pivot would leave no digit of the first unknown."""
+    """Rows are exchanged for the largest pivot: the pivot 1e-20 would leave no digit of the first unknown."""
     right = np.array([[1.0], [2.0]])
     solve_in_place(np.array([[1e-20, 1.0], [1.0, 1.0]]), right)
     np.testing.assert_allclose(right, [[1.0], [1.0]], rtol=1e-15)

@@ -1,4 +1,4 @@
-"""Cells of many masses: their bands cost the cube of the masses, with the edges and the speeds of the folded chain."""
+"""Cells of many masses: edges and speeds of their bands in closed form, at a cost that goes with the cube of masses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vipetsc.lattice import Spring, UnitCell, bands, fastest_speed, pass_bands
 
 
 def folded(masses: int) -> UnitCell:
-    """A chain of equal masses and springs, ``masses`` of them in a cell."""
+    """Return the cell of a chain of equal masses and springs that takes ``masses`` of them as one cell."""
     springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
     return UnitCell(masses=(0.01,) * masses, springs=springs, host=0, resonator=1)
 
@@ -17,7 +17,7 @@ def folded(masses: int) -> UnitCell:
 @pytest.mark.slow
 @pytest.mark.parametrize("masses", [8, 40])
 def test_bands_of_a_folded_chain(masses):
-    """Band edges lie at j pi over the masses of the chain's own zone, the long waves are the fastest."""
+    """A folded chain of n masses a cell has band edges 2 (k/m)^(1/2) sin(j pi/(2 n)); its long waves are fastest."""
     top = 2 * np.sqrt(1e4 / 0.01)
     edges = top * np.sin(np.arange(masses + 1) * np.pi / masses / 2)
     found = pass_bands(folded(masses))
@@ -36,7 +36,7 @@ def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
 
 
 def graded(masses: int) -> UnitCell:
-    """A chain whose masses grow along the cell, so that no two bands touch."""
+    """Return a cell whose masses grow along it, so that no two bands touch."""
     springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
     return UnitCell(masses=tuple(np.linspace(0.01, 0.02, masses)), springs=springs, host=0, resonator=1)
 
@@ -52,7 +52,7 @@ def test_one_band_of_a_long_cell_is_that_of_all_bands(kappa):
 
 
 def test_extremes_of_bands_that_are_flat_to_rounding_are_not_refined(monkeypatch):
-    """Cells that a spring of 1e-12 of the others ties together have bands of no width."""
+    """Bands without width, of cells that springs of 1e-12 of the inner stiffness join, are not refined."""
     masses = bands.MANY_MASSES + 3
     within = tuple(Spring(i, i + 1, 1e4) for i in range(masses - 1))
     between = Spring(masses - 1, 0, 1e-8, next_cell=True)
@@ -68,5 +68,5 @@ def test_extremes_of_bands_that_are_flat_to_rounding_are_not_refined(monkeypatch
     monkeypatch.setattr(bands, "_frequency", record)
     found = pass_bands(cell)
     assert len(found) == masses
-    # The lowest band, at nearly zero, is the root of rounding errors.
+    # The lowest band, near zero, is the square root of rounding errors and may be refined.
     assert refined <= {1}

@@ -1,4 +1,4 @@
-"""Named tuples in compiled code: passed by address, and the same values as in Python whenever variables change."""
+"""Named tuples in compiled code: they are passed by address, and assignments to variables act as in Python."""
 
 import re
 from collections.abc import Callable
@@ -10,12 +10,12 @@ import pytest
 
 from vipetsc.kernel import EntryCompiler, Kernel
 
-# As in ``vipetsc.compiled``, which keeps kernels of the package alone.
+# The decorator of ``vipetsc.compiled`` keeps kernels of the package alone, hence tests have their own.
 entry = numba.njit(error_model="numpy", pipeline_class=EntryCompiler)
 
 
 def kernel(function: Callable[..., Any], disjoint: bool = False) -> Kernel:
-    """A kernel of a ``function``."""
+    """Return the kernel of a ``function``."""
     return Kernel(function, entry, {"error_model": "numpy"}, disjoint)
 
 
@@ -31,13 +31,13 @@ class Outer(NamedTuple):
 
 
 def outer(value: float, name: int) -> Outer:
-    """A tuple whose numbers are ``value`` and its double."""
+    """Return a tuple whose numbers are ``value`` and its double."""
     return Outer(inner=Inner(np.array([value, 2.0 * value]), scale=value), counts=np.zeros(1, np.int64), name=name)
 
 
 @kernel
 def weigh(record: Outer, weight: float) -> float:
-    """A number of everything in ``record``; counts how often it is asked."""
+    """Return a number that depends on every field of ``record``, and count the call in it."""
     record.counts[0] += 1
     return weight * record.inner.scale * record.inner.numbers[1] + record.name
 
@@ -49,12 +49,12 @@ def weigh_inner(inner: Inner) -> float:
 
 @entry
 def scaled(record: Outer, factor: float) -> Outer:
-    """A new tuple; its counts are those of ``record``."""
+    """Return a new tuple with scaled numbers, which has the array of counts of ``record``."""
     return Outer(Inner(record.inner.numbers * factor, record.inner.scale), record.counts, record.name + 1)
 
 
 def replace_in_loop(first: Outer, second: Outer) -> tuple[float, float]:
-    """Variables of tuples are replaced while others have what they were."""
+    """Exchange two variables that are tuples in a loop, while other variables keep their earlier values and fields."""
     current = first
     other = second
     total = 0.0
@@ -64,7 +64,7 @@ def replace_in_loop(first: Outer, second: Outer) -> tuple[float, float]:
         inner = current.inner
         current = other
         other = before
-        # The old tuple as a whole, its old part and the new one.
+        # The terms use the earlier tuple, its field, and the present tuple.
         total += 100.0 * weigh(before, 1.0 + i) + 10.0 * weigh_inner(inner) + weigh(current, 2.0)
         kept = kept * 3.0 + inner.scale + before.name
     return total, kept
@@ -76,7 +76,7 @@ replace_without_references = numba.njit(error_model="numpy", _nrt=False, pipelin
 
 @entry
 def replace_argument(record: Outer, times: int) -> float:
-    """An argument is replaced by new tuples."""
+    """Assign new tuples to an argument."""
     total = 0.0
     for _ in range(times):
         total = 10.0 * total + weigh(record, 1.0)
@@ -86,7 +86,7 @@ def replace_argument(record: Outer, times: int) -> float:
 
 @entry
 def choose(first: Outer, second: Outer, takes_first: bool) -> float:
-    """Fields and arguments of a tuple that a condition chooses."""
+    """Use fields of a tuple that a condition chooses, and that tuple as an argument."""
     inner = (first if takes_first else second).inner
     if takes_first:
         late = second.inner
@@ -98,7 +98,7 @@ def choose(first: Outer, second: Outer, takes_first: bool) -> float:
 
 @entry
 def give_back(record: Outer) -> Inner:
-    """A part of an argument, which both own afterwards."""
+    """Return a field of an argument, to which both refer afterwards."""
     part = record.inner
     same = part
     return same
@@ -109,7 +109,7 @@ def give_back(record: Outer) -> Inner:
     [(replace, ()), (replace_without_references, ()), (replace_argument, (4,)), (choose, (True,)), (choose, (False,))],
 )
 def test_values_are_those_of_python(function, arguments):
-    """Of the compiled function and the counts that it leaves in the tuples' arrays."""
+    """The compiled function returns the values, and leaves the counts in the tuples' arrays, that Python does."""
     results = []
     for call in (function, function.py_func):
         records = [outer(3.0, 5)]
@@ -129,7 +129,7 @@ def test_a_part_of_an_argument_can_be_given_back():
 
 
 def arguments_of(function: Kernel) -> list[str]:
-    """What LLVM has for the arguments of a kernel, behind the result and the error of all of numba's functions."""
+    """Return LLVM's declarations of a kernel's arguments, without the first two, numba's result and error."""
     (compiled,) = function.overloads.values()
     declared = str(compiled.library._final_module.get_function(compiled.fndesc.llvm_func_name))
     (definition,) = [line for line in declared.splitlines() if line.startswith("define")]
@@ -137,7 +137,7 @@ def arguments_of(function: Kernel) -> list[str]:
 
 
 def test_a_tuple_of_arrays_is_one_argument():
-    """Seven numbers describe an array that is no part of a tuple."""
+    """A kernel takes a tuple as one pointer, whereas numba passes seven numbers for an array by itself."""
     replace_argument(outer(3.0, 5), 1)
     record, weight = arguments_of(weigh)
     assert record.startswith("ptr noalias")
@@ -145,7 +145,7 @@ def test_a_tuple_of_arrays_is_one_argument():
 
 
 def add_product(out: np.ndarray, x: np.ndarray, factors: np.ndarray) -> None:
-    """Eight sums, each in the order of the factors."""
+    """Add products to eight sums, each in the order of the factors."""
     for k in range(factors.size):
         for i in range(8):
             out[i] += factors[k] * x[i]
@@ -160,7 +160,7 @@ def call_add_apart(out: np.ndarray, x: np.ndarray, factors: np.ndarray) -> None:
 
 
 def test_disjoint_arrays_are_marked_so():
-    """Without a change of bits."""
+    """A kernel with disjoint arrays has them declared ``noalias``, and its sums have the bits of Python's."""
     x = np.sqrt(np.arange(8.0))
     factors = np.cbrt(np.arange(1.0, 6.0))
     sums = np.linspace(0.0, 1.0, 8)

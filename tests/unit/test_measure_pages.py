@@ -44,7 +44,7 @@ def style():
 
 
 def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, parts: int = 0) -> xr.Dataset:
-    """An ensemble over ``axes``, each with the values of one or several keys, whose measures rise with the member."""
+    """Return an ensemble over ``axes``, dicts of keys with their values, whose measures rise with the member."""
     dims = [next(iter(axis)).rpartition(".")[2] for axis in axes]
     coords = {}
     for dim, axis in zip(dims, axes, strict=True):
@@ -54,7 +54,7 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
             coords[path.rpartition(".")[2]] = xr.Variable(dim, coordinate(values), about)
 
     shape = [len(next(iter(axis.values()))) for axis in axes]
-    # Every member has a value of its own: one drawn at another's place would be seen.
+    # All members have different values, so that a value drawn at a wrong place is seen.
     number = np.arange(prod(shape)).reshape(shape)
     about = {"units": "1", "long_name": "inter-band energy transfer"}
     data = {
@@ -64,7 +64,7 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
         "contact_episodes": (dims, number.astype(float), {"units": "1", "long_name": "contact episodes"}),
         "ibtet": (dims, 0.01 * (number + 1.0), about),
     }
-    # Values fall by decades from part to part, so that a curve shows whose it is.
+    # Values fall by decades from part to part, so that a curve's values identify its part.
     if parts:
         fractions = np.stack([10.0**-part * (number + 1.0) for part in range(parts)], axis=-1)
         names = ["below", *(f"band {part}" for part in range(1, parts))]
@@ -75,7 +75,7 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
 
 
 def with_samples(*axes: dict[str, list]) -> xr.Dataset:
-    """An ensemble over eight seeds and ``axes``, with the statistics that a finished sweep has."""
+    """Return an ensemble over eight seeds and ``axes``, with the statistics that a finished sweep has."""
     ensemble = ensemble_of({"disorder.seed": list(range(8))}, *axes)
     for name in ("ibtet", "contact_episodes"):
         values = ensemble[name]
@@ -126,7 +126,7 @@ def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
 
 def test_the_ring_is_at_the_largest_value():
     ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES)
-    # Away from the end of the curves, where the rising values would have the ring anyway.
+    # The largest value lies inside a curve: rising values would have the ring at the end.
     ensemble["ibtet"][0, 3] = 5.0
     (axes,) = panels(only(ensemble))
     (ring,) = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
@@ -186,7 +186,7 @@ def test_keys_that_vary_together_are_named_together():
 
 
 def test_what_does_not_vary_stands_nowhere():
-    # An axis of one value says nothing that distinguishes a page.
+    # An axis of one value distinguishes no page from another.
     figure = drawn(ensemble_of({"contacts.law": ["hertz"]}, {"lattice.reading": ["printed"]}, AMPLITUDES))
     (stem,) = figure
     assert stem == "ibtet-over-drive.amplitude"
@@ -211,7 +211,7 @@ def test_a_study_of_too_many_pages_is_cut_through_its_largest_value():
     figures = drawn(
         ensemble_of(*wide, {"drive.band": list(range(1, 9))}, {"contacts.radius": [1.0, 2.0, 3.0, 4.0, 5.0]})
     )
-    # Otherwise the study would be drawn whole, and nothing be tested.
+    # The study has more pages than are drawn.
     assert MOST_PAGES < 4**3
     (figure,) = figures.values()
     assert "through the largest value: " in title(figure)
@@ -232,7 +232,7 @@ def test_samples_are_a_mean_and_a_band():
     figure = only(ensemble)
     (axes,) = panels(figure)
     (band,) = axes.collections
-    # By xarray's own quantiles of the members.
+    # The reference is xarray's quantiles of the members.
     low, high = (ensemble["ibtet"].quantile(end, dim="seed").values for end in (0.05, 0.95))
     edges = band.get_paths()[0].vertices
     assert edges[:, 1].min() == pytest.approx(low.min())
@@ -267,7 +267,7 @@ def test_a_value_that_is_not_finite_is_no_largest():
 def test_what_cannot_be_drawn_has_a_reason():
     ensemble = ensemble_of(AMPLITUDES)
     assert reason_without_page(ensemble, "ibtet", by_name=True) == ""
-    # Zeros are left out of a study's pages, and drawn for who asks for them by name.
+    # A measure that is zero for all members has no page unless it is requested by name.
     zero = ensemble.assign(ibtet=0 * ensemble["ibtet"])
     assert reason_without_page(zero, "ibtet", by_name=False) == "0 for every member"
     assert reason_without_page(zero, "ibtet", by_name=True) == ""
@@ -279,7 +279,7 @@ def test_what_cannot_be_drawn_has_a_reason():
 
 def test_measures_are_what_is_measured_of_every_member():
     ensemble = ensemble_of(LAWS, AMPLITUDES, parts=3)
-    # Neither a value of every member nor one number of a member: both are no measure of the pages.
+    # A fit has no value for every member, and a history has several for each: neither is a measure with a page.
     ensemble["fits/ibtet/exponent"] = ("law", [1.0, 2.0])
     ensemble["entropy/history"] = (("law", "amplitude", "snapshot"), np.ones((2, 6, 9)))
     assert measures_of(ensemble) == ["contact_episodes", "ibtet", "bands/share"]
@@ -316,13 +316,13 @@ def test_values_are_distinguished_in_few_digits():
 def test_a_logarithmic_axis_has_three_labels_at_least(low, ratio):
     ticks = log_ticks(low, low * ratio)
     assert 3 <= len(ticks) <= 10
-    # Ticks are rounded, so that the outermost ones may lie beyond by a rounding.
+    # Ticks are rounded: the outermost ones may lie outside by a rounding error.
     assert low * 0.999 <= min(ticks)
     assert max(ticks) <= low * ratio * 1.001
 
 
 def test_a_short_logarithmic_axis_has_three_labels_within_its_ends():
-    """Of the ticks of a linear axis two lie inside, 7.5 and 9."""
+    """An axis from 6.05 to 10.1 has three labels inside, though a linear axis would have two, 7.5 and 9."""
     ticks = log_ticks(6.05, 10.1)
     assert len(ticks) >= 3
     assert min(ticks) >= 6.05
@@ -375,7 +375,7 @@ def test_samples_of_bands_are_those_of_the_bands():
 @pytest.mark.parametrize("numbers", [0, 1, 2, 3])
 @pytest.mark.parametrize("words", [0, 1, 2])
 def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path):
-    """Files of a page's picture and of its numbers, with every key in the names."""
+    """Every page is saved as a picture and as numbers, and names of pages contain every key."""
     axes = [AMPLITUDES, CLEARANCES, THREE][:numbers] + [LAWS, SITES][:words]
     if not axes:
         return
@@ -427,14 +427,14 @@ STOPS = {"modulus": 1e8, "radius": 0.005, "poisson": 0.3, "sites": [10, 15], "cl
     ],
 )
 def test_a_case_is_named_by_what_applies_to_it(table, name):
-    """No reading of a cell of one's own, no cycles of a harmonic drive."""
+    """The name of a case omits the reading of a cell that is no preset and the cycles of a harmonic drive."""
     case = Case.from_table({"name": "tried"} | table)
     assert Labels.of(case).member == name
     assert Labels.of(case, "drive.ramp 2 s").page.endswith("drive.ramp 2 s")
 
 
 def test_pages_of_several_sweeps_have_common_axes():
-    """Curves and maps of another sweep, of larger values over higher amplitudes, have the same limits and colours."""
+    """Pages of two sweeps, one of larger values over higher amplitudes, have common limits of axes and colours."""
     higher = {"drive.amplitude": [8.0, 16.0, 32.0, 64.0, 128.0, 256.0]}
     for axes in ([RESTITUTIONS], [CLEARANCES]):
         sweeps = [ensemble_of(*axes, AMPLITUDES), ensemble_of(*axes, higher)]
@@ -451,7 +451,7 @@ def test_pages_of_several_sweeps_have_common_axes():
 
 
 def test_pages_over_categories_have_a_common_scale_of_the_measure():
-    """Categories are each page's own; the values over them have the same limits."""
+    """Axes of categories belong to each page; axes of the values over them have common limits."""
     sweeps = [ensemble_of(SITES), ensemble_of(SITES)]
     sweeps[1]["ibtet"] *= 7
     limits = []
@@ -465,9 +465,9 @@ def test_pages_over_categories_have_a_common_scale_of_the_measure():
 
 
 def test_a_band_that_reaches_below_zero_is_shown_whole():
-    """Means that are positive begin the axis at 0 only if their band does not go further down."""
+    """An axis of positive means begins at 0 only if the band of samples does not reach below."""
     ensemble = with_samples(AMPLITUDES)
-    # Less than half of the largest mean.
+    # The smallest mean is less than half of the largest.
     ensemble["statistics/ibtet/mean"][0] = 0.01
     ensemble["statistics/ibtet/quantiles"][0] = -1.0
     (axes,) = panels(only(ensemble))
@@ -476,7 +476,7 @@ def test_a_band_that_reaches_below_zero_is_shown_whole():
 
 
 def test_pages_can_be_read(tmp_path):
-    """No text outside the page or over other text, of curves, of maps, of panels and with long names."""
+    """Pages of curves, maps and panels, also with long names, have no text outside the page or over other text."""
     for axes in (
         [AMPLITUDES],
         [RESTITUTIONS, AMPLITUDES],

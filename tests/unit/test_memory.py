@@ -1,4 +1,4 @@
-"""A run that needs more memory than there is is refused before anything is allocated or written."""
+"""Runs that need more memory than is available are refused before anything is allocated or written."""
 
 import resource
 from typing import Any
@@ -16,12 +16,12 @@ HUGE = {"lattice": {"cells": 50_000_000}, "contacts": {"sites": [6], "clearance"
 
 
 def bytes_needed(case: Case, engine: str, ranks: int = 1) -> float:
-    """Bytes that a rank needs in all."""
+    """Return the bytes that a rank needs in total."""
     return sum(memory_needed(case.model(), case.output, engine, ranks).values())
 
 
 def needs_of_many_sites(ranks: int = 1, end: float = 0.01) -> dict[str, float]:
-    """Bytes by key that the propagator needs on a rank for a million cells with 100,000 sites."""
+    """Return bytes by key that the propagator needs on a rank for a million cells with about 100,000 sites."""
     case = small_case(
         lattice={"cells": 1_000_000},
         contacts={"sites": {"first": 5, "spacing": 10, "count": 99_999}, "clearance": 1e-4},
@@ -33,14 +33,14 @@ def needs_of_many_sites(ranks: int = 1, end: float = 0.01) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_memory_grows_with_cells_and_sites_of_a_rank_but_not_with_samples_times_sites():
-    """As counted and fitted to one run: 192 MB of states of a million cells, 2.4 to 3.5 kB a site."""
+    """A million cells need 192 MB of states and each site 2.4 to 3.5 kB, as was fitted to one measured run."""
     one = needs_of_many_sites()
     two = needs_of_many_sites(ranks=2)
     assert one["lattice.cells"] == 2 * two["lattice.cells"] == pytest.approx(192e6)
     assert 2.4e8 < one["contacts.sites"] < 3.5e8
-    # A part of it is the same on every rank.
+    # A part of the sites' memory is needed on every rank.
     assert two["contacts.sites"] < 0.7 * one["contacts.sites"]
-    # 50,000 samples more of 100,000 sites would be 40 GB.
+    # 50,000 more samples of all 100,000 sites would take 40 GB.
     assert sum(needs_of_many_sites(end=10.0).values()) < sum(one.values()) + 0.2e9
 
 
@@ -79,7 +79,7 @@ def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(
     with pytest.raises(CaseError, match=message):
         run_rows(case, 1)
 
-    # With wider indices it is too large as every other run is.
+    # With wider indices the run is refused for its memory, as any other.
     monkeypatch.setattr(memory.PETSc, "IntType", np.int64)
     with pytest.raises(CaseError, match="300000000 cells, 1 sites and 251 samples need"):
         simulate(case, folder / "run")

@@ -1,4 +1,4 @@
-"""Profiles of the misfit follow a valley whose motion loses a contact on either side of it."""
+"""Profiles of the misfit follow a valley; motions on either side of the valley lack a contact."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,7 @@ JUMP = 50.0
 
 
 class BentValley:
-    """A fit of two coordinates (a, b) with cost a^2 + (b - a - BEND a^2)^2, and JUMP more without one contact."""
+    """A fit of two coordinates (a, b) with the cost a^2 + (b - a - BEND a^2)^2, plus JUMP if one contact is missing."""
 
     def __init__(self) -> None:
         self.misfit = SimpleNamespace(records=[None], cost=self.cost)
@@ -28,13 +28,13 @@ class BentValley:
         return float(z[1] - z[0] - BEND * z[0] ** 2)
 
     def tolerances(self, precision: Any) -> None:
-        """Nothing is integrated."""
+        """Return None, since no motion is integrated."""
 
     def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
         return np.zeros(2 if abs(self.distance(z)) < WIDTH else 1)
 
     def solve(self, z: np.ndarray, ends: Any, active: list[int], precision: Any) -> np.ndarray:
-        """The valley if it begins there: no derivative leads over the jump."""
+        """Return the nearest point of the valley, or ``z`` itself beyond the jump, where no derivative leads back."""
         assert active == [1]
         self.solutions += 1
         if abs(self.distance(z)) >= WIDTH:
@@ -52,12 +52,12 @@ def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
     profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
     costs = profile_costs(windows, np.zeros(2), profile, 0, side)
     assert costs == pytest.approx(np.square(places), abs=1e-12)
-    # The line of the covariance and the line through two fits leave the valley: steps were halved, and not often.
+    # The lines of the covariance and through two fits leave the valley, hence some steps are halved.
     assert windows.solutions <= 5
 
 
 def test_a_contact_that_no_motion_keeps_is_given_up():
-    """Beyond some place the motion has one contact whatever the others are, and the profile shows the jump."""
+    """For a < -2 the motion has one contact for any b, and the profile has the cost with the jump."""
 
     class Lost(BentValley):
         def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
@@ -69,7 +69,7 @@ def test_a_contact_that_no_motion_keeps_is_given_up():
 
 
 def test_places_that_bounds_cut_are_followed_from_the_fit():
-    """All places of a fit at its lower bound lie above it."""
+    """Places are listed outwards from the fit on one side; a fit at its lower bound has none below."""
     profile = MisfitProfile(np.linspace(0, 3, 4)[None], np.ones((1, 2)))
     assert profile.outwards(0, 0.0, "below").tolist() == []
     assert profile.outwards(0, 0.0, "above").tolist() == [0, 1, 2, 3]

@@ -33,13 +33,13 @@ DRIVEN = 1023.27
 
 
 def random_fields(chain: Chain, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements and velocities (t, cell, dof) of noise with comparable spring and kinetic energies."""
+    """Return random displacements and velocities (t, cell, dof) with comparable spring and kinetic energies."""
     u, v = np.random.default_rng(1).standard_normal((2, count, chain.cells, chain.cell.dofs))
     return u, v * pass_bands(chain.cell)[-1].high
 
 
 def energy_of(chain: Chain, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Kinetic and spring energy (t)."""
+    """Return the sum of kinetic and spring energy (t,)."""
     u = u.reshape(len(u), -1)
     v = v.reshape(len(v), -1)
     spring = np.sum(u * (chain.stiffness_matrix() @ u.T).T, axis=1)
@@ -47,7 +47,7 @@ def energy_of(chain: Chain, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def free_motion(chain: Chain, u: np.ndarray, v: np.ndarray, interval: float) -> tuple[np.ndarray, np.ndarray]:
-    """Fields (cell, dof) of the free lattice after an ``interval`` in s, by the matrix exponential."""
+    """Return fields (cell, dof) of the free lattice after an ``interval`` in s, from the matrix exponential."""
     n = u.size
     system = np.zeros((2 * n, 2 * n))
     system[:n, n:] = np.eye(n)
@@ -66,7 +66,7 @@ def test_energies_sum_up_and_modes_turn_freely(name, ends, cells):
     energies = parts.energies(u, v, range(3))
     assert energies.sum(axis=(0, 1)) == pytest.approx(energy_of(chain, u, v), rel=1e-12)
 
-    # 2.3 rad of the fastest oscillation.
+    # The fastest oscillation turns by 2.3 rad.
     interval = 2.3 / pass_bands(chain.cell)[-1].high
     end_u, end_v = free_motion(chain, u[0], v[0], interval)
     found = parts.modes.amplitudes(end_u[None], end_v[None])[0]
@@ -94,7 +94,7 @@ def test_modes_are_in_bands_but_for_those_of_the_ends(name, ends):
         assert parts.modes.frequency[0] == 0.0
         assert parts.part[0] == 0
 
-    # Those in bands obey the dispersion relation, whatever the ends are.
+    # Modes in bands obey the dispersion relation with any ends.
     branches = bloch(chain.cell, parts.modes.wavenumber[in_bands]).frequency
     nearest = np.abs(branches - parts.modes.frequency[in_bands, None]).min(axis=1)
     assert nearest.max() < 1e-6 * pass_bands(chain.cell)[-1].high
@@ -118,11 +118,11 @@ def test_chains_that_differ_in_contacts_alone_share_their_modes():
     assert linear_modes(replace(chain, sites=(3,), clearances=(1e-3,))) is linear_modes(chain)
 
 
-# Within the burst of 24.6 ms, across its end, and after it.
+# Intervals in s within the burst of 24.6 ms, across its end, and after it.
 @pytest.mark.parametrize(("start", "stop"), [(0.0, 1e-3), (2e-3, 5e-3), (0.02, 0.03), (0.03, 0.04)])
 @ENDS
 def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
-    """The closed form is the integral of the force by quadrature."""
+    """The closed form of the response to a burst is the integral of exp(i omega (stop - t)) times the force."""
     burst = ToneBurst(3.0, DRIVEN, 4)
     modes_ = linear_modes(Chain(CELLS["four-band"], 12, ends))
     found = modes_.driven(burst, start, stop)
@@ -130,7 +130,7 @@ def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
     if start >= burst.duration:
         assert not found.any()
         return
-    # 200 nodes of Gauss resolve 36 rad of the fastest mode to rounding.
+    # 200 nodes of Gauss resolve the fastest mode, which turns by 36 rad, to rounding.
     s, weights = np.polynomial.legendre.leggauss(200)
     last = min(stop, burst.duration)
     t = start + (last - start) * (s + 1) / 2
@@ -139,7 +139,7 @@ def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-# Within the force, from its beginning to its end, and with a time after it.
+# Intervals in s within the force, from its beginning to its end, and beyond its end.
 @pytest.mark.parametrize(("start", "stop"), [(0.013, 0.052), (0.0, 0.1), (0.0, 0.3)])
 def test_a_long_force_drives_the_modes_as_its_integral_says(start, stop):
     """Half a sine of 0.1 s, in which the fastest mode turns by 360 rad, has its integral in closed form."""
@@ -159,7 +159,7 @@ def test_a_long_force_drives_the_modes_as_its_integral_says(start, stop):
 def test_an_impulse_gives_the_modes_the_amplitudes_of_its_velocity(ends):
     modes_ = linear_modes(Chain(CELLS["four-band"], 12, ends))
     u, v = np.zeros((2, 1, 12, 4))
-    # The velocity that 1 N s gives to a mass.
+    # An impulse of 1 N s gives a mass m the velocity 1/m.
     v[0, 7, 1] = 1 / CELLS["four-band"].masses[1]
     assert modes_.amplitudes(u, v)[0] == pytest.approx(modes_.force(7, 1), abs=1e-12)
 
@@ -167,7 +167,7 @@ def test_an_impulse_gives_the_modes_the_amplitudes_of_its_velocity(ends):
 @pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
-    """Away from the ends, where they meet no wave, bands have the energies of the lattice's own modes."""
+    """Energies of bands are those of the lattice's own modes for motions that are zero near the ends."""
     chain = Chain(CELLS["four-band"], 200, ends)
     u, v = random_fields(chain)
     window = np.exp(-(((np.arange(200) - 100) / 15.0) ** 2))[:, None]
@@ -179,11 +179,11 @@ def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
     monkeypatch.setattr(modes, "MOST_DOFS", 100)
     ring = ModalParts.of(chain)
     found = ring.energies(u, v, range(3)).sum(axis=1)
-    # Other tests want modes that are exact.
+    # Other tests need exact modes.
     modes._modes.cache_clear()
 
     assert not ring.modes.exact
-    # Walls take the place of one more cell.
+    # The ring has one more cell for the two walls of a fixed lattice.
     assert ring.modes.cells == 200 + (ends == "fixed")
     assert found.sum(axis=0) == pytest.approx(energy_of(chain, u, v), rel=1e-12)
     assert found == pytest.approx(exact, abs=1e-9 * exact.sum(axis=0).max())

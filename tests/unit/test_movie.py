@@ -1,4 +1,4 @@
-"""Movies: what the frames show, that they read no more than that, files whole or not at all, bad input refused."""
+"""Movies: contents of frames, data read for them, files that are whole or absent, and input that is refused."""
 
 import h5py
 import numpy as np
@@ -52,7 +52,7 @@ def stage(opened):
 
 
 def test_envelopes_of_bands_sum_to_the_energy_of_a_ring():
-    """Of any motion of a ring the envelopes of the bands sum to its energy, each to the energy of its waves."""
+    """Envelopes of all bands sum to the energy of any motion of a ring, the envelope of each to its waves' energy."""
     chain = Chain(CELL, 30, "periodic")
     u, v = 1e-3 * np.random.default_rng(3).standard_normal((2, 30, 4))
     kinetic = 0.5 * (np.square(v) @ CELL.masses).sum()
@@ -67,7 +67,10 @@ def test_envelopes_of_bands_sum_to_the_energy_of_a_ring():
 
 @pytest.mark.parametrize("phase", [0.0, 0.7])
 def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
-    """A packet of the third band that goes to higher cells: no other band, no swing within a period."""
+    """The envelope of a packet is omega^2 |a|^2/2 at the packet, at any phase, and zero in other bands.
+
+    The packet belongs to the third band and has the amplitude a of mass-normalised waves.
+    """
     band = 2
     centre = 90
     width = 12
@@ -84,11 +87,11 @@ def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
 
     energies, *_ = wave_energies(CELL, u, v)
     wavenumbers = 2 * np.pi * np.fft.fftfreq(len(x))
-    # Wavenumbers of 200 cells are 0.031 apart.
+    # Wavenumbers of a ring of 200 cells are 0.031 apart.
     assert wavenumbers[energies[:, band].argmax()] == pytest.approx(kappa, abs=0.04)
     assert envelopes[band].sum() > 0.999 * envelopes.sum()
     assert envelopes[band].argmax() in (centre - 1, centre, centre + 1)
-    # The modes are mass-normalised. Waves of other velocity within the packet shift its envelope by up to 15 %.
+    # Waves of the packet have various velocities, which change its envelope by up to 15 %.
     expected = 0.5 * omega**2 * np.abs(profile) ** 2
     assert envelopes[band, 60:120] == pytest.approx(expected[60:120], rel=0.15)
 
@@ -96,7 +99,7 @@ def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
 @pytest.mark.slow
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
     """A site lights up in the one frame whose time since the last holds an onset, and fades by FADE a frame."""
-    # A frame is 1.5 ms.
+    # A frame stands for 1.5 ms.
     content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))
 
     # The run's six onsets belong to its two sites in turn.
@@ -138,7 +141,7 @@ def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(
     assert content.wave.sum(axis=(1, 2))[3:] == pytest.approx(kinetic[3:], rel=0.05)
     assert np.array_equal(velocities.wave[:, 0], velocity[rows, :, CELL.host])
 
-    # The mean cell of all, and of those that are shown.
+    # A movie has the mean cell of the cells that it shows.
     assert content.cell.masses == pytest.approx((0.0075, *CELL.masses[1:]))
     assert part.cell.masses[0] == pytest.approx(masses[10:, 0].mean())
     stiffness = CELL.springs[0].stiffness
@@ -162,7 +165,7 @@ def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monk
         velocity = file["velocity"][...]
 
     monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
-    # Eight frames a second of 20.8 ms: 2.6 ms a frame.
+    # Eight frames a second, which is 20.8 ms of the run, are 2.6 ms apart.
     shot = Shot("velocity", start=0.01, stop=0.0308, speed=0.0208, rate=8.0, cells=(5, 14))
     content = movie_frames(*opened, shot)
 
@@ -191,9 +194,9 @@ def test_a_gif_holds_every_frame_for_its_time(clear, stage):
             image.seek(k)
             lasts += image.info["duration"]
             frame = np.asarray(image.convert("RGB"), int)
-            # 255 colours are left: a mean deviation below one step of 256.
+            # A GIF has 255 colours: the mean deviation is below one step of 256.
             assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k
-    # In ms, of which a GIF counts tens.
+    # Durations are in ms, and a GIF counts in units of 10 ms.
     assert lasts == round(1000 * count / 3, -1)
 
 
@@ -207,8 +210,8 @@ def test_frames_have_even_sides(opened):
 
 
 def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
-    """ffmpeg gets every frame as it is; where it fails, its words are raised and the old movie stays."""
-    # In place of ffmpeg: a script that writes what it reads into the last of its arguments.
+    """ffmpeg receives every frame; if it fails, its message is raised and the old movie stays."""
+    # A script in place of ffmpeg copies its input into the file that its last argument names.
     program = tmp_path / "ffmpeg"
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\n')
@@ -230,7 +233,7 @@ def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monke
 
 @pytest.mark.slow
 def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
-    """Without ffmpeg a movie is a GIF, with a word on how to get it; a movie asked for as MP4 is refused."""
+    """Without ffmpeg a movie is a GIF, and a message says how to install it; a movie requested as MP4 is refused."""
     monkeypatch.setattr(movie, "ffmpeg", lambda: None)
     few = ["plot", str(clear), "--movie", "--speed", "0.016", "--rate", "2", "--width", "320"]
     assert main(few) == 0
@@ -274,7 +277,7 @@ def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsy
         code = ended.code
     assert code == 2
     message = capsys.readouterr().err
-    # The option with the wrong value, or the one that the others need.
+    # The message names the option with the wrong value, or the option that the others need.
     assert words.split()[-2] in message or words.split()[0] in message
     assert sorted(clear.rglob("*")) == before
 
@@ -282,7 +285,7 @@ def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsy
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
 def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
-    """Runs without sites, with a window behind them, of every third sample or of one cell have moving frames."""
+    """Runs without sites, with a window behind the sites, of every third sample or of one cell have moving frames."""
     write_run(tmp_path / "run.h5", SHAPES[shape])
     shot = Shot("velocity", rate=0.3, width=320)
 
@@ -290,7 +293,7 @@ def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
         stage = movie.MovieFigure(run, movie_frames(run, None, shot), shot.width)
         assert field_time(run)[-1] >= stage.content.time[-1]
         assert np.ptp(stage.frame(1)) > 0
-        # One cell has no wave along the lattice, of which bands would be shown.
+        # A record of one cell has no wavenumbers, hence no energies of bands.
         if shape == "single cell":
             with pytest.raises(ValueError, match="contiguous cells"):
                 movie_frames(run, None, Shot())

@@ -1,4 +1,4 @@
-"""Spoilt case files end in a case or in sentences that name the key, never in a traceback, never late."""
+"""Case files with random changes yield a case, or an error that names the key, and no other exception."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def load(path, text, *overrides):
 
 @pytest.mark.slow
 def test_spoilt_cases_are_read_or_refused(tmp_path):
-    """Of 150 case files with random changes each is read or refused by a sentence; both occur often."""
+    """Each of 150 case files with random changes is read, or refused by a sentence; both occur often."""
     spoilt = list(islice(mutations(11, without=SWEEPS), 150))
     verdicts = [judge(mutation, tmp_path / "case.toml") for mutation in spoilt]
 
@@ -37,8 +37,8 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
             defects.append((mutation.parent, mutation.changes, verdict.defect))
     assert defects == []
 
-    # Changes that all have one outcome would test nothing of the other. In thousands one of seven is read; a new key or
-    # a new example draws other changes.
+    # Both outcomes must occur: of thousands of files one in seven is read. A new key or a new example leads to other
+    # random changes.
     assert sum(bool(verdict.refusal) for verdict in verdicts) > 75
     assert sum(bool(verdict.cases) for verdict in verdicts) > 8
 
@@ -78,7 +78,7 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_named_with_its_remedy(tmp_path, text, message):
-    """A case that cannot be is refused with its key, its value and what would be right."""
+    """An impossible case is refused with its key, its value and a remedy."""
     with pytest.raises(CaseError) as caught:
         load(tmp_path / "case.toml", text)
     assert message in str(caught.value)
@@ -91,9 +91,9 @@ def test_a_byte_order_mark_is_no_key(tmp_path):
 
 
 def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):
-    """At kappa = pi, where the group velocity is 0, the end of the run cannot follow from it and may be given."""
+    """At kappa = pi the group velocity is 0, hence no end of the run follows from it; a given end is accepted."""
     (case,) = load(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
-    # The upper edge of band 2, (k2/m)^1/2 = (1e4/0.005)^1/2.
+    # The frequency is the upper edge of band 2, (k2/m)^(1/2) = (1e4/0.005)^(1/2).
     assert case.drive.frequency == pytest.approx(1414.2136)
 
 
@@ -108,7 +108,7 @@ def test_a_key_can_be_taken_out(tmp_path):
 
 
 def test_a_cell_of_ones_own_needs_no_contacts(tmp_path):
-    """A lattice of a cell of one's own without a section [contacts] has no sites; tests/verify steps one."""
+    """A lattice whose cell is no preset has no sites without a section [contacts]; tests/verify simulates one."""
     (case,) = load(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
     assert case.model().chain.sites == ()
 
@@ -125,7 +125,7 @@ def test_a_sweep_may_give_what_a_run_lacks(tmp_path):
 
 @pytest.mark.parametrize("kind", VERB_CASES, ids=lambda kind: kind.verb or "run")
 def test_every_key_of_every_verb_is_spoilt(kind):
-    """The list follows from the verbs: a section that a new verb reads cannot be left out."""
+    """All sections of all verbs are among the changed keys, also those of a verb that is added."""
     sections = {path[0] for path in known_keys()}
     assert kind.sections().keys() <= sections
 

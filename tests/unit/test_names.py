@@ -1,4 +1,4 @@
-"""Names of files after numbers: as many digits as tell them apart."""
+"""Names of files that contain numbers have as many digits as distinguish these numbers."""
 
 from mpi4py import MPI
 
@@ -17,7 +17,7 @@ from vipetsc.modes.branches.lattices import LatticeMethod
         ([1023.27, 1023.2701], ["1023.27", "1023.2701"]),
         ([0.7, 0.7000001, 0.3], ["0.7", "0.7000001", "0.3"]),
         ([1420.0, 1420.001], ["1420", "1420.001"]),
-        # Names of before stay where six digits distinguish all, and next to numbers that they do not.
+        # Six digits stay where they distinguish a number from all others, also next to numbers that need more.
         ([1 / 3, 1000 / 3, 1e7], ["0.333333", "333.333", "1e+07"]),
         ([1 / 3, 1420.0, 1420.001], ["0.333333", "1420", "1420.001"]),
         ([1.0, 1.0 + 2**-52], ["1", "1.0000000000000002"]),

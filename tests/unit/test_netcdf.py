@@ -1,4 +1,4 @@
-"""The one layout of HDF5 files: what is written is read back, by xarray as by h5py."""
+"""The layout of HDF5 files: files are read back as they were written, by xarray and by h5py."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 
 
 def measured() -> xr.Dataset:
-    """Return a dataset with everything that occurs: groups with dimensions of their own, texts, scalars, nothing."""
+    """Return a dataset with groups that have dimensions of their own, texts, scalars and empty variables."""
     variables = {
         "time": variable("time", [0.0, 0.5, 1.0], "s", "time"),
         "cell": variable("cell", [3, 7], "1", "cell, counted from 1"),
@@ -50,7 +50,7 @@ def test_what_is_written_is_read_back(tmp_path):
         assert json.loads(data.attrs["statistics"]) == {"steps": 3}
         assert data.attrs["bands/start"] == 0.5
 
-        # By the group's own coordinate, which has the name of the root's.
+        # The group's own coordinate selects, although the root has one of the same name.
         assert data["coarse/total"].sel({"coarse/time": 1.0}).item() == 4.0
         assert data["velocity"].sel(cell=7, time=0.5).item() == 3.0
         assert data["bands/energy"].sel({"bands/part": 2}).values.tolist() == [0, 1, 0]
@@ -74,7 +74,7 @@ def test_the_file_is_netcdf_4_for_other_tools(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    """A dataset without a needed coordinate is refused; the file that was there keeps its bytes, alone."""
+    """A dataset without a needed coordinate is refused; the earlier file keeps its bytes, and no other file is left."""
     path = tmp_path / "a.h5"
     write_netcdf(path, measured())
     before = path.read_bytes()
@@ -100,14 +100,14 @@ def test_fields_stay_in_the_file_until_they_are_used(tmp_path):
     "key", [(1, 0), (slice(None, None, -1), 1), ([2, 0, 2], slice(None)), ([2, 0], [1, 0, 0]), (-1, slice(1, 0))]
 )
 def test_fields_are_read_where_they_are_indexed(tmp_path, key):
-    """Positions in any order and twice, steps backwards and empty ranges, of which HDF5 knows none."""
+    """Repeated positions in any order, backward steps and empty ranges, which HDF5 does not support, can be read."""
     write_netcdf(tmp_path / "a.h5", measured())
     with open_netcdf(tmp_path / "a.h5", "run") as data:
         np.testing.assert_array_equal(data["velocity"][key].values, measured()["velocity"][key].values)
 
 
 def test_files_of_xarray_itself_are_read(tmp_path):
-    """Dimensions without a coordinate, which netCDF-4 has datasets for, texts and attributes of every type."""
+    """A file that xarray has written is read: dimensions without coordinates, texts, attributes of every type."""
     attributes = {"whole": 3, "several": [1.5, 2.5], "words": ["a", "b"], "word": "µm"}
     written = xr.Dataset({"field": (("row", "time"), np.arange(6.0).reshape(2, 3), attributes)}, {"time": [1, 2, 3]})
     written["field"].encoding["_FillValue"] = None

@@ -1,4 +1,4 @@
-"""Newton's method of PETSc: what the equations raise comes out as it is, and the solver goes on afterwards."""
+"""PETSc's Newton method: exceptions of the equations reach the caller, and the solver can be used afterwards."""
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -12,7 +12,7 @@ from vipetsc.modes.problem import FlowError
 
 
 class Circle:
-    """x^2 + y^2 = 1; the evaluation of number ``fails_at`` raises ``error``, and none of what follows is asked for."""
+    """The equation x^2 + y^2 = 1; the evaluation of number ``fails_at`` raises ``error`` and must be the last one."""
 
     def __init__(self, fails_at: dict[str, int] | None = None, error: BaseException | None = None) -> None:
         self.error = error
@@ -102,7 +102,7 @@ def test_errors_of_petsc_itself_pass(petsc_options):
 @pytest.mark.parametrize("residual", [np.nan, np.inf])
 def test_a_residual_that_is_not_finite_ends_the_attempt(make, names, residual):
     newton = make()
-    # PETSc looks at the residual itself before it asks, in most of its versions.
+    # Most versions of PETSc check the residual themselves before they call the convergence test.
     assert newton._test(newton._snes, 1, (0.8, 0.1, residual)) < 0
 
     equations = Circle()

@@ -1,4 +1,4 @@
-"""The section [nnm]: problems named all at once, cases written out and read back, what branches do not support."""
+"""The section [nnm]: all problems in one error, cases written out and read back, features that are refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_case_is_written_out_and_read_back():
 
     assert NnmCase.from_table(table) == case
     contacts = table["contacts"]
-    # SPEC section 9.
+    # These numbers stand in section 9 of SPEC.md.
     assert contacts["modulus"] == 1e8
     assert contacts["radius"] == 0.005
     assert contacts["poisson"] == 0.3
@@ -61,7 +61,7 @@ def test_what_does_not_fit_together_is_refused(nnm, message):
         NnmCase.from_table({"nnm": nnm})
 
 
-# What a spring, a smooth spring and a contact need besides the pair that it stands between.
+# Tables of a spring, a smooth spring and a contact between the masses 1 and 2.
 PAIR = {"start": 1, "end": 2}
 WRONG_PAIRS = {
     "springs": PAIR | {"stiffness": 1.0},
@@ -81,7 +81,7 @@ def test_pairs_that_are_not_in_the_system_are_named(key):
 
 
 def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
-    """Presets have a clearance and a contact's stiffness by default; for another cell both are asked for."""
+    """Presets have default clearances and contact stiffnesses; another cell without them is refused."""
     springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]
     lattice = {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}
 
@@ -105,7 +105,7 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
     ],
 )
 def test_what_branches_do_not_support_is_refused(nnm, table, key):
-    """Dissipation, and cells and contacts that are not sound, are refused for every kind of system."""
+    """Absorbing ends, stops that touch at rest and incomplete contacts are refused for every kind of system."""
     contacts = {"sites": [2], "clearance": 1e-3} | table.get("contacts", {})
     lattice = {"preset": "four-band", "cells": 8} | table.get("lattice", {})
 
@@ -124,7 +124,7 @@ def test_what_branches_do_not_support_is_refused(nnm, table, key):
     ],
 )
 def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
-    """What only a lattice has is refused for the reduced model; a stop on one side is not."""
+    """The reduced model refuses features that a lattice alone has, and accepts a stop on one side."""
     table = {"contacts": {"side": "plus"} | contacts, "lattice": {"preset": "four-band"} | lattice}
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table(table)
@@ -132,7 +132,7 @@ def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
 
 
 def test_a_lattice_that_nothing_holds_is_not_pushed():
-    """A stop to ground on one side moves a lattice with free ends away; on both sides it does not."""
+    """A free lattice between two stops to ground is accepted; one stop, whose mean force moves it away, is refused."""
     table = {
         "lattice": {"preset": "four-band", "cells": 8, "ends": "free"},
         "contacts": {"sites": [2], "clearance": 1e-3, "pair": [0, 3]},
@@ -145,7 +145,7 @@ def test_a_lattice_that_nothing_holds_is_not_pushed():
 
 
 def test_stops_to_ground_hold_symmetric_motions_alone():
-    """Between equal stops to ground a free lattice has no place of its own if other forces are not symmetric."""
+    """A free lattice between equal stops to ground is refused if other forces on it are not symmetric."""
     sites = {"sites": [2, 4], "clearance": 1e-3, "each": {"pair": [[0, 3], [2, 3]], "side": ["both", "both"]}}
     table: dict[str, Any] = {
         "lattice": {"preset": "four-band", "cells": 8, "ends": "free"},
@@ -164,7 +164,7 @@ def test_stops_to_ground_hold_symmetric_motions_alone():
 
 
 def test_a_contact_pressed_to_ground_holds_a_lattice():
-    """Its first mode is no rigid motion; so in a system of one's own."""
+    """A contact to ground that is pressed at rest holds a free lattice, or given masses, so that mode 1 oscillates."""
     contacts = {"stiffness": 20.0, "clearance": 0.0, "side": "minus", "precompression": 0.02}
     spring = {"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}
     table: dict[str, Any] = {
@@ -173,7 +173,7 @@ def test_a_contact_pressed_to_ground_holds_a_lattice():
         "nnm": {"system": "chain", "modes": [1]},
     }
     NnmCase.from_table(table)
-    # The same stop, which the mass does not touch at rest.
+    # The mass does not touch this stop at rest, hence the lattice can move as a whole.
     apart = {"stiffness": 20.0, "clearance": 0.02, "sites": [1], "pair": [0, 1]}
     with pytest.raises(CaseError, match="rigid body"):
         NnmCase.from_table(table | {"contacts": apart})
@@ -187,7 +187,7 @@ def test_a_contact_pressed_to_ground_holds_a_lattice():
 
 
 def test_disorder_is_drawn_for_normal_modes():
-    """The case holds what was drawn about the clearances, and is read back as the same case."""
+    """A case with disorder has drawn clearances and masses, and is the same case when read back."""
     table = {
         "lattice": {"preset": "four-band", "cells": 8},
         "contacts": {"sites": [2, 5], "clearance": 1e-3},
@@ -198,7 +198,7 @@ def test_disorder_is_drawn_for_normal_modes():
 
     (first, _), (second, _) = case.gaps()
     assert first != second
-    # Four standard deviations.
+    # The bound is four standard deviations.
     assert first == pytest.approx(1e-3, rel=0.2)
     # The masses were drawn, too.
     assert not case.chain().is_uniform()
@@ -215,14 +215,14 @@ def test_disorder_is_drawn_for_normal_modes():
     ],
 )
 def test_a_forced_mass_that_is_not_there_is_refused(nnm, message):
-    """The mass is one of the system's, and in a lattice one of a cell."""
+    """A forced mass must exist: ``[mass]`` of a system, or ``[cell, mass]`` of a lattice."""
     table = {"lattice": {"preset": "four-band", "cells": 8}, "contacts": {"sites": [2], "clearance": 1e-3}}
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table(table | {"nnm": nnm})
 
 
 def test_beads_between_ends_without_walls_move_as_a_rigid_body():
-    """No spring ties them to a wall, whatever the ends are called: their first mode has no frequency."""
+    """Mode 1 of beads that no spring joins to a wall has the frequency 0 and is refused, also with fixed ends."""
     pressed = {"sites": [1, 2], "next_cell": True, "side": "minus", "clearance": 0.0, "precompression": 1e-6}
     table: dict[str, Any] = {
         "lattice": {"cells": 3, "ends": "fixed", "cell": {"masses": [1e-3]}},

@@ -1,4 +1,4 @@
-"""The section [optimise], designs as points of a cube, searches and objectives whose runs are given."""
+"""The section [optimise], designs as points of the unit cube, searches, and objectives from prescribed runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "l
 
 def test_designs_of_other_cells_keep_smooth_parts_and_dashpots():
     """A design that changes a spring's stiffness keeps the spring's other numbers, and the other springs."""
-    # Each differs from its default, so that one which is lost is seen.
+    # Each number differs from its default, so that a lost one is seen.
     parts = {"quadratic": -2e6, "cubic": 3e9, "damping": 0.5}
     springs = [
         {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True} | parts,
@@ -97,7 +97,7 @@ def test_what_is_wrong_with_a_search_is_named(changes, message):
     with pytest.raises(CaseError) as error:
         plan(*changes)
     assert message in str(error.value)
-    # One: a wrong key must not bring problems of others that depend on it.
+    # Keys that depend on the wrong one are not reported.
     assert len(error.value.problems) == 1
 
 
@@ -108,7 +108,7 @@ def test_all_problems_come_at_once(tmp_path):
     options = BOUNDS | {"variables": BOUNDS["variables"] | wrong}
     path.write_text(tomli_w.dumps(TABLE | {"optimise": options}))
 
-    # A user's file is read by the second one, which does not know the verb.
+    # ``load_every`` reads a user's file, whose verb it does not know.
     for load in (OptimiseCase.load, load_every):
         with pytest.raises(CaseError) as error:
             load(path)
@@ -163,9 +163,9 @@ def test_a_profile_is_log_spaced_and_a_cell_takes_its_masses_and_springs():
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(
-    # Beyond the cube too, since samplers may step over its edge.
+    # Points outside the cube are included, since samplers may step over its edge.
     point=st.lists(st.floats(-0.2, 1.2), min_size=3, max_size=3),
-    # The whole lattice, just the three cells that are needed, three at its end, and a part of it.
+    # Bounds are the whole lattice, exactly three cells, three cells at its end, and a part of it.
     bounds=st.sampled_from([(1, 40), (7, 9), (38, 40), (5, 30)]),
 )
 def test_sites_are_distinct_in_order_and_within_their_bounds(point, bounds):
@@ -182,7 +182,7 @@ def test_sites_are_distinct_in_order_and_within_their_bounds(point, bounds):
 
 
 class Bowl:
-    """In place of the runs: the squares of the clearances' logarithms over 1 mm; some designs fail."""
+    """An objective without runs: the sum of log(clearance/1 mm)^2 over the sites; designs with ``fails(case)`` fail."""
 
     def __init__(self, fails=lambda case: False):
         self.fails = fails
@@ -231,7 +231,7 @@ def test_a_search_spends_its_budget_and_keeps_the_best():
     spend(search)
 
     assert len(search.designs) == 200
-    # The same object: the case is not built anew from its values.
+    # The first design is the same object, not a case built from its values.
     assert search.designs[0].case is small.base
     compared = search.compared()
     assert compared["case"] == 0
@@ -246,7 +246,7 @@ def fails_where_first_clearance_is_large(case):
 
 
 def test_failed_and_impossible_designs_are_reported_as_worst_and_the_search_goes_on():
-    """The sampler learns the losses as they are, and of failed and impossible designs more than the worst so far."""
+    """The sampler receives losses unchanged; failed and impossible designs have a loss larger than the worst so far."""
     small = plan("optimise.budget=60")
     sampler = recorder(small)
     search = OptimumSearch(small, Bowl(fails_where_first_clearance_is_large), sampler, small.begin())
@@ -293,13 +293,13 @@ def test_a_start_that_is_not_the_case_is_a_design_too():
 
 
 def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
-    """A scatter is that of [disorder] with the next seeds; the design itself is without."""
+    """A design is run at each amplitude with each sample of scatter, drawn as [disorder] with successive seeds."""
     objective = "optimise.objective=[{amplitudes=[2.0, 5.0]}, {measure='transmitted', amplitudes=[5.0, 9.0]}]"
     small = plan(objective, "optimise.samples=2", "disorder={seed=7, clearance={relative=0.01}}")
 
     runs = ObjectiveRuns.runs(GivenRecords(small), small.base)
 
-    # Amplitudes of two objectives, of which they have one in common, times two samples.
+    # The two objectives have three different amplitudes, each with two samples.
     assert [*runs] == [(2.0, 0), (2.0, 1), (5.0, 0), (5.0, 1), (9.0, 0), (9.0, 1)]
     assert {run.drive.amplitude for run in runs.values()} == {2.0, 5.0, 9.0}
     clearance = {key: run.contacts.clearance for key, run in runs.items()}
@@ -311,7 +311,7 @@ def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
 
 
 class GivenRecords(ObjectiveRuns):
-    """Runs of an objective without ranks and files: their records are given."""
+    """The runs of an objective with prescribed records, without ranks and files."""
 
     def __init__(self, plan, records=()):
         self.plan = plan
@@ -329,11 +329,11 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
         records[case_id(run)] = {"values": {"upper_share_at_end": upper[key], "transmitted": 0.4}}
 
     losses, _, _, reason = GivenRecords(small, records).judge(small.base)
-    # Means 0.2 at 2 N and 0.35 at 5 N, the smaller of which counts; what is maximised is a loss with its sign turned.
+    # The means are 0.2 at 2 N and 0.35 at 5 N; the smaller one counts. A measure to maximise is a negative loss.
     assert losses == pytest.approx([-0.2, 0.4])
     assert reason == ""
 
-    # One of four runs: a mean over the others would favour designs that fail.
+    # One of four runs fails: a mean over the others would favour designs that fail.
     records[case_id(runs[5.0, 1])] = {"reason": "stalled"}
     losses, _, _, reason = GivenRecords(small, records).judge(small.base)
     assert np.isnan(losses).all()
@@ -342,7 +342,7 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
 
 @pytest.mark.parametrize("error", [MemoryError("Unable to allocate 1.00 TiB"), OSError(28, "full"), CaseError([])])
 def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
-    """A run that fails otherwise has a record and is not repeated; this one is asked for both times."""
+    """A run that lacked memory or disk has no record and is repeated; a run that fails otherwise is recorded."""
     asked = []
 
     def work(key):
@@ -354,7 +354,7 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
 
     # The second call stands for the command after memory or disk was freed.
     for _ in range(2):
-        # All become one error, which ends the study.
+        # All three errors become an OSError, which ends the study.
         with pytest.raises(OSError, match=r"Unable|full|0 problem"):
             recorded().make(["stalls", "short"], work, failures=True)
 
@@ -366,7 +366,7 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
 
 
 def test_a_wrong_key_hides_no_other_and_brings_none():
-    """A wrong start is one problem besides that of a variable; a wrong objective has no problems of the default's."""
+    """A wrong start does not hide a wrong variable; a wrong objective does not bring problems of the default one."""
     with pytest.raises(CaseError) as error:
         plan("optimise.start=midst", "optimise.variables.sites=[30, 2]")
     assert [problem.key for problem in error.value.problems] == ["optimise.start", "optimise.variables.sites"]
@@ -388,7 +388,7 @@ def test_clearances_are_matched_at_sites_of_one_kind():
 
 
 def test_a_search_finds_files_next_to_its_case_file(tmp_path, monkeypatch):
-    """A list of states to begin with is one of files in the folder of the case file, wherever the program starts."""
+    """Names in a list of initial states are relative to the folder of the case file, not to the working directory."""
     folder = tmp_path / "case"
     folder.mkdir()
     for name in ("a.h5", "b.h5"):

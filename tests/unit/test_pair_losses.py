@@ -10,7 +10,10 @@ from vipetsc.dynamics.propagator.substeps import Substep
 
 
 def test_an_impulse_of_zero_that_had_moments_still_loses_with_a_later_force():
-    """A force that changed its sign has left no impulse, but motion: the later force's impulse times its moment."""
+    """The loss is impulse times kernel times first moment where an earlier force has left a moment and no impulse.
+
+    An earlier force that changed its sign has the impulse zero and moves the mass, on which the later force works.
+    """
     kernels = np.zeros((1, 2, 2))
     kernels[0, 0, 1] = 5.0
     losses = PairLosses(
@@ -27,5 +30,6 @@ def test_an_impulse_of_zero_that_had_moments_still_loses_with_a_later_force():
     accumulate_losses(losses, cluster, cluster.trial, Substep(PLAIN, 0.25))
     impulse = 7.0 * 0.25 * cluster.interval
     assert losses.loss[0] == pytest.approx(impulse * 5.0 * 3.0, rel=1e-13)
-    # The force is in the moments afterwards: its impulse, and over the first quarter of the step 2 a - 1 = 0.75.
+    # The moments then include the force: its impulse, and the impulse times the mean of 2 a - 1 over the first quarter
+    # of the step, 0.75, where a is the fraction of the step that remains.
     assert losses.moments[0] == pytest.approx([impulse, 0.75 * impulse], rel=1e-13)

@@ -1,4 +1,4 @@
-"""Panels that figures share show their data where the axes say, with the marks that belong there."""
+"""Panels that several figures use show their data at their coordinates, with marks, bands, gaps and regions."""
 
 import itertools
 
@@ -41,12 +41,12 @@ def test_a_map_shows_every_value_at_its_coordinates(axes):
     assert bottom + (row + 0.5) * (top - bottom) / len(CELLS) == pytest.approx(CELLS[5])
     assert axes.get_xlabel() == "Time (s)"
     assert axes.get_ylabel() == "Cell"
-    # Half a cell beyond the first and the last one.
+    # The limits are half a cell beyond the first and the last cell.
     assert axes.get_ylim() == (4.5, 11.5)
 
 
 def test_colours_follow_the_data(axes):
-    """The scale ends at the largest value, whatever its unit, and at 1 where nothing is positive."""
+    """The scale of colours ends at the largest value in any unit, and at 1 if no value is positive."""
     for largest in (1e-9, 2.0, 3e7):
         norm = panels.log_norm(largest, 0.5 * largest, decades=3)
         assert norm.vmin == pytest.approx(1e-3 * largest)
@@ -80,7 +80,7 @@ def test_the_dispersion_has_every_branch_over_it(axes, cell):
     image = panels.dispersion_map(axes, spectrum, panels.log_norm(30.0), cell)
 
     np.testing.assert_array_equal(image.get_array(), energy.T)
-    # Half a bin beyond each end: pi/20 in units of pi, 4000/30 in krad/s.
+    # The picture extends by half a bin beyond each end; bins are 1/20 in units of pi and 4/30 krad/s wide.
     assert image.get_extent() == pytest.approx((-0.025, 1.025, -4 / 60, 4 + 4 / 60))
     assert axes.get_xlim() == (0, 1)
     assert axes.get_ylim() == (0, 4)

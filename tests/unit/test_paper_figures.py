@@ -1,4 +1,4 @@
-"""Figures of the paper: shared, kept, noted; their names in words; the report's small texts; schematics."""
+"""Figures of the paper: division among ranks, kept files, notes, names in words, texts of the report, schematics."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vipetsc.paper.report import numbers, sources
 
 
 def drawings(count: int, drawn: list[int]):
-    """Yield drawings of empty pages, whose numbers are appended to ``drawn`` as they are drawn."""
+    """Yield drawings of empty pages; drawing one appends its number to ``drawn``."""
 
     def page(number: int) -> Figure:
         drawn.append(number)
@@ -36,7 +36,7 @@ def drawings(count: int, drawn: list[int]):
 
 
 def turned(count: int, turns) -> list[str]:
-    """Return the pictures whose turn it is, none of them drawn."""
+    """Return the names of the pictures that a rank with these ``turns`` takes, without drawing them."""
     seen: list[str] = []
 
     def keep(path: Path) -> bool:
@@ -68,7 +68,7 @@ def test_ranks_that_draw_from_one_count_miss_none(count, owners):
 
 
 def test_what_is_kept_is_not_drawn_and_not_half(tmp_path):
-    """A picture that is there in all formats is kept; one that lacks a format is drawn for both."""
+    """A picture that exists in all formats is kept; one that lacks a format is drawn in all of them."""
     drawn: list[int] = []
     (tmp_path / "page-0.png").write_text("old")
     # The second page lacks its PDF.
@@ -94,12 +94,12 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
     assert noted.shape[1] == plain.shape[1]
     # A strip without text has one colour.
     assert np.ptp(noted[-strip:]) > 0.2
-    # A mean, since the renderer may place an edge between pixels anew.
+    # The mean is compared, since edges may move by fractions of a pixel.
     assert np.abs(noted[: plain.shape[0]] - plain).mean() < 0.01
 
 
 def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
-    """The layout, which costs more than all else, is computed once for a PNG and a PDF; ticks of decades stay few."""
+    """The layout, the dearest step, is computed once for a PNG and a PDF, and minor ticks of decades stay few."""
     laid_out = []
     monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: laid_out.append(figure))
 
@@ -116,7 +116,7 @@ def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
 
 
 def numbers_of(figure: Figure, path: Path, note: str = "") -> list[dict]:
-    """Return what the JSON file of a figure holds of its axes."""
+    """Return the entries for axes in the JSON file of a figure."""
     return json.loads(save(figure, path, note).read_text())
 
 
@@ -128,7 +128,7 @@ WAVE_Y = 100 + 50 * np.sin(np.linspace(0, 20, 2001))
 @pytest.fixture
 def curves_and_map():
     """Draw axes with two curves and points, a map with a colour bar, and axes that are switched off."""
-    # A gap of two values.
+    # The curve has a gap of two values.
     x = np.array([1.0, 10.0, np.nan, np.nan, 100.0])
     with rc_style():
         figure = new_figure(4, 2)
@@ -167,10 +167,10 @@ def test_curves_and_points_of_a_picture_are_in_its_numbers(curves_and_map, tmp_p
     assert curve["y"] == [2, 20, None, 200]
 
     assert many["label"] == ""
-    # Of 2001 points: a page does not show more.
+    # A page shows fewer than 400 of the 2001 points.
     assert len(many["x"]) < 400
     thinned = np.interp(np.log(WAVE_X), np.log(many["x"]), many["y"])
-    # The curve rises by 1 from one of its points to the next: 6 are a few of them.
+    # The curve rises by up to 1 between neighbouring points: the bound is a few points.
     assert thinned == pytest.approx(WAVE_Y, abs=6)
 
     assert points["label"] == "by colour"
@@ -180,13 +180,13 @@ def test_curves_and_points_of_a_picture_are_in_its_numbers(curves_and_map, tmp_p
 
 @pytest.mark.slow
 def test_colours_of_a_map_are_in_its_numbers(curves_and_map, tmp_path):
-    """Of a map the numbers hold its colours with their values; lines on it are no curves."""
+    """The numbers of a map are its colours and their values; lines on a map are no curves."""
     _, image = numbers_of(curves_and_map, tmp_path / "plain.json")
 
     assert image["curves"] == []
     table = image["map"]
     assert table["label"] == "Energy E (J)"
-    # The darkest colour of viridis; six hexadecimal digits each.
+    # The first colour is the darkest of viridis; a colour has six hexadecimal digits.
     assert table["colours"][:6] == "440154"
     count = len(table["values"])
     assert len(table["colours"]) == 6 * count
@@ -223,7 +223,7 @@ def test_an_inset_has_numbers_of_its_own_within_its_axes(tmp_path):
 def test_every_claim_has_a_figure_that_shows_it():
     """Figures show all claims, and are those of the paper, its appendix and its supplement, in their order."""
     shown = {claim for figure in PAPER_FIGURES for claim in figure.claims}
-    # In both directions: no claim without a picture, and no picture of a claim that was removed.
+    # No claim lacks a picture, and no picture shows a claim that does not exist.
     assert shown == set(CLAIMS)
 
     paper = [f"Fig. {number}" for number in range(1, 13)]

@@ -1,4 +1,4 @@
-"""Panels of the paper's figures from data that are put together here: entropy histories, dispersions of cells."""
+"""Panels of the paper's figures from synthetic data: entropy histories, energies over time, dispersions of cells."""
 
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ def style():
 
 
 def entropy_ensemble(amplitudes: list[float], episodes: list[float]) -> xr.Dataset:
-    """A sweep over ``amplitudes`` with H(t) and numbers of contact ``episodes``, NaN for a member that failed."""
+    """Return a sweep over ``amplitudes`` with H(t) and numbers of contact ``episodes``, NaN for a failed member."""
     failed = np.isnan(episodes)
     times = np.where(failed[:, None], np.nan, np.linspace(0.0, 1.0, 6))
     variables = {
@@ -46,7 +46,7 @@ def entropy_ensemble(amplitudes: list[float], episodes: list[float]) -> xr.Datas
 
 
 def history(amplitudes: list[float], episodes: list[float]):
-    """The axes that show H(t) of the sweep."""
+    """Return the axes that show H(t) of the sweep."""
     (offered,) = FIGURES["entropy_history"].function(Sweeps([entropy_ensemble(amplitudes, episodes)], Files()))
     return offered.draw().axes[0]
 
@@ -55,11 +55,11 @@ def history(amplitudes: list[float], episodes: list[float]):
     ("episodes", "onset"),
     [
         ([0, 0, 3, 9, 20], 8.0),
-        # A member that failed tells nothing about contact.
+        # A failed member gives no information about contact.
         ([0, np.nan, 3, 9, 20], 4.0),
         ([3, np.nan, 9, 20, 30], None),
         ([np.nan, 3, 9, 20, 30], None),
-        # None at a higher amplitude only.
+        # The member without contact has the higher amplitude.
         ([3, 0, 9, 20, 30], None),
         ([0, 0, 0, 0, 0], None),
     ],
@@ -70,7 +70,7 @@ def test_contact_begins_between_a_member_without_and_one_with_it(episodes, onset
 
 
 def test_rows_of_a_history_meet_halfway_on_the_logarithmic_axis():
-    """A member without a drive, which fails, has no row there."""
+    """Edges of rows are geometric means of amplitudes; a failed member without a drive has no row."""
     axes = history([0.0, *AMPLITUDES], [np.nan, 0, 0, 3, 9, 20])
     (mesh,) = axes.collections
     edges = mesh.get_coordinates()[:, 0, 1]
@@ -80,7 +80,7 @@ def test_rows_of_a_history_meet_halfway_on_the_logarithmic_axis():
 
 
 def test_energies_of_a_record_shorter_than_a_period_are_drawn():
-    """Means are then those of the whole record."""
+    """Energies of a record shorter than a period of the drive are means over the whole record."""
     parts = np.array([[4.0, 3.0, 2.0], [1.0, 1.0, 1.0]])
     analysis = xr.Dataset(
         {
@@ -100,7 +100,7 @@ def test_energies_of_a_record_shorter_than_a_period_are_drawn():
 
 
 def cell_search(highest: list[float]) -> xr.Dataset:
-    """A search of one cell of each reading, whose bands go up to the ``highest`` frequencies (rad/s)."""
+    """Return a search of cells of two readings, whose bands end at the ``highest`` frequencies in rad/s."""
     grid = ("reading", "lambda", "eta")
     frequency = np.ones((2, 3, 3, 5, 4)) * np.array(highest)[:, None, None, None, None]
     # A cell far from the best one has bands three times as high.
@@ -124,7 +124,7 @@ def cell_search(highest: list[float]) -> xr.Dataset:
 
 
 def test_each_reading_has_frequencies_up_to_those_of_its_best_cell():
-    """Titles announce the curves that leave a panel, and no others."""
+    """The axes of each reading end above its best cell's bands; titles name the highest frequency of curves beyond."""
     figure = cost_maps.dispersions(cell_search([1e3, 4e3]), along="lambda", other="eta")
     rows = np.reshape(figure.axes[:6], (2, 3))
     for row, highest in zip(rows, (1.0, 4.0), strict=True):

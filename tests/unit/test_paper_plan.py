@@ -1,4 +1,4 @@
-"""The paper's plan comes with the package; what is derived from results is stale by content alone."""
+"""The paper's plan: case files in the package, steps and their states, and figures that are stale by content alone."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def step_of(plan: Plan, name: str) -> PaperStep:
 
 
 def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
-    """It is counted among what is left, with its failures; without them nothing is left."""
+    """A sweep with failed members is among the steps that are left; without failures no step is left."""
     plan = paper_plan(FULL)
     step = replace(
         step_of(plan, TRANSFER),
@@ -143,7 +143,7 @@ def test_another_case_is_another_input_and_a_stale_step(searched):
     assert step.identity(root) != plan.steps[0].identity(root)
     assert plan.steps[0].state(root / "none") == MISSING
 
-    # As a kill leaves it before it is run anew: what was begun is continued.
+    # The folder is claimed and empty, as after a kill; a step that was begun is continued.
     with claimed(MPI.COMM_SELF, step.folder(root), SEARCH, step.text, force=True):
         pass
     assert step.state(root) == BEGUN
@@ -177,7 +177,7 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
     assert not old.exists()
     assert other.exists()
 
-    # Now it was drawn from the inputs that were recorded.
+    # The recorded inputs are the present ones, hence the picture counts as drawn from them.
     old.touch()
     record = draw._drop_stale(plan, root, plan.inputs(root))
     assert old.exists()
@@ -185,7 +185,7 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
-    """A request that comes first lets nothing be drawn or reported: only the folder is the plan's."""
+    """A request to stop before the first step leaves a folder with the plan alone, without a report."""
     stop = StopRequest()
     stop.requested = True
     reported = []
@@ -204,7 +204,7 @@ def test_fingerprints_distinguish_parts():
 
 
 def test_the_plan_names_what_it_does_not_know():
-    """Figures that the plan lacks are refused with those it has; a claim in small letters is one, with its figures."""
+    """Unknown figures and claims are refused with a list of the known ones; claims may be in small letters."""
     with pytest.raises(FolderError, match=r"--only fig99 C99: figures are fig01"):
         paper_plan(FULL).only(["fig99", "C99", "C1"])
     assert paper_plan(FULL).only(["c1"]).figures
@@ -235,7 +235,7 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
     assert failed.new_steps == ("design",)
     assert not failed.complete
 
-    # The same command makes what failed, and draws no picture again.
+    # The same command repeats the failed step and draws no picture again.
     whole = make.make_paper(plan, root)
     assert whole.new_steps == ("other",)
     assert whole.complete
@@ -257,7 +257,7 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
     assert picture in repaired.drawn
     assert_same_bits(datasets(result), before)
     assert (root / "claims.json").read_bytes() == claims
-    # The last chunk of a PNG: it is whole.
+    # The picture is whole: it ends with the last chunk of a PNG.
     assert picture.read_bytes()[-8:-4] == b"IEND"
 
     (root / "plan.json").write_text("")
@@ -267,7 +267,7 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
 
 @pytest.mark.parametrize("end", ["another case", "removed"])
 def test_the_time_of_a_step_is_that_of_the_results_that_are_there(searched, tmp_path, end):
-    """Time spent on results that are gone does not count, whether another case replaced them or they were removed."""
+    """The time of a step is that of its present results, not of earlier ones that were replaced or removed."""
     plan = replace(searched[0], figures=[], measure=lambda root: [])
     root = tmp_path / "paper"
     make.make_paper(plan, root)
@@ -285,7 +285,7 @@ def test_the_time_of_a_step_is_that_of_the_results_that_are_there(searched, tmp_
 
 @pytest.mark.slow
 def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_same_again():
-    """The members that ts computes as well are of different curves, spread over the amplitudes, and fixed."""
+    """The members that the engine ts computes, too, are of different curves, spread over the amplitudes, and fixed."""
     steps = {step.name: step for step in paper_plan(FULL).steps}
     checked = {step.checks for step in steps.values() if step.checks}
     assert checked == {"interband", "scattering", "scattering-neighbours"}
@@ -304,7 +304,7 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
         places = sorted(amplitudes.index(case.drive.amplitude) for case in sample)
         assert [place * step.sample // len(amplitudes) for place in places] == list(range(step.sample))
 
-        # But for the engine each is a member of the sweep.
+        # Each case of the sample, with the engine of the sweep, is a member of the sweep.
         assert {case.time.engine for case in sample} == {"ts"}
         tables = (case.model_dump(by_alias=True, exclude_none=True) | {"name": name} for case in sample)
         assert {case_id(Case.from_table(t, ["time.engine=auto"])) for t in tables} <= set(map(case_id, members))
@@ -314,7 +314,7 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
-    """A second call looks at no figure; a lost picture costs its figure, a lost report the pictures in it."""
+    """A second call draws nothing; a missing picture is drawn again, a missing report encodes its pictures again."""
     plan = replace(searched[0], measure=lambda root: [])
     root = tmp_path / "paper"
     offered: list[str] = []
@@ -341,12 +341,12 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
     monkeypatch.setattr(draw, "draw_each", order_noted)
 
     first = make.make_paper(plan, root)
-    # The dearest first: it would otherwise keep one rank at the end.
+    # The dearest picture is the first, since it would keep one rank busy at the end.
     assert ordered[0] == "figS3-design-cost-maps"
     assert len(ordered) == 6
     assert sorted(offered) == ["fig10", "figS3"]
     assert len(encoded) == 6
-    # A PNG, a PDF and the numbers of each.
+    # Each picture has a PNG, a PDF and a file of numbers.
     assert len(first.drawn) == 3 * 6
     cpu = read_record(root)["cpu"]
     assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
@@ -369,7 +369,7 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
 
 
 def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
-    """The parts of all steps that have some are jobs of one pool, in the order of their cost."""
+    """The parts of all steps with parts are jobs of one pool, the dearest first."""
     jobs: list[tuple[float, str, int]] = []
 
     def note(pool, new_jobs, *rest, **options):

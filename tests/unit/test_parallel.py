@@ -1,4 +1,4 @@
-"""Requests to stop: which signals are one, what a second does, what is put back."""
+"""Requests to stop: signals that count as one, a second signal, handlers that are restored, work that ends at once."""
 
 import signal
 import subprocess
@@ -14,7 +14,7 @@ from vipetsc.parallel import STOP_SIGNALS, EndedError, StopRequest, on_every_ran
 
 @pytest.fixture(autouse=True)
 def as_in_a_terminal():
-    """The signals as a shell leaves them, though tests may run under nohup or in a script's background."""
+    """Give the signals their default actions, though tests may run under nohup or in the background of a script."""
     before = {number: signal.signal(number, signal.SIG_DFL) for number in STOP_SIGNALS}
     yield
     for number, handler in before.items():
@@ -23,7 +23,7 @@ def as_in_a_terminal():
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_is_a_request_and_a_second_one_the_end(number):
-    """The first signal is a request and restores the default action, so that a second one ends the process."""
+    """The first signal is a request and restores the default action, by which a second one ends the process."""
     before = {other: signal.getsignal(other) for other in STOP_SIGNALS}
     with StopRequest().listening() as stop:
         assert not stop.requested
@@ -58,7 +58,7 @@ def test_a_signal_that_is_sent_twice_is_one_request():
 
 
 def test_what_has_nothing_to_save_ends_at_once():
-    """Where nothing is to be saved, the signal raises an exception that handlers of errors leave alone."""
+    """A signal raises EndedError in work that has nothing to save; handlers of errors do not catch it."""
     with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
         signal.raise_signal(signal.SIGUSR1)
         pytest.fail("the work went on")
@@ -72,7 +72,7 @@ def test_what_has_nothing_to_save_does_not_begin_after_a_request():
 
 
 def test_an_error_that_the_end_of_such_work_causes_is_not_reported():
-    """A library left halfway may fail while it clears up, in place of the exception that left it."""
+    """EndedError is raised although a cleanup that it causes, as in a library, raises an error in its place."""
     with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
         try:
             signal.raise_signal(signal.SIGUSR1)
@@ -82,7 +82,7 @@ def test_an_error_that_the_end_of_such_work_causes_is_not_reported():
 
 @pytest.mark.parametrize("agree", [on_root, on_every_rank])
 def test_an_error_that_the_end_of_such_work_causes_is_no_error_of_all_ranks(agree):
-    """Ranks that agree on errors do not agree on this one: it would be raised on those that go on."""
+    """An error in a cleanup after EndedError is not raised on all ranks, since other ranks go on."""
 
     def work() -> None:
         try:
@@ -112,7 +112,7 @@ with p.StopRequest().listening() as stop, stop.at_once():
 
 @pytest.mark.slow
 def test_a_signal_in_a_destructor_ends_such_work_without_a_trace():
-    """The exception that should end the work is lost there; the process ends in a moment all the same."""
+    """A signal within a destructor, where Python swallows exceptions, ends the process within seconds, with code 75."""
     script = [sys.executable, "-c", ENDS_IN_A_DESTRUCTOR]
     ended = subprocess.run(script, capture_output=True, text=True, timeout=25, env=clean_environment(), check=False)
 

@@ -1,4 +1,4 @@
-"""Power-law fits: exact laws, textbook statistics, and how they scale."""
+"""Power-law fits: exact laws, textbook statistics, changes of units, and fits that are refused."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def test_units_change_the_factor_alone(seed, scale_y, scale_x):
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say():
-    """Of 400 intervals of 95 % about 95 % hold the exponent that was scattered."""
+    """About 95 % of 400 intervals of 95 % contain the exact exponent."""
     inside = []
     for seed in range(400):
         low, high = power_law(X, scattered_law(seed)).exponent_interval
@@ -109,7 +109,10 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
 
 
 def test_a_fit_that_runs_away_is_nan():
-    """The last point alone stands out: the steeper the law, the smaller the squares."""
+    """A fit without a minimum has NaN as its numbers.
+
+    The last point alone is large: the steeper the law through it, the smaller the sum of squares.
+    """
     x = [1.0, 2.0, 3.0, 3.01]
     y = [1e-3, 2e-6, 1e-9, 1.0]
 
@@ -121,7 +124,7 @@ def test_a_fit_that_runs_away_is_nan():
 @settings(max_examples=30)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=20, unique=True))
 def test_normalised_spans_its_range(values):
-    """Values are mapped to 0.01 to 1 in their order, whatever their unit."""
+    """Values are mapped to 0.01 to 1 in their order, independently of their unit."""
     scaled = normalised(values)
 
     assert scaled.min() == 0.01
@@ -159,7 +162,7 @@ def test_a_constant_has_no_coefficient_of_determination():
 
 
 def test_three_points_or_a_fit_worse_than_the_mean_are_no_power_law():
-    """A fit of four points that is no worse than their mean is not doubted; others are, with the reason."""
+    """A fit counts from four points on and if it is no worse than their mean; otherwise a reason is given."""
     assert doubt(4, 0.0) == ""
     assert doubt(9, 0.99) == ""
     assert doubt(3, 0.999) == "too few points (3)"

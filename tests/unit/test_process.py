@@ -12,13 +12,13 @@ from vipetsc.process import ALONE, ONE_MACHINE, RANKS, quick_start
 
 pytestmark = pytest.mark.parallel(1)
 
-# Open MPI's number of all ranks, and of those on the machine of a rank.
+# Open MPI's variables with the number of all ranks and of the ranks on the machine.
 SIZES = "OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_LOCAL_SIZE"
 
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch):
-    """No launcher and no setting of the user, whatever has started the tests."""
+    """Remove the variables of launchers and of users, which may be set where the tests run."""
     for name in (*RANKS, *SIZES, *ALONE):
         monkeypatch.delenv(name, raising=False)
 
@@ -29,7 +29,7 @@ def test_a_process_alone_starts_mpi_without_daemon_and_network():
 
 
 def test_processes_started_later_do_not_inherit_it():
-    """With these settings an mpirun's ranks could not reach one another."""
+    """The settings are removed after MPI's start, also after an error: ranks of an mpirun could not communicate."""
     with pytest.raises(RuntimeError), quick_start():
         raise RuntimeError
     assert not ALONE.keys() & os.environ.keys()
@@ -52,7 +52,7 @@ def test_a_rank_of_a_job_starts_mpi_as_its_launcher_says(name, monkeypatch):
 
 @pytest.mark.parametrize(("here", "expected"), [("4", {**ONE_MACHINE}), ("2", {})])
 def test_ranks_look_for_a_network_unless_one_machine_has_them_all(here, expected, monkeypatch):
-    """All ranks of a job choose alike: each sees these numbers."""
+    """Ranks have settings for one machine if all ranks are on it, and none else; all ranks see the same numbers."""
     for name, value in zip((RANKS[0], *SIZES), ("1", "4", here), strict=True):
         monkeypatch.setenv(name, value)
 
@@ -60,7 +60,7 @@ def test_ranks_look_for_a_network_unless_one_machine_has_them_all(here, expected
         assert {name: os.environ[name] for name in ALONE if name in os.environ} == expected
 
 
-# The signal comes while the process waits: if the handler returned, it would end with exit code 0.
+# The process sends itself the signal; if the handler returned, the exit code would be 0.
 REQUESTED = """
 import os, signal
 from vipetsc.process import end_on_request
@@ -74,8 +74,8 @@ os.kill(os.getpid(), signal.{name})
 )
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name, launched, said):
-    """The code is that of a run that can be resumed, not the signal's; ranks leave the words to their launcher."""
-    # The tests themselves may have been started by nohup.
+    """A signal before any work ends the process with code 75, as a run that can be resumed; ranks print nothing."""
+    # The tests may run under nohup, which ignores SIGHUP.
     not_ignored = f"import signal; signal.signal(signal.{name}, signal.SIG_DFL)"
     ended = subprocess.run(
         [sys.executable, "-c", not_ignored + REQUESTED.format(name=name)],
@@ -90,7 +90,7 @@ def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name,
 
 
 def test_a_signal_that_nohup_has_set_aside_stays_so():
-    """The end of the terminal must not end a run that was started to outlive it."""
+    """A process that ignores SIGHUP from its start, as under nohup, is not ended by it."""
     ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
     program = ignoring + REQUESTED.format(name="SIGHUP")
     ended = subprocess.run([sys.executable, "-c", program], check=False)

@@ -1,4 +1,4 @@
-"""Progress in scripts and notebooks: what is written where there is no log and no terminal."""
+"""Progress in scripts and notebooks, without a log and a terminal, and the time of compiling that it leaves out."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ pytestmark = pytest.mark.parallel(1)
 
 @pytest.fixture
 def written(monkeypatch, capsys) -> Callable[[], str]:
-    """Make this a process that has set up no log, as a script or a notebook; returns what it writes to stderr."""
+    """Make this a process without a log, as a script or a notebook, and return a function that yields its stderr."""
     monkeypatch.setattr(process.logger, "hasHandlers", lambda: False)
     monkeypatch.setattr(logging.getLogger("vipetsc"), "level", logging.NOTSET)
     monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
-    # Loggers remember the levels that they have asked for.
+    # Loggers cache levels.
     logging.getLogger("vipetsc").manager._clear_cache()
     return lambda: capsys.readouterr().err
 
 
 def test_a_script_has_lines_and_an_end(written, monkeypatch):
-    """Without a log the lines go to stderr every five seconds, and the end is one."""
+    """Without a log, lines go to stderr every five seconds and at the end."""
     now = [0.0]
     monkeypatch.setattr(process.time, "monotonic", lambda: now[0])
     progress = Progress(MPI.COMM_SELF, 20.0, "s")
@@ -69,7 +69,7 @@ def test_a_notebook_has_a_bar(written, monkeypatch):
 
 
 class Clock:
-    """Replaces the clock of the machine by one that a test moves."""
+    """A clock in place of the machine's, which a test moves."""
 
     def __init__(self, monkeypatch) -> None:
         self.now = 100.0
@@ -77,7 +77,7 @@ class Clock:
 
 
 def test_the_compiler_is_timed_once_where_kernels_call_others(monkeypatch):
-    """What is compiled within another one is part of its time, and the clock goes on meanwhile."""
+    """The time of a kernel that is compiled within another is counted once, and the clock can be read meanwhile."""
     clock = Clock(monkeypatch)
     compiling = CompileClock()
     compiling.start()
@@ -106,7 +106,7 @@ def test_the_time_left_is_that_of_the_work(written, monkeypatch):
 
 
 def test_the_bar_leaves_it_out_as_well(written, monkeypatch):
-    """A bar, which has a clock of its own, gives the rate of the work."""
+    """The clock of a bar leaves out the time of compiling, so that its rate is that of the work."""
     monkeypatch.setitem(sys.modules, "ipykernel", object())
     compiled = [0.0]
     monkeypatch.setattr(CompileClock, "seconds", property(lambda clock: compiled[0]))
@@ -119,7 +119,7 @@ def test_the_bar_leaves_it_out_as_well(written, monkeypatch):
 
 
 def test_the_bar_of_a_resumed_run_begins_where_that_was_stopped(written, monkeypatch):
-    """Its rate is that of the work since then, and what was done before is no work of an instant."""
+    """The rate of a resumed bar is that of the work since the resumption; earlier work does not count."""
     monkeypatch.setitem(sys.modules, "ipykernel", object())
     progress = Progress(MPI.COMM_SELF, 100.0, "s")
     bar = progress._bar
@@ -127,7 +127,7 @@ def test_the_bar_of_a_resumed_run_begins_where_that_was_stopped(written, monkeyp
     bar.start_t -= 2.0
     bar.last_print_t -= 2.0
     progress.update(92.0)
-    # Two seconds for 2 s of 100: eight more are left.
+    # The work since then is 2 s of 100 in two seconds.
     assert bar.format_dict["rate"] == pytest.approx(1.0, rel=0.05)
     assert " 92%|" in written()
     progress.close()

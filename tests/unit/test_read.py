@@ -1,4 +1,4 @@
-"""Results are read back by name and by value: the site that leads, the member that is meant, its folder."""
+"""Results are read by names and values: the variables and first site of a run, members of a sweep, their folders."""
 
 import h5py
 import numpy as np
@@ -89,7 +89,7 @@ def folder(tmp_path):
 def test_a_run_is_read_by_name(run):
     """A run's variables, the site nearest to the drive, the nearest recorded cell and the fields' times."""
     with open_run(run) as data:
-        # Not the recorded cells, which have the same name.
+        # The cells of the sites differ from the coordinate ``cell``, the recorded cells.
         assert list(data["sites/cell"].values) == [3, 20, 14]
         # The drive is in cell 12, two cells from the third site.
         assert leading_site(data) == 2

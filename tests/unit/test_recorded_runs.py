@@ -1,4 +1,4 @@
-"""Records of runs, by whatever study, and the ring on which one site is run."""
+"""Records of the runs of a study, and the ring on which runs with one site take place."""
 
 from types import SimpleNamespace
 

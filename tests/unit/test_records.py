@@ -1,4 +1,4 @@
-"""Records come back as they were written; a line that was cut off or damaged is named and costs no other."""
+"""Records are read back as they were written; a truncated or damaged line is named and does not affect others."""
 
 import os
 import resource
@@ -8,12 +8,12 @@ import pytest
 from tests.faults.inject import Injector
 from vipetsc.io.records import RecordFile, merge_records, read_records
 
-# Numbers without a short decimal form and near the smallest: they come back to the bit.
+# Numbers without a short decimal form, and close to the smallest float, are read back to the bit.
 ROWS = [{"id": f"m{i}", "values": [0.1 * i, 1e-300, float(i)]} for i in range(5)]
 
 
 def append_all(path, rows):
-    """Append rows to a file of records, which is opened for it and closed."""
+    """Open a file of records, append rows to it, and close it."""
     file = RecordFile(path)
     for row in rows:
         file.append(row)
@@ -21,7 +21,7 @@ def append_all(path, rows):
 
 
 def read_all(path):
-    """Return the records of a file, and what was said of damaged lines."""
+    """Return the records of a file and the messages about damaged lines."""
     damaged: list[str] = []
     return [record for record, _ in read_records(path, damaged.append)], damaged
 
@@ -36,7 +36,7 @@ def test_what_is_appended_comes_back_by_line_and_alone(tmp_path):
     assert [line.record() for _, line in read_records(path, print)] == ROWS
 
 
-# Of the last line its end is missing, or a part of its checksum as well.
+# The cuts in bytes remove the end of the last line, or a part of its checksum as well.
 @pytest.mark.parametrize("cut", [2, 30])
 def test_a_line_that_was_cut_off_costs_no_other(tmp_path, cut):
     """The line that a kill cut off is left out; records appended after it are whole."""
@@ -93,7 +93,7 @@ def test_a_full_disk_names_the_file(tmp_path):
 
 
 def test_a_disk_that_takes_a_part_of_a_line_is_full(tmp_path):
-    """Of a line that the disk took ten bytes of nothing is read, and the next append begins a line of its own."""
+    """A line of which the disk took ten bytes is not read, and the next append begins a new line."""
     path = tmp_path / "a.jsonl"
     append_all(path, ROWS[:1])
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

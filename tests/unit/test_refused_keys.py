@@ -1,4 +1,4 @@
-"""Keys that would be accepted and ignored, motions that a lattice does not have, and words that describe a case."""
+"""Keys without effect and motions that a lattice does not have are refused; sentences describe stops and drives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vipetsc.dynamics.propagator.step_choice import refusal
 
 
 def unsprung_table(**sections: dict[str, Any]) -> dict[str, Any]:
-    """Beads that only their contacts join, struck by half a sine; ``sections`` update the table."""
+    """Return the table of beads that contacts alone join, driven by half a sine; ``sections`` update it."""
     table: dict[str, Any] = {
         "lattice": {"cell": {"masses": [1e-3]}, "cells": 4, "ends": "free"},
         "contacts": {"stiffness": 1e8, "clearance": 0.0, "next_cell": True, "side": "minus", "sites": [1, 2, 3]},
@@ -25,7 +25,7 @@ def unsprung_table(**sections: dict[str, Any]) -> dict[str, Any]:
 
 
 def problem_of(table: dict[str, Any], overrides: tuple[str, ...] = ()) -> tuple[str, str]:
-    """Key and remedy of the one problem of a case."""
+    """Return key and remedy of the only problem of a case."""
     with pytest.raises(CaseError) as error:
         Case.from_table(table, overrides)
     [problem] = error.value.problems
@@ -35,7 +35,7 @@ def problem_of(table: dict[str, Any], overrides: tuple[str, ...] = ()) -> tuple[
 @pytest.mark.parametrize(
     ("contacts", "key"),
     [
-        # One that is smaller than the clearances was dropped.
+        # A precompression below the clearances has no effect.
         ({"precompression": 1e-5}, "contacts.precompression"),
         ({"each": {"precompression": [0.0, 1e-5]}}, "contacts.each.precompression"),
         ({"side": "plus", "clearance_minus": 1e-5}, "contacts.clearance_minus"),
@@ -126,7 +126,7 @@ def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, re
 
 
 def test_a_precompression_is_named_as_it_is_given():
-    """With a clearance, the indentation is less than the key's value."""
+    """The message has the key's value, not the indentation, which is smaller by the clearance."""
     stops = {"sites": [4], "clearance": 1e-5, "precompression": 3e-5, "side": "plus", "restitution": 0.7}
     with pytest.raises(CaseError, match=r"contacts\.precompression = 3e-05: site 1: a precompressed contact"):
         small_case(contacts=stops)

@@ -1,4 +1,4 @@
-"""Regions of a branch and the power laws of its slope in them, on slopes whose exponents are exact."""
+"""Regions of a branch and power laws of its slope in them, from slopes with known exponents."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_regions_and_power_law_of_a_constructed_branch():
     energy = np.geomspace(1e-3, 1e6, 400)
     touched = energy > FIRST_CONTACT
     slope, _ = two_powers(energy, factor=1e3, peak=1e4, exponent=-6.0)
-    # The time in contact approaches the whole, as the clearance becomes negligible.
+    # The fraction of time in contact approaches 1, as the clearance becomes negligible.
     decades = np.log10(np.maximum(energy / FIRST_CONTACT, 1))
     closed = np.where(touched, 1 - 0.5 / (1 + decades**2), 0.0)
 
@@ -36,14 +36,18 @@ def test_regions_and_power_law_of_a_constructed_branch():
     assert closed[region == 4].min() >= 0.95 > closed[region == 3].max()
 
     law = fit_slope(energy, slope, region)["IV"]
-    # In region IV what is left of the peak changes the exponent by less than a thousandth.
+    # In region IV the rest of the peak changes the exponent by less than a thousandth.
     assert law["exponent"] == pytest.approx(-1, abs=1e-3)
     assert law["adjusted_r2"] > 0.9999
     assert law["points"] == np.sum(region == 4)
 
 
 def test_region_three_begins_where_the_exponent_settles():
-    """Of E^-1 + c E^-6, the second with the fraction a: exponent -1 - 5 a, growth 25 a (1 - a) = 1/2 at a = 0.0204."""
+    """Region III begins where the exponent of the slope changes by less than 1/2 per e-fold of energy.
+
+    The slope E^-1 + c E^-6, whose second term is the fraction a of it, has the exponent -1 - 5 a, which grows by
+    25 a (1 - a): by 1/2 at a = 0.0204.
+    """
     energy = np.geomspace(1e-3, 1e6, 4000)
     touched = energy > FIRST_CONTACT
     slope, fraction = two_powers(energy, factor=1e3, peak=1e4, exponent=-6.0)
@@ -51,7 +55,7 @@ def test_region_three_begins_where_the_exponent_settles():
     region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
 
     begin = np.nonzero(region == 3)[0][0]
-    # a (1 - a) = 0.02; a point further on, the fraction is 3 % less.
+    # The root of a (1 - a) = 0.02; from one point to the next the fraction falls by 3 %.
     assert fraction[begin] == pytest.approx((1 - np.sqrt(0.92)) / 2, rel=0.05)
     laws = fit_slope(energy, slope, region)
     assert set(laws) == {"II", "III"}
@@ -61,7 +65,7 @@ def test_region_three_begins_where_the_exponent_settles():
 
 
 def test_the_law_of_region_two_is_that_of_its_falling_part():
-    """The law is fitted behind the last point where the branch goes backwards, and behind the peak."""
+    """The law of region II is fitted after the peak of the slope and the last point where the branch goes backwards."""
     energy = np.geomspace(1, 100, 60)
     first = np.full(5, 9.0)
     backwards = [-1.0]
@@ -83,7 +87,10 @@ def test_too_few_points_or_no_numbers_have_no_law():
 
 
 def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
-    """E^-1 + c E^-3: the exponent -1 - 2 a stays at -3 first; from a(1 - a) = 1/8 on it has settled above -2."""
+    """A steady exponent of -3 after the peak is region II; region III begins where it has settled above -2.
+
+    The slope E^-1 + c E^-3 has the exponent -1 - 2 a, which grows by 4 a (1 - a): by 1/2 at a (1 - a) = 1/8.
+    """
     energy = np.geomspace(1e-3, 1e6, 4000)
     touched = energy > FIRST_CONTACT
     slope, fraction = two_powers(energy, factor=1.0, peak=1e8, exponent=-3.0)

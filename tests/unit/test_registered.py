@@ -1,4 +1,4 @@
-"""Registered laws, factors and waveforms are checked before a case is simulated: their formulas, what they return."""
+"""Formulas and values of registered laws, factors and waveforms are checked before a case is simulated."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_formulas_that_contradict_each_other_are_named(slope, energy, exponent, 
 
 
 def test_a_force_that_begins_later_has_no_onset():
-    """A contact is felt at its clearance: a force of 0 over the first tenth of a micrometre has no power there."""
+    """A law whose force is 0 over the first tenth of a micrometre beyond the clearance is refused."""
 
     def beyond(x: np.ndarray) -> np.ndarray:
         return np.maximum(np.asarray(x) - ONSET, 0.0)
@@ -60,7 +60,7 @@ ORIGIN = {"modules": {__name__}, "file": __file__, "sha256": ""}
 
 
 def test_a_factor_that_fails_is_named_with_its_file(monkeypatch):
-    """A division by zero in a user's function is no error of the package, and one that is refused."""
+    """A user's function that raises an error is refused with its name, file and error."""
     part = DissipationPart(name="inverse", function=lambda restitution: 1 / restitution, **ORIGIN)
     monkeypatch.setitem(PARTS[DISSIPATION], "inverse", part)
     assert list(check_factors("contacts.damping", ["inverse"], [0.5])) == []
@@ -70,7 +70,7 @@ def test_a_factor_that_fails_is_named_with_its_file(monkeypatch):
 
 @pytest.mark.parametrize("frequency", [None, "fast", 0.0, np.nan])
 def test_a_frequency_that_is_none_is_named_with_its_file(monkeypatch, frequency):
-    """A waveform that gives its own frequency gives a positive number."""
+    """The frequency of a registered waveform must be a positive number."""
     part = WaveformPart(name="tap", function=lambda drive: None, frequency=lambda drive: frequency, **ORIGIN)
     monkeypatch.setitem(PARTS[WAVEFORM], "tap", part)
     with pytest.raises(PartError, match=r"the frequency of the waveform 'tap' of .*; a positive number"):

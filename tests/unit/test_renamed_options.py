@@ -1,4 +1,4 @@
-"""Options that PETSc has renamed: a case may use either name under any version."""
+"""Options that PETSc has renamed: a case may use either name with any version of PETSc."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vipetsc.dynamics.options import check_options, given_first_step, name_in_pe
 
 
 def in_database() -> dict[str, str]:
-    """The options of time stepping in PETSc's database."""
+    """Return the options of time stepping in PETSc's database."""
     return {name: value for name, value in PETSc.Options().getAll().items() if name.startswith("ts_")}
 
 
@@ -54,7 +54,7 @@ def test_the_first_step_is_read_by_either_name(name):
     options[name] = 1e-5
     try:
         assert given_first_step(default=2.0) == 1e-5
-        # Those of a case come first, and leave the database as it was.
+        # The options of a case take precedence, and leave the database as it was.
         with petsc_options({"ts_dt": "1e-3"}):
             PETSc.TS().create(PETSc.COMM_SELF).setFromOptions()
             assert given_first_step(default=2.0) == 1e-3

@@ -1,4 +1,4 @@
-"""Numbers of frequency responses: their largest value and the widest range below a level, of curves in closed form."""
+"""The largest value of a frequency response and the widest range below a level, for curves in closed form."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vipetsc.spectra.responses import CurvePart, largest_response, widest_gap
 
 
 def part(parameter, values, is_regular=None) -> CurvePart:
-    """A part of a curve through these points, with the absolute values of complex ones, and its length through them."""
+    """Return the part of a curve through these points, with absolute values of complex ones and its length."""
     p = np.asarray(parameter, float)
     y = np.asarray(values)
     length = np.append(0.0, np.cumsum(np.hypot(np.diff(p), np.abs(np.diff(y)))))
@@ -18,12 +18,12 @@ def part(parameter, values, is_regular=None) -> CurvePart:
 
 
 def resonance(p):
-    """A resonance, a circle in the complex plane, with its largest absolute value 1 at p = 0.3137."""
+    """Return the values of a resonance 1/(1 + i (p - 0.3137)/0.2), whose largest absolute value is 1 at p = 0.3137."""
     return 1 / (1 + 1j * (p - 0.3137) / 0.2)
 
 
 def test_the_largest_value_between_points_converges():
-    """Wherever points lie, the parabola's error falls by more than eight as they are twice as many."""
+    """The error of the parabola through three points falls by more than 8 with twice the points, wherever they lie."""
     errors = []
     for count in (21, 41, 81):
         p, spacing = np.linspace(-1, 1, count, retstep=True)
@@ -45,7 +45,7 @@ def test_the_largest_value_is_that_of_the_range_and_of_all_parts():
 
 
 def test_special_points_close_to_others_do_not_spoil_the_parabola():
-    """Points that are not regular are values, but no support; uneven supports give the largest point itself."""
+    """Points that are not regular count as values and not for the parabola; uneven points yield the largest one."""
     y = [0.0, 1.0, 0.9, 0.0]
     steep = part([0.0, 1.0, 1.001, 2.0], y, is_regular=[True, True, False, True])
     assert largest_response([steep], 0, 2) == pytest.approx(1.0, abs=0.1)
@@ -54,7 +54,10 @@ def test_special_points_close_to_others_do_not_spoil_the_parabola():
 
 
 def test_gaps_of_a_resonance_are_those_of_its_formula():
-    """Below 0.5 are two ranges, of which the wider one counts; above all values it is all of the range."""
+    """|y| < 1/2 holds beyond 0.2 sqrt(3) from the resonance on either side; the wider one of both ranges counts.
+
+    The gap below a level above all values is the whole range.
+    """
     p = np.linspace(-1, 1, 2001)
     curve = [part(p, resonance(p))]
     half_width = 0.2 * np.sqrt(3)

@@ -52,11 +52,11 @@ class Motion(NamedTuple):
 
 
 def lattice(ends: str, pairs: tuple[Pair, ...] = ()) -> Model:
-    """A short lattice with dashpots, nonlinear springs, four contacts and three drives."""
+    """Return a short lattice with dashpots, nonlinear springs, four contacts and three drives."""
     model = small_case(lattice={"cells": 24}, contacts={"sites": [1]}).model()
     chain = Chain(CELL, CELLS, ends, SITES, (CLEARANCE,) * len(SITES), pairs=pairs)
     wave = model.drives[0].waveform
-    # The first drive acts on the host of the second site, the others on masses that only look like a site's.
+    # The first drive acts on the host of the second site, the others on masses near it that are not in contact.
     targets = [(SITES[1], CELL.host), (SITES[1], 0), (SITES[1] - 1, CELL.resonator)]
     factors = (1.0, 0.5, 2.0)
     drives = [
@@ -81,7 +81,7 @@ def set_contacts(lattice: LatticeRecord) -> None:
 
 
 def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[float]]:
-    """Forces in N on the hosts and powers in W that are dissipated, of sites in the modes of ``set_contacts``."""
+    """Return forces in N on the hosts and dissipated powers in W of the sites, in the modes of ``set_contacts``."""
     sides = [1.0, -1.0, 1.0]
     approaches = [0.02, 0.03, 0.05]
     forces = [0.0] * len(SITES)
@@ -92,7 +92,7 @@ def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[floa
         resonator = motion.at(SITES[i] + pair.next_cell, pair.resonator)
         w, rate = side * (resonator - host)
         x = w - CLEARANCE
-        # Also at x < 0: a closed site's force is continued until the change of mode is landed on.
+        # The force of a closed site is continued to x < 0, until a step ends on the change of mode.
         elastic = LAW.stiffness * np.sign(x) * abs(x) ** 1.5
         factor = 1.0 + LAW.damping * rate / approach
         forces[i] = side * elastic * factor
@@ -138,7 +138,7 @@ def accelerations(model: Model, motion: Motion) -> np.ndarray:
 
 
 class Evaluated(NamedTuple):
-    """A layout, its record, the state, also with its ghosts, and the rates by the right-hand side, with theirs."""
+    """A layout, its record, the state, its array ``y`` with ghosts, and its rates, also with ghosts."""
 
     layout: Layout
     lattice: LatticeRecord
@@ -148,7 +148,7 @@ class Evaluated(NamedTuple):
 
 
 def rates_of(lattice: LatticeRecord, time: float, state: PETSc.Vec) -> PETSc.Vec:
-    """The rates of a state as PETSc gets them; what is not written stays a NaN."""
+    """Return the rates of a state as PETSc gets them; entries that are not written stay NaN."""
     rates = state.duplicate()
     rates.array[:] = np.nan
     ts = PETSc.TS().create(MPI.COMM_SELF)
@@ -177,7 +177,7 @@ def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
 
 PAIRS = {
     "the cell's pair": (),
-    # To ground, to the next cell, and within the cell.
+    # The pairs are to ground, to the next cell, and within the cell.
     "any pair": (Pair(-1, 0), Pair(2, 1, next_cell=True), Pair(0, 2), Pair(1, 2)),
 }
 
@@ -213,7 +213,10 @@ def test_the_rates_are_those_of_all_forces(ends, pairs):
 
 @ENDS
 def test_the_sites_motion_is_that_of_the_rates(ends):
-    """That of the cell's pairs is computed site by site, that of other pairs comes from the rates of all masses."""
+    """The motion (w, w', w'') of the sites is that of the rates.
+
+    It is computed site by site for the cell's pair, and from the rates of all masses for other pairs.
+    """
     for name, pairs in PAIRS.items():
         model = lattice(ends, pairs)
         motion = random_motion(model)
@@ -237,7 +240,7 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
 
 
 def test_a_rank_writes_only_to_what_it_owns():
-    """A site that another rank shares acts here on the one mass that this rank owns, and has no ledger here."""
+    """A site of which this rank owns one mass acts on that mass alone; a ledger of another rank is not written."""
     model = lattice("fixed", PAIRS["any pair"])
     motion = random_motion(model)
     whole = evaluate(model, motion)
@@ -245,7 +248,8 @@ def test_a_rank_writes_only_to_what_it_owns():
     d = CELL.dofs
 
     layout, record, state, _, _ = evaluate(model, motion)
-    # Of the pressed site, which joins masses 1 and 3 of a cell, the host belongs to another rank; the last site too.
+    # Another rank owns the host of the pressed site (masses 1 and 3), the resonator of the second site, and the
+    # ledger of the last one.
     record.site_dofs["host"]["cell"][2] = -1
     record.site_dofs["resonator"]["cell"][1] = -1
     record.site_dofs["ledger"][3] = -1
@@ -279,7 +283,7 @@ def undamped_cell() -> UnitCell:
 
 
 def test_pressed_contacts_at_rest_are_not_accelerated():
-    """The static load balances the contact force in what the search for changes sees, too."""
+    """The motion of pressed sites at rest, which the search for changes uses, is zero: the load balances the force."""
     model = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0}).model()
     layout = Layout(model, MPI.COMM_SELF)
     record = create_record(model, layout)
@@ -287,5 +291,6 @@ def test_pressed_contacts_at_rest_are_not_accelerated():
     motion = np.full((3, 3), np.nan)
     observe(0.0, rest, record, motion)
     assert record.contacts["preload"].min() > 1.0
-    # 1e-12 of what the load alone would give, 4e3 m/s^2: the force at w = 0 is computed twice, in numpy and compiled.
+    # The load alone would accelerate by 4e3 m/s^2. It is computed with NumPy and the force compiled: both differ in
+    # rounding, and the bound is less than 1e-12 of that acceleration.
     assert np.abs(motion).max() < 1e-9

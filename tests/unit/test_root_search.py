@@ -42,14 +42,14 @@ def test_first_rise_is_the_first_sign_change(coefficients):
     position = np.linspace(0, 1, 4001)
     values = BPoly(coefficients[:, None], [0, 1])(position)
 
-    # The search says 2 where there is no root. What is positive by rounding alone may be missed.
+    # The search returns 2 if there is no root. Values that are positive by rounding alone may be missed.
     if root > 1:
         assert values.max() <= 1e-12
         return
 
     before = values[position < root - 1e-9]
     assert np.all(before <= 1e-12)
-    # Otherwise it begins on zero, which counts as a root whatever the rounding.
+    # An interpolant that begins at zero, within rounding, has its root there.
     if coefficients[0] < -1e-9:
         assert abs(evaluate(coefficients, root, np.empty(6))) < 1e-9
 
@@ -74,8 +74,8 @@ def test_a_pair_of_crossings_inside_one_step_is_found():
 
 
 def test_the_first_of_three_roots_is_found():
-    """(s - 0.2)(s - 0.3)(s - 0.9) ends above zero: a bisection of the whole step would go to its last root."""
-    # s^3 - 1.4 s^2 + 0.51 s - 0.054 in Bernstein's form.
+    """The first root of (s - 0.2)(s - 0.3)(s - 0.9) is found, though bisection of the whole step leads to the last."""
+    # The coefficients are those of s^3 - 1.4 s^2 + 0.51 s - 0.054 in Bernstein's form.
     coefficients = np.array([-0.054, -0.054 + 0.51 / 3, -0.054 + (2 * 0.51 - 1.4) / 3, 0.056])
 
     np.testing.assert_allclose(evaluate(coefficients, 0.5, np.empty(6)), 0.3 * 0.2 * -0.4)
@@ -83,11 +83,11 @@ def test_the_first_of_three_roots_is_found():
 
 
 def test_a_start_that_has_just_landed_is_no_crossing():
-    """s (s - 0.4), raised by the rounding of a landing: on zero and falling at first."""
+    """The start of s (s - 0.4), raised by the rounding of a landing, is no crossing: the next root, 0.4, is found."""
     coefficients = np.array([0.0, -0.2, 0.6]) + 1e-12
 
     assert first_upcrossing(coefficients) == 0.0
     np.testing.assert_allclose(first_upcrossing_after_start(coefficients, 1e-10), 0.4, atol=1e-10)
-    # A tolerance below that rounding leaves the start a crossing; so does one that rises at once.
+    # The start is a crossing with a tolerance below that rounding, and for a polynomial that rises at once.
     assert first_upcrossing_after_start(coefficients, 1e-13) == 0.0
     assert first_upcrossing_after_start(-coefficients, 1e-10) == 0.0

@@ -15,7 +15,7 @@ def bowl(points):
 
 
 def search_with(sampler, function, generations):
-    """Let a sampler search for the least of a function; return all points and their losses."""
+    """Let a sampler minimise a function for some generations; return all points and their losses."""
     asked = []
     losses = []
     for _ in range(generations):
@@ -31,7 +31,7 @@ def two_bowls(points):
 
 
 def cma():
-    """Return CMA-ES in four dimensions from the middle of the cube, in generations of its own size, 8."""
+    """Return CMA-ES in four dimensions from the middle of the cube, with its default generations of 8 points."""
     return CmaEs(np.full(4, 0.5), np.zeros(4), np.eye(4), 0.2, seed=3, population=None)
 
 
@@ -61,7 +61,7 @@ def test_cma_es_finds_the_least_and_stays_in_the_cube():
 
 @pytest.mark.parametrize(("make", "function"), [(cma, bowl), (nsga, two_bowls)])
 def test_a_search_depends_on_its_seed_alone(make, function):
-    """NumPy's global random numbers, which libraries like to use, neither change a search nor are changed by it."""
+    """NumPy's global random numbers, which libraries may use, neither change a search nor are changed by it."""
     np.random.seed(1)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     first, _ = search_with(make(), function, 12)
@@ -73,7 +73,7 @@ def test_a_search_depends_on_its_seed_alone(make, function):
 
 
 def test_a_search_that_has_contracted_begins_again_with_more():
-    """Where the steps have become too short the search starts anew with twice as many points a generation."""
+    """A search whose steps have become too short starts again with twice as many points a generation."""
     sizes = generation_sizes(cma(), bowl, 150)
 
     assert sizes[0] == 8
@@ -81,7 +81,7 @@ def test_a_search_that_has_contracted_begins_again_with_more():
 
 
 def test_where_nothing_differs_generations_stay_within_bounds():
-    """Equal losses make the search start anew at once: generations grow, to eight times the first at most."""
+    """With equal losses the search starts again at once, and generations grow to at most eight times the first."""
 
     def flat(points):
         return np.ones((len(points), 1))
@@ -90,12 +90,12 @@ def test_where_nothing_differs_generations_stay_within_bounds():
 
 
 def test_the_step_of_a_whole_number_does_not_vanish():
-    """Where the others contract, neighbouring cells are still tried."""
+    """The step of a whole number stays large enough for its neighbours when the steps of other variables contract."""
     sampler = CmaEs(np.full(2, 0.52), np.array([0.0, 0.02]), np.eye(2), 0.2, 5, None)
 
     points, _ = search_with(sampler, lambda p: ((p - 0.5) ** 2).sum(axis=1, keepdims=True), 30)
 
-    # In the last generations; the second value is a whole number of 50 cells.
+    # The last generations; the second variable is a whole number of 50 cells.
     assert np.std(points[-12:, 0]) < 0.001
     assert np.std(points[-12:, 1]) > 0.002
 
@@ -108,7 +108,7 @@ def test_a_first_generation_changes_neighbours_together():
 
     points = sampler.ask() - 0.5
 
-    # The standard deviation of 4000 points is itself good to 1/8000^1/2, 1.1 %.
+    # The standard deviation of 4000 points has the relative error 1/8000^(1/2) = 1.1 %.
     assert np.std(points.mean(axis=1)) == pytest.approx(step, rel=0.05)
     modes = points @ shapes / (shapes**2).sum(axis=0)
     assert np.allclose(np.std(modes, axis=0), step, rtol=0.08)
@@ -118,7 +118,7 @@ def test_a_first_generation_changes_neighbours_together():
 
 @pytest.mark.slow
 def test_nsga_ii_finds_the_front_of_two_bowls():
-    """The best of both lie on the straight line between their lowest points."""
+    """The front of the squared distances from two points is the straight line between these points."""
     ends = np.array([[0.2, 0.2, 0.2], [0.8, 0.8, 0.2]])
 
     def squared_distances(points):
@@ -127,7 +127,7 @@ def test_nsga_ii_finds_the_front_of_two_bowls():
     points, losses = search_with(Nsga2(np.full(3, 0.5), 0.2, 3, 20), squared_distances, 50)
 
     best = points[front(losses)]
-    # Most of a generation of 20, over most of the line, and near it.
+    # Most of a generation of 20 points lie on the front, along most of the line and near it.
     assert len(best) > 15
     assert np.ptp(best[:, 0]) > 0.4
     assert np.abs(best[:, 0] - best[:, 1]).max() < 0.1
@@ -140,6 +140,6 @@ def test_a_front_has_what_nothing_is_better_than_and_its_knee():
     assert front(losses).tolist() == [3, 1, 0]
     assert knee(losses[front(losses)]) == 1
 
-    # Of one loss the front is the first of the least; where all failed there is none.
+    # The front of one loss is the first point of the least loss; it is empty if all points failed.
     assert front(np.array([[2.0], [np.nan], [1.0], [1.0]])).tolist() == [2]
     assert front(np.full((2, 2), np.nan)).size == 0

@@ -1,4 +1,4 @@
-"""Samples of a waveform from files: what is too large or no table is refused before it is read whole."""
+"""Samples of a waveform from files: data that are too many or no table are refused before they are read whole."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vipetsc.case.samples import MOST_SAMPLES, with_samples
 
 
 def refusal(**samples: object) -> str:
-    """The text of the one problem with the file of a drive's ``samples``."""
+    """Return the text of the only problem with the file of a drive's ``samples``."""
     _, problems = with_samples({"drive": {"waveform": "samples", "samples": samples}})
     (problem,) = problems
     assert problem.key == "drive.samples.file"
@@ -21,7 +21,7 @@ def refusal(**samples: object) -> str:
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """An HDF5 file with 16 TB of samples, of which none was ever written, a group, and a table of three columns."""
+    """Return an HDF5 file with a data set of 16 TB without written chunks, a group, and a table of three columns."""
     path = tmp_path / "samples.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("endless", shape=(10**12, 2), chunks=(1000, 2), dtype=float)

@@ -23,7 +23,10 @@ def found():
 
 
 def direct_loop(reading, lam, eta):
-    """Return deflections (kappa,) and speeds (kappa, band) of a cell from the paper's matrix, its -1/2 put in."""
+    """Return deflections (kappa,) and speeds (kappa, band) of a cell from the paper's matrix.
+
+    Row 1, column 2 has the term -1/2 that the printed matrix lacks, without which it is not Hermitian.
+    """
     m = 0.005
     k = 2e4
     k2 = 1e4
@@ -41,7 +44,7 @@ def direct_loop(reading, lam, eta):
 
     deflection = []
     speeds = []
-    # Central differences of frequencies of some 1e3 rad/s are good to (1e-5)^2 and to rounding over 1e-5.
+    # Errors of central differences, relative to frequencies of some 1e3 rad/s, are h^2 and rounding over h.
     h = 1e-5
     for kappa in KAPPA[1:-1]:
         _, u = modes(kappa)
@@ -73,14 +76,17 @@ def test_out_of_phase_wherever_the_resonator_alone_is_slower_than_the_band_edge(
     alone = GRID[:, None] * SPRING[reading] / (0.005 * GRID[None, :-1])
     edge = 1e4 / 0.005
     clear = np.abs(alone - edge) > 1e-6 * edge
-    # On the edge itself rounding decides; few cells lie there.
+    # The few cells on the edge are left out, since rounding decides there.
     assert clear.mean() > 0.95
     np.testing.assert_array_equal(found[reading].out_of_phase[clear], (alone < edge)[clear])
 
 
 @pytest.mark.parametrize("reading", READINGS)
 def test_best_velocities_where_bands_three_and_four_touch(found, reading):
-    """At kappa = 0 the two touch where 10 eta^2 - 5 eta + 5 a = 0, a = k3 / (m omega^2) of the lower edge, 5 k/2m."""
+    """The best cell is the one at which bands 3 and 4 touch at kappa = 0.
+
+    There 10 eta^2 - 5 eta + 5 a = 0, with a = k3/(m omega^2) and the edge omega^2 = 5 k/(2 m).
+    """
     lam = GRID[0]
     a = lam * SPRING[reading] / 5e4
     eta = (5 + np.sqrt(25 - 200 * a)) / 20
@@ -92,13 +98,13 @@ def test_best_velocities_where_bands_three_and_four_touch(found, reading):
         assert row == 0
         assert abs(GRID[column] - eta) <= 0.5 * (GRID[1] - GRID[0])
 
-    # Finer in eta, the optimum closes in on it, as far as the spacing in kappa lets the touching bands be seen.
+    # On a finer grid of eta the optimum is closer, up to the error by the spacing of kappa.
     fine = search_cells(reading, [lam], np.arange(0.4, 0.55, 5e-4), KAPPA)
     assert fine.eta[fine.optimum("weighted")[1]] == pytest.approx(eta, abs=1e-3)
 
 
 def test_paper_choice(found):
-    """C10: (0.1, 0.5) is what a grid of spacing 0.1 gives; finer, 0.45 as printed and 0.475 calibrated."""
+    """The optimum is (0.1, 0.5) on a grid of 0.1, as in claim C10; finer, eta is 0.45 as printed, 0.475 calibrated."""
     tenths = np.round(np.linspace(0.1, 0.9, 9), 12)
     for reading, eta in (("printed", 0.45), ("calibrated", 0.475)):
         row, column = search_cells(reading, tenths, tenths, KAPPA).optimum("weighted")
@@ -115,7 +121,7 @@ def test_paper_choice(found):
 
 
 def test_no_cell_is_out_of_phase():
-    """A stiff spring carries its resonator along: deflections are negative, and there is no optimum."""
+    """With a stiff spring the resonator follows its host: deflections are negative, and there is no optimum."""
     stiff = search_cells("printed", [5.0, 50.0], [0.3, 0.5], KAPPA)
 
     assert not stiff.out_of_phase.any()
@@ -141,7 +147,7 @@ def test_a_massless_host_or_resonator_is_refused(eta):
 @settings(max_examples=25)
 @given(lam=st.floats(0.05, 2), eta=st.floats(0.05, 0.95), kappa=st.floats(0.01, 3.1), reading=st.sampled_from(READINGS))
 def test_deflection_knows_neither_phase_nor_length_nor_direction(lam, eta, kappa, reading):
-    """A wave to the left deflects as one to the right; a unit vector deflects by sqrt(2) at most."""
+    """The signed deflection does not depend on phase, length or direction of a wave, and is at most sqrt(2)."""
     cell = four_band(reading, lam, eta)
     right = bloch(cell, kappa)
     left = bloch(cell, -kappa)

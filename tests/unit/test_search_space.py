@@ -26,7 +26,7 @@ TABLE = {
     "lattice": {
         "cells": 24,
         "cell": OWN_CELL,
-        # Keys with dots and brackets of their own, which a path must not split.
+        # These keys contain dots and brackets, at which a path must not be split.
         "profiles": {"masses[1]": {"first": 4e-3, "last": 4e-3}, "springs[1].stiffness": {"first": 1e4, "last": 2e4}},
     },
     "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [6, 12, 14], "clearance": 1e-4, "restitution": 0.7},
@@ -37,7 +37,7 @@ TABLE = {
 
 
 def plan_of(variables: dict, **sections) -> OptimiseCase:
-    """The search of ``TABLE`` over these variables."""
+    """Return the search of ``TABLE`` over these variables."""
     table = with_sections(TABLE, sections)
     return OptimiseCase.from_table(table | {"optimise": table["optimise"] | {"variables": variables}})
 
@@ -80,7 +80,7 @@ def test_every_key_has_its_place_in_a_design():
     expected["drive"] = TABLE["drive"] | {"cycles": 7, "more": more}
     # Searches take the faster engine where the case names none.
     expected["time"]["engine"] = "auto"
-    # By the hash of the case: it covers every key, those that must not have changed among them.
+    # The hash of a case covers every key, also those that must not have changed.
     assert case_id(design) == case_id(type(design).from_table(expected | {"name": "design"}))
     # A float would be refused by the schema, or change the hash.
     assert type(design.drive.cycles) is int
@@ -97,18 +97,17 @@ def test_the_case_is_the_start_and_survives_the_unit_cube():
         contacts={"damping": "paper"},
     )
     values = plan.begin()
-    # Choices are numbered: "paper" is the second of its list. Sites without a list of their own have the single
-    # value.
+    # Choices are numbered: "paper" is the second of its list. Sites have the common value, since the case has no list.
     assert values.tolist() == [1e-4] * 3 + [1e7] * 3 + [2, 3]
     assert np.allclose(plan.space.from_unit(plan.space.to_unit(values)), values, rtol=1e-12)
     design = plan.design(values)
     assert {*design.model().laws} == {plan.base.model().contact}
-    # The models and not the cases, since the design has lists where the case has single values.
+    # Models are compared and not cases, since the design has lists where the case has single values.
     assert design.model().chain == plan.base.model().chain
 
 
 def test_names_are_keys_of_the_case():
-    """A variable with a name of its own is that of the key's path: both give the same design, to its hash."""
+    """A variable by its short name and by the path of its key gives the same design, with the same hash."""
     by_name = plan_of({"profile": [1e-5, 1e-2], "restitution": [0.1, 0.9], "masses": {"2": [1e-3, 1e-2]}})
     by_key = plan_of(
         {
@@ -135,7 +134,7 @@ def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
     # A fine grid, so that the parts are measured to 1/3000.
     numbers = np.array([choice.from_unit(x) for x in grid])
     assert [np.mean(numbers == n) for n in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=1e-3)
-    # A choice holds in its third of the cube, 1/6 to either side of its middle.
+    # A choice has a third of the range, 1/6 on either side of its middle.
     for near in (-0.16, 0.0, 0.16):
         found = [choice.in_case(choice.from_unit(choice.to_unit(n) + near)) for n in (1, 2, 3)]
         assert found == ["a", "b", "c"]
@@ -153,13 +152,13 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     ]
     space = SearchSpace({}, kinds)
     steps = np.array([variable.step for variable in kinds])
-    # From far off: x at 1/200 of its best value, n at 3 rather than 21, and the worst but one of the choices.
+    # The start is far away: x at 1/200 of its best value, n at 3 instead of 21, and the second worst choice.
     search = CmaEs(space.to_unit(space.begin()), steps, np.eye(3), 0.3, seed=1, population=None)
 
     best = np.inf, None
     for _ in range(60):
         values = [space.from_unit(point) for point in search.ask()]
-        # The sum of three valleys, each with its least value at a place that can be read off.
+        # The loss is the sum of three functions, with their minima at x = 2, n = 21 and the choice of the value 0.
         losses = [np.log10(x / 2) ** 2 + 0.05 * (n - 21) ** 2 + kinds[2].choices[int(c) - 1] for x, n, c in values]
         search.tell(np.array(losses)[:, None])
         best = min(best, (min(losses), values[int(np.argmin(losses))]), key=lambda pair: pair[0])
@@ -198,7 +197,7 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
 def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, message):
     with pytest.raises(CaseError) as error:
         plan_of(variables)
-    # One: no problem may be reported by two checks, or cause others.
+    # No other check reports the same problem or one that follows from it.
     (problem,) = error.value.problems
     assert problem.key == f"optimise.variables.{key}"
     assert message in str(problem)
@@ -206,23 +205,23 @@ def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, m
 
 @pytest.mark.parametrize("variables", [{"restitution": [0.1, 0.9]}, {"contacts": {"restitution": [0.1, 0.9]}}])
 def test_a_key_that_the_sites_do_not_take_is_no_variable(variables):
-    """Where each site has a restitution of its own, that of all sites has no effect."""
+    """The common restitution is no variable where each site has its own, since it has no effect."""
     with pytest.raises(CaseError, match=r"contacts\.each\.restitution, which can vary instead"):
         plan_of(variables, contacts={"each": {"restitution": [0.5, 0.6, 0.7]}})
 
 
 def test_an_amplitude_that_varies_is_that_of_the_runs():
-    """Measures at given amplitudes would not depend on it, and are refused."""
+    """An amplitude that varies is that of the runs; objectives at given amplitudes are refused beside it."""
     variables = {"drive": {"amplitude": {"log": [1.0, 10.0]}}}
     plan = plan_of(variables)
     assert plan.design(np.array([7.0])).drive.amplitude == 7.0
-    # An objective at amplitudes of its own replaces the one that varies.
+    # An objective at given amplitudes would replace the amplitude that varies.
     with pytest.raises(CaseError, match=r"would take the place of drive\.amplitude"):
         plan_of(variables, optimise={"objective": [{"measure": "entropy", "amplitudes": [2.0]}]})
 
 
 def test_keys_with_dots_are_found_and_changed():
-    """The key of a table may have dots itself; a path to a value returns what was put there."""
+    """A path finds and changes a value also where keys contain dots."""
     table = {"profiles": {"springs[1].stiffness": {"first": 1.0}, "masses[1]": [1.0, 2.0]}, "list": [{"a": 1}]}
     for path, value in (
         ("profiles.springs[1].stiffness.first", 3.0),
@@ -231,7 +230,7 @@ def test_keys_with_dots_are_found_and_changed():
         ("list[1].a", 6),
         ("new.b.c", 7),
     ):
-        # No problem was found on the path.
+        # ``put`` returns the problems of the path, of which there is none.
         assert put(table, path, value) == []
         assert value_at(table, path) == value
 
@@ -240,12 +239,12 @@ def test_keys_with_dots_are_found_and_changed():
         "list": [{"a": 6}],
         "new": {"b": {"c": 7}},
     }
-    # Beyond a list, of no table, and a key of a list: none has a value, none is an error.
+    # An entry beyond a list, a missing table and a key of a list have no value, and are no error.
     assert value_at(table, "list[2].a") is value_at(table, "no.such") is value_at(table, "list.a") is None
 
 
 def test_the_text_of_a_search_over_keys_gives_the_same_search():
-    """It is written out and read back, dotted keys among them; units are those of the keys."""
+    """A search over keys, dotted ones among them, is equal after a round trip as text; units are those of the keys."""
     table = search_table(40, [10, 20], lattice={"profiles": {"springs[1].stiffness": {"first": 4e3, "last": 5e3}}})
     profiles = {"springs[1].stiffness": {"last": {"log": [1e3, 1e4]}}}
     table["optimise"]["variables"] = {"clearance": [1e-5, 1e-3], "lattice": {"profiles": profiles}}

@@ -1,4 +1,4 @@
-"""Series of a free motion: shifted, copied, and met with a clearance for the first time."""
+"""Series of a free motion: shifts, copies, and the first onset at a clearance."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from tests.conftest import small_case
 from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics.propagator.taylor import copy, evaluate, first_onset, shift
 
-# What first_onset returns without an onset.
+# The value of first_onset if there is no onset.
 NONE = 2.0
 
 
@@ -36,7 +36,7 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
     copy(taylor, rows)
     np.testing.assert_array_equal(rows, taylor[:2])
 
-    # A workspace for more DoFs keeps what it had of the others.
+    # A workspace for more DoFs keeps the other rows.
     room = np.full((5, 7), 9.0)
     shift(taylor, -0.6, room)
     np.testing.assert_array_equal(room[:3], expected)
@@ -46,7 +46,7 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
 @pytest.mark.parametrize(
     ("series", "clearances", "length", "onset"),
     [
-        # At constant velocity: towards either side, the length just long enough or not, and no stop on one side.
+        # Motions of constant velocity to either side: the length is just long enough or not; one side has no stop.
         ([0.0, 1.0], (0.4, 0.4), 1.0, 0.4),
         ([0.0, -1.0], (0.4, 0.4), 1.0, 0.4),
         ([0.0, -1.0], (0.4, 0.3), 1.0, 0.3),
@@ -54,22 +54,22 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
         ([0.0, -1.0], (0.4, np.inf), 1.0, NONE),
         ([0.0, 1.0], (np.inf, 0.4), 1.0, NONE),
         ([0.0, 1.0], (0.4, 0.4), 0.39, NONE),
-        # From rest: the bound on w'' is the parabola itself, which the first step of the search meets.
+        # Motions from rest: the bound on w'' is that of the parabola itself, which the first step of the search finds.
         ([0.0, 0.0, 1.0], (0.2, 0.2), 0.5, 0.2**0.5),
         ([0.0, 0.0, 1.0], (0.3, 0.3), 0.5, NONE),
-        # Both sides within the length: the first of the two.
+        # Motions that reach both sides within the length have the earlier onset.
         ([0.0, 2.0, -6.0], (0.1, 0.1), 1.0, (1 - 0.4**0.5) / 6),
         ([0.0, -2.0, 6.0], (0.1, 0.1), 1.0, (1 - 0.4**0.5) / 6),
-        # Away from a clearance on which it begins, and back; towards it; a little beyond it.
+        # Motions that begin at a clearance: away from it and back, outwards, and outwards from a little beyond it.
         ([0.3, -1.0, 1.0], (0.3, 0.3), 1.2, 1.0),
         ([0.3, 1.0, 0.0], (0.3, 0.3), 1.2, 0.0),
         ([0.3 * (1 + 1e-12), 1.0, 0.0], (0.3, 0.3), 1.2, 0.0),
-        # At rest on a clearance, then away to the other side; almost at rest just before it.
+        # A motion from rest at a clearance to the other side, and one almost at rest just before a clearance.
         ([0.3, 0.0, -1.0], (0.3, 0.3), 1.0, 0.6**0.5),
         ([0.3 - 1e-11, 1e-9, 1.0], (0.3, 0.3), 1.0, 0.0),
-        # Away at first, and back faster and faster: w = 4 s^3 - s.
+        # The motion w = 4 s^3 - s goes away first and returns faster and faster.
         ([0.0, -1.0, 0.0, 4.0], (0.3, 0.3), 1.0, np.roots([4.0, 0.0, -1.0, -0.3]).real.max()),
-        # A short approach with much curvature; one that turns just short of the clearance, or just beyond.
+        # A motion of high curvature; motions that turn just before the clearance, or just beyond it.
         ([0.0, 0.0, 0.0, 40.0], (0.3, 0.3), 1.0, (0.3 / 40) ** (1 / 3)),
         ([0.0, 1.0, -1.0], (0.25 + 1e-7, 0.25 + 1e-7), 1.0, NONE),
         ([0.0, 1.0, -1.0], (0.25 - 1e-7, 0.25 - 1e-7), 1.0, 0.5 - 1e-7**0.5),
@@ -78,5 +78,5 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
 def test_the_first_onset_is_met_to_rounding(series, clearances, length, onset):
     """The first onset of a polynomial motion is its first root at a clearance, in closed form."""
     site = create_contacts(small_case().model().contact, [clearances])[0]
-    # An approach to LANDED_W, 1e-10 of a clearance, counts as an onset.
+    # A distance from the clearance below LANDED_W, 1e-10 of it, counts as an onset.
     assert first_onset(np.array(series), site, length) == pytest.approx(onset, rel=2e-10, abs=1e-14)

@@ -1,4 +1,4 @@
-"""Modes that share their frequency with others, or have a part of it, begin no branch."""
+"""Modes whose frequency equals that of another mode, or a whole fraction of it, begin no branch."""
 
 from mpi4py import MPI
 
@@ -13,7 +13,7 @@ from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 
 def oscillators(*omega: float, minus: float | None = None, cubic: float = 0.0) -> System:
-    """Masses of 1 kg on springs of their own with these frequencies in rad/s, and a stop at the first one."""
+    """Return separate masses of 1 kg on springs, with these frequencies in rad/s, and a stop at the first one."""
     springs = [(None, i, frequency**2) for i, frequency in enumerate(omega)]
     stop = ContactPair(None, 0, 1e-3, Contact("bilinear", 1e4), clearance_minus=minus)
     smooth = [SmoothSpring.between(None, 0, cubic=cubic)] if cubic else []
@@ -29,7 +29,10 @@ def test_equal_frequencies_are_companions_of_each_other():
 
 
 def test_multiples_are_companions_of_the_lower_mode_alone():
-    """Even ones only where the stops differ, so that motions need not be symmetric."""
+    """The mode of a multiple of a frequency is a companion of the lower mode, and not the other way round.
+
+    Even multiples count only where the stops on both sides differ, since motions are then not symmetric.
+    """
     assert companions(oscillators(1.0, 2.0, 3.0), 0) == [Companion(2, 3)]
     assert companions(oscillators(1.0, 2.0, 3.0, minus=np.inf), 0) == [Companion(1, 2), Companion(2, 3)]
     assert companions(oscillators(1.0, 2.0, 3.0), 2) == []
@@ -46,7 +49,7 @@ def test_motions_that_are_nowhere_linear_are_left_to_their_equations():
 
 
 def ring(**nnm) -> NnmCase:
-    """A ring of three cells of two masses, whose modes 2 and 3 are waves to either side."""
+    """Return the case of a ring of three cells of two masses, whose modes 2 and 3 are waves in both directions."""
     springs = [
         {"start": 1, "end": 1, "next_cell": True, "stiffness": 1000.0},
         {"start": 1, "end": 2, "stiffness": 700.0},

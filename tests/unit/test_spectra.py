@@ -1,4 +1,4 @@
-"""Spectral measures against waves with a spectrum in closed form, and their sums against Parseval."""
+"""Spectral measures of waves against closed forms, and their sums against Parseval's identity."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def split(signal, interval, edges):
     frequency = np.pi * np.arange(nt) / ((nt - 1) * interval)
     part = np.searchsorted(edges, frequency, side="right") - 1
 
-    # One value a time, for all axes behind it.
+    # The shape lets one value for each time apply to all further axes.
     part = part.reshape(-1, *[1] * (signal.ndim - 1))
     for number in range(len(edges) - 1):
         yield fft.idct(np.where(part == number, spectrum, 0.0), type=1, axis=0)
@@ -65,7 +65,7 @@ def test_a_plane_wave_lands_on_its_bin(row, direction):
     k, w = np.unravel_index(np.argmax(found.energy), found.energy.shape)
     assert found.wavenumber[k] == pytest.approx(kappa)
     assert found.frequency[w] == pytest.approx(omega)
-    # The sum over the cells of m/2 cos^2, whose mean is 1/2.
+    # The energy is the sum over the cells of (m/2) cos^2, and the mean of cos^2 is 1/2.
     assert found.energy[k, w] == pytest.approx(0.5 * mass * n * 0.5)
     assert np.delete(found.energy.ravel(), found.energy.argmax()).max() < 1e-20
 
@@ -77,7 +77,7 @@ def test_a_plane_wave_lands_on_its_bin(row, direction):
 @settings(max_examples=30)
 @given(st.integers(2, 40), st.integers(2, 40), st.integers(0, 99))
 def test_energies_obey_parseval(nt, n, seed):
-    """Energies over wavenumbers and frequencies sum to the kinetic energy, whatever the lengths."""
+    """Energies over wavenumbers and frequencies sum to the kinetic energy, for records of any lengths."""
     velocity = noise((nt, n, 2), seed)
 
     kinetic = kinetic_energy(velocity, MASSES)
@@ -128,7 +128,7 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
 @settings(max_examples=60)
 @given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(0, 99))
 def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, seed):
-    """As many as the width of the part needs, wherever it lies and whatever the length."""
+    """Energies of a part, computed at as few times as its width needs, are exact at every sample, for any position."""
     # The highest frequency of samples at this interval.
     interval = 0.1
     highest = np.pi / interval
@@ -147,7 +147,7 @@ def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, see
 @settings(max_examples=60)
 @given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(1, 9), st.integers(1, 7), st.booleans())
 def test_maps_of_parts_are_means_of_their_energy(nt, one, other, samples, cells, whole):
-    """Means over blocks of samples and cells, the last ones shorter, of the energy at every sample."""
+    """Maps of a part are means of its energy over blocks of samples and cells, of which the last may be shorter."""
     interval = 0.1
     highest = np.pi / interval
     edges = sorted((highest * one, highest * other))
@@ -159,13 +159,13 @@ def test_maps_of_parts_are_means_of_their_energy(nt, one, other, samples, cells,
 
     kept = {"mapped": (0,), "sizes": (samples, cells), "memory": np.inf if whole else 1.0}
     found = part_energies(velocity, MASSES, interval, [*edges, np.inf], **kept)
-    # Kept in single precision.
+    # Maps are kept in single precision.
     assert found.maps.dtype == np.float32
     assert np.allclose(found.maps, [expected], rtol=1e-6, atol=1e-12 * energy.max() + 1e-300)
 
 
 def test_a_part_takes_twice_as_many_points_as_it_has_cosines():
-    """Wherever they lie; a part without one takes a point and has no energy."""
+    """A part of n cosines takes 2 n points or a few more, at any frequencies; without cosines it has no energy."""
     for low in (0, 640, 4000):
         part = CosineSquares.zeros(low, low + 255)
         assert 2 * 255 < part.length <= 512 + 1
@@ -177,21 +177,21 @@ def test_a_part_takes_twice_as_many_points_as_it_has_cosines():
 
 
 def test_a_last_wide_part_is_coarser_by_the_stride():
-    """What is above the bands is interpolated between every tenth sample; other parts stay exact."""
+    """The energy above the last edge is interpolated between every tenth sample; other parts stay exact."""
     velocity = noise((100, 3, 2))
     edges = [0.0, 20.0, np.inf]
     every = part_energies(velocity, MASSES, 0.1, edges, 1).total
     tenth = part_energies(velocity, MASSES, 0.1, edges, 10).total
     assert np.allclose(every[0], tenth[0], rtol=1e-12)
     assert not np.allclose(every[1], tenth[1], rtol=0.1)
-    # 99 steps become 10, which have the samples 0 and 99 in common.
+    # 99 steps become 10; the samples 0 and 99 belong to both.
     assert np.allclose(every[1, [0, 99]], tenth[1, [0, 99]], rtol=1e-12)
 
 
 @settings(max_examples=30)
 @given(st.integers(2, 200), st.floats(0, 0.3), st.integers(2, 20), st.integers(0, 99))
 def test_an_open_part_at_strided_times_is_the_part_there(nt, low, stride, seed):
-    """At the few times that are samples, as it would be without a stride."""
+    """The last part with a stride has the energy of the part without one at those of its times that are samples."""
     edges = [0.0, low * np.pi / 0.1, np.inf]
     velocity = noise((nt, 3, 2), seed)
     every = part_energies(velocity, MASSES, 0.1, edges).total
@@ -224,13 +224,13 @@ def test_parts_name_bands_and_gaps():
 
 
 def test_parts_of_bands_that_overlap_touch_or_begin_above_zero():
-    """Bands that overlap are one part; a gap below the first band is named; a zero of rounding has none below it."""
+    """Bands that overlap are one part; there is a gap below a first band unless that begins at zero within rounding."""
     merged = Parts.of([Band(1, 0.0, 2.0), Band(2, 1.0, 3.0), Band(3, 5.0, 6.0)])
     assert merged.bands == ((1, 2), (), (3,), ())
     assert merged.edges.tolist() == [0, 3, 5, 6, np.inf]
     assert Parts.of([Band(1, 4.0, 6.0)]).names == ("gap 1", "band 1", "above")
     assert list(Parts.of([Band(1, 0.0, 5.0), Band(2, 1.0, 3.0), Band(3, 6.0, 7.0)]).edges) == [0, 5, 6, 7, np.inf]
-    # A free lattice's zero, rounded.
+    # The lowest frequency of a free lattice is zero within rounding.
     assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")
 
 
@@ -239,9 +239,9 @@ def test_transfer_is_the_mean_fraction_after_arrival():
     energy = np.array([[1.0, 1.0, 3.0], [0.0, 1.0, 1.0]])
     above = np.array([False, True])
 
-    # From sample 1 on: 1/2, then 1/4.
+    # The fractions from sample 1 on are 1/2 and 1/4.
     assert ibtet(energy, above, 1) == pytest.approx((0.5 + 0.25) / 2)
-    # Without a part above, and without energy, there is none.
+    # The transfer is NaN without a part above the drive, and without energy.
     assert np.isnan(ibtet(energy, ~above & above))
     assert np.isnan(ibtet(0 * energy, above))
 
@@ -261,7 +261,7 @@ def test_taper_keeps_the_mean_square():
 
 
 def test_windows_of_a_dispersion_are_dispersions_of_their_cells():
-    """Windows, which have one transform in time, have the dispersions of their cells cut out of the field."""
+    """A window of cells, from one transform in time of all cells, has the dispersion of the field of these cells."""
     velocity = noise((40, 21, 2), 3)
     windows = [CellWindow(), CellWindow(slice(0, 8), taper=0.5), CellWindow(slice(9, 21), taper=0.2)]
     options = {"lengths": (45, 24), "highest": 20.0}
@@ -274,7 +274,7 @@ def test_windows_of_a_dispersion_are_dispersions_of_their_cells():
 
 
 def test_ridge_of_a_packet_lies_on_the_branch():
-    """A packet on band 2 of the four-band cell, composed of its Bloch modes."""
+    """The ridge of a packet of Bloch waves of band 2 lies on that band, to a tenth of a bin of frequency."""
     cell = four_band("calibrated")
     n = 128
     interval = 4e-4

@@ -40,7 +40,7 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
     _, layout, series, halo = chain_parts(ends, interval, tolerance)
     matrix = stencil_matrix(layout, series, halo)
 
-    # The bound is one of amplitudes, in which a velocity counts as omega_max u.
+    # The bound is one of amplitudes, for which displacements are multiplied by omega_max.
     is_displacement = np.arange(len(matrix)) < len(matrix) // 2
     scale = np.where(is_displacement, series.omega_max_h / interval, 1.0)
     difference = np.abs(matrix - exponential(series.chain, interval))
@@ -54,7 +54,8 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
         assert error > 1e-3 * series.truncation
 
 
-# One vector and a half; a last vector that overlaps the one before it; cells one by one at both borders.
+# Numbers of cells for one and a half vectors of cells, for a last vector that overlaps the one before it, and for
+# single cells at both borders.
 @pytest.mark.parametrize("cells", [24, LANES + 12, 3 * LANES + 17])
 @pytest.mark.parametrize("name", ["diatomic", "three-mass", "four-band"])
 def test_every_cell_is_the_same_sum_to_the_last_bit(name, cells):

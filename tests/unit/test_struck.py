@@ -1,4 +1,4 @@
-"""Masses that are struck: the section [initial] with velocities, what it resolves to, and what it refuses."""
+"""Masses that are struck: initial velocities in the section [initial], the numbers that follow, and refusals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MASS = 2.05e-3
 
 
 def beads(initial: dict, **sections: dict) -> Case:
-    """Return five beads that just touch, of which some are struck."""
+    """Return the case of five beads that touch without force, with the ``initial`` velocities of some of them."""
     table = {
         "lattice": {"cells": 5, "ends": "free", "cell": {"masses": [MASS]}},
         "contacts": {
@@ -29,7 +29,10 @@ def beads(initial: dict, **sections: dict) -> Case:
 
 
 def test_a_struck_lattice_has_no_frequency_of_a_drive():
-    """Nothing drives it; the frequency of its motion is that of a contact, and its scale that of the fastest mass."""
+    """A struck lattice has no drive; the frequency of its motion is pi over the contact time of the fastest mass.
+
+    The amplitude is the velocity of that mass over this frequency.
+    """
     case = beads({"cell": 1, "velocity": 0.1, "more": [{"cell": 5, "velocity": -0.5}]})
     assert case.drive.frequency is None
     assert case.wave_frequency is None
@@ -47,7 +50,10 @@ def test_a_struck_lattice_has_no_frequency_of_a_drive():
 
 
 def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
-    """Of two springs of 2e4 N/m, and one of 6e3 N/m to its resonator."""
+    """A struck mass on springs has the frequency (k/m)^(1/2) with the sum k of its springs, other masses held.
+
+    A host has two springs of 2e4 N/m, and one of 6e3 N/m to its resonator.
+    """
     springs = [
         {"start": 1, "end": 1, "stiffness": 2.0e4, "next_cell": True},
         {"start": 1, "end": 2, "stiffness": 6.0e3},
@@ -91,7 +97,7 @@ def test_what_is_refused(initial, message):
 
 
 def test_two_frequencies_are_refused():
-    """The frequency of a drive is the reference where there is one."""
+    """A frequency of the initial motion beside that of a drive is refused, and accepted without a drive."""
     initial = {"cell": 1, "velocity": 1.0, "frequency": 1e4}
     with pytest.raises(CaseError, match=r"initial\.frequency = 10000\.0: the drive has a frequency; omit this key"):
         beads(initial, drive={"amplitude": 1.0, "frequency": 2e4})
@@ -99,7 +105,7 @@ def test_two_frequencies_are_refused():
 
 
 def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
-    """A site with a loss that touches at rest has no approach velocity; that of the struck mass has one."""
+    """A lossy site that touches at rest has no approach velocity and is refused; at a struck mass it has one."""
     lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}
     with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
         beads({"cell": 1, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
@@ -107,7 +113,7 @@ def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
 
 
 def test_verbs_about_waves_refuse_it():
-    """A law is about a wave in a lattice at rest."""
+    """A scattering law, which needs a lattice at rest, refuses an initial motion."""
     with pytest.raises(
         CaseError, match=r"initial\.kind = 'velocity': the law's fractions .* in a lattice that starts at rest"
     ):
@@ -115,7 +121,7 @@ def test_verbs_about_waves_refuse_it():
 
 
 def test_a_lossy_site_is_not_at_rest_where_the_mass_of_the_next_cell_is_struck():
-    """Its contact is with the next cell; on a ring that of the last cell is with the first."""
+    """A contact between cells j and j + 1 is not at rest if cell j + 1 is struck; on a ring cell 1 follows the last."""
     lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}
     assert beads({"cell": 4, "velocity": -1.0}, contacts=lossy | {"sites": [3]})
     with pytest.raises(CaseError, match="site 1 touches its stop at rest"):

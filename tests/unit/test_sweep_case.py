@@ -1,4 +1,4 @@
-"""The section [sweep]: ranges, products, zipped keys, names, and what is wrong with it, all at once."""
+"""The section [sweep]: ranges, products, zipped keys, names of members, and sections that are refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.sweep import coordinate
 
-# Sites of all tried members together, as of a test with a bound of its own.
+# The bound on the number of sites of all tried members together, in tests.
 MOST_TRIED_SITES = 2000
 BASE = """
 name = "small"
@@ -164,7 +164,7 @@ def test_a_number_or_a_name_finds_its_member():
     assert plan.number(plan.ids()[3]) == 3
     assert plan.number("3") == 3
     assert plan.case(3).drive.amplitude == 2.0
-    # Beyond the last one, before the first one, and no name of any.
+    # A number beyond the last member, one before the first, and a name of no member.
     for name in ("6", "-1", "0123456789abcdef"):
         with pytest.raises(CaseError, match="is not a member; ensemble"):
             plan.number(name)
@@ -205,7 +205,7 @@ def test_a_range_has_its_ends_and_rises(first, ratio, count, kind):
     values = np.array(plan.axes[0]["drive.amplitude"])
     assert len(values) == count
     assert values[[0, -1]] == pytest.approx([first, first * ratio], rel=1e-12)
-    # A step may be a thousandth of the values: rounding takes the more of it.
+    # A step may be a thousandth of the values, hence its relative rounding error is larger than theirs.
     steps = np.diff(np.log(values) if kind == "log" else values)
     assert steps == pytest.approx(np.full(count - 1, steps[0]), rel=1e-6)
 
@@ -217,13 +217,13 @@ def test_a_range_meets_decimal_numbers_without_rounding():
         """Return the amplitudes of a sweep over the range."""
         return sweep_of(f"[sweep.drive]\namplitude = {text}").axes[0]["drive.amplitude"]
 
-    # As numpy rounds these ranges, 5 is 4.999999999999999, 0.3 is 0.30000000000000004, and 0 is 1.4e-17.
+    # NumPy's ranges have 4.999999999999999 for 5, 0.30000000000000004 for 0.3, and 1.4e-17 for 0.
     log = values("{ log = [0.5, 50.0], count = 7 }")
     assert log[3] == 5.0
     assert log[1] == np.geomspace(0.5, 50.0, 7)[1]
     assert values("{ linear = [0, 1], count = 11 }") == tuple(i / 10 for i in range(11))
     assert values("{ linear = [-0.1, 0.2], count = 4 }") == (-0.1, 0.0, 0.1, 0.2)
-    # A logarithmic range over 16 decades has no 0, which is nowhere near its values.
+    # Small values of a logarithmic range over 16 decades are not taken for 0.
     assert values("{ log = [1e-9, 1e7], count = 3 }") == (1e-9, 0.1, 1e7)
 
 
@@ -240,7 +240,7 @@ def test_a_member_is_resolved_once():
 
 def test_fewer_members_of_many_sites_are_tried_before_a_sweep_begins(monkeypatch):
     """The members by which a sweep is checked have a bounded number of sites together, and one is always tried."""
-    # A hundredth of the program's bound: to resolve the cases of so many sites takes seconds.
+    # The bound is a hundredth of the program's, since cases with that many sites take seconds.
     monkeypatch.setattr("vipetsc.case.sweep.MOST_TRIED_SITES", MOST_TRIED_SITES)
     sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nclearance = 1e-3\nsites = "
     assert len(sweep_of(sweep + "2").tried()) == 60

@@ -1,4 +1,4 @@
-"""Systems whose branches are followed: the paper's two masses, chains, systems of one's own; forces and energy."""
+"""Systems whose branches are followed: the paper's two masses, chains, systems of given masses; forces and energy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LINEAR_STOP = four_band_contact("bilinear")
 
 
 def test_reduced_model_of_the_paper():
-    """Host and resonator of the four-band cell, the host on the springs to its neighbours at rest."""
+    """The reduced model is host and resonator of the four-band cell; the host's other neighbours are at rest."""
     system = reduced_model()
     assert system.masses == pytest.approx([0.0025, 0.0025])
     assert system.stiffness == pytest.approx(np.array([[2.2e4, -2e3], [-2e3, 2e3]]))
@@ -81,7 +81,7 @@ def test_unsound_systems_are_refused(change, message):
 
 
 def test_quarter_map_needs_an_odd_system():
-    """A quarter of a period determines the orbit only where the mirrored motion is one, too: half is proposed."""
+    """The quarter map refuses a system whose mirrored motions are none, and proposes the half map."""
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=0.1)])
     with pytest.raises(ValueError, match="half"):
         Shooting(Dop853Flow(system), MAPS["quarter"])
@@ -124,7 +124,7 @@ def test_a_chain_has_the_modes_and_sites_of_its_cells():
 
 @pytest.mark.parametrize(("ends", "springs", "held"), [("fixed", 4, 1.0), ("free", 2, 0.0), ("periodic", 3, 0.0)])
 def test_a_chain_keeps_its_nonlinear_springs(ends, springs, held):
-    """Moved as a whole by 1 m, a lattice stretches the springs to its walls alone, one by 1 m, one by -1 m."""
+    """A lattice that moves as a whole by 1 m strains the springs to its walls alone, one by 1 m, one by -1 m."""
     quadratic = 2.0
     cubic = 3.0
     nonlinear = Spring(1, 0, 5.0, next_cell=True, quadratic=quadratic, cubic=cubic)
@@ -136,6 +136,6 @@ def test_a_chain_keeps_its_nonlinear_springs(ends, springs, held):
     u = np.ones(system.dofs)
     energy = system.energy(u, 0 * u) - 0.5 * u @ system.stiffness @ u
     forces = system.forces(u) - system.stiffness @ u
-    # Energies e^3 quadratic/3 + e^4 cubic/4: the first cancels in the sum over e = 1 and e = -1.
+    # The energy is e^3 quadratic/3 + e^4 cubic/4, whose first term cancels in the sum over e = 1 and e = -1.
     assert energy == pytest.approx(held * 2 * cubic / 4)
     assert forces[[0, -1]] == pytest.approx([held * (cubic + quadratic), held * (cubic - quadratic)])

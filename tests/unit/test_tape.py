@@ -1,4 +1,4 @@
-"""The tape of substeps: which substep a contact begins with, and what a row holds of a closed site."""
+"""The tape of substeps: marks of substeps with which a contact begins, and rows of closed sites."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from vipetsc.dynamics.propagator.substeps import Substep, create_tape, create_tr
 
 
 class TimedOnset(NamedTuple):
-    """A substep at ``position`` of the step that begins at ``begin`` s, an onset in s, and whether they are one."""
+    """A substep at ``position`` of a step that begins at ``begin`` s, an ``onset`` in s, and 1 if both coincide."""
 
     begin: float
     position: float
@@ -26,7 +26,7 @@ def timed_onsets(interval: float) -> list[TimedOnset]:
         TimedOnset(begin=0.0, position=3e-3, onset=(3e-3 - 1e-9) * interval, begins_contact=0),
         TimedOnset(begin=0.0, position=3e-3, onset=(3e-3 + 1e-9) * interval, begins_contact=0),
     ]
-    # At 40 s a rounding of the time is much more than one of the step.
+    # The rounding of a time of 40 s is much larger than that of the interval.
     for begin, position in ((0.0, 3e-3), (0.7, 0.25), (40.0, 0.999)):
         time = begin + position * interval
         two_roundings = 2.0 * max(np.spacing(time), np.spacing(interval))
@@ -36,7 +36,7 @@ def timed_onsets(interval: float) -> list[TimedOnset]:
 
 
 def test_a_tape_marks_the_substep_in_which_a_contact_begins():
-    """An onset equals a substep's beginning where they differ by roundings, since they were summed in other orders."""
+    """A contact begins with a substep if its onset equals the beginning up to rounding of two different sums."""
     cluster = mass_on_stop()
     timed = timed_onsets(cluster.interval)
     tape = create_tape(1, len(timed))

@@ -1,4 +1,4 @@
-"""Which springs count as torn off, by the zeros of their force."""
+"""Springs that count as torn off, by the zeros of their force."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from vipetsc.lattice.cell import Spring, UnitCell
     [(0.4, None), (0.75, 0.5), (-3.0, None), (2.0, None), (np.nan, None), (np.inf, None), (0.0, None)],
 )
 def test_a_spring_is_torn_between_the_zeros_of_its_force(elongation, limit):
-    """z - 3 z^2 + 2 z^3 pushes the masses apart between 1/2 and 1, and pulls them back beyond and on the other side."""
+    """A spring is torn where its force has the wrong sign.
+
+    The force z - 3 z^2 + 2 z^3 = z (1 - z)(1 - 2 z) pushes the masses apart for 1/2 < z < 1, and restores elsewhere.
+    """
     spring = Spring(0, 0, 1.0, next_cell=True, quadratic=-3.0, cubic=2.0)
     chain = Chain(UnitCell(masses=(1.0,), springs=(spring,), host=0, resonator=0), 3)
 

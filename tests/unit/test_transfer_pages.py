@@ -1,4 +1,4 @@
-"""Pages of inter-band transfer from files that are put together here: curves over branches, and lone dispersions."""
+"""Pages of inter-band transfer from synthetic files: curves over branches, dispersions of members, warnings."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def style():
 
 
 def transfer_of(restitution: float) -> np.ndarray:
-    """A transfer that falls as 1/A^2 from the onset on, larger by the restitution."""
-    # The exponent does not depend on the restitution, the height does: curves are distinguished by it.
+    """Return a transfer (amplitude,) that is proportional to the restitution and falls as 1/A^2 from the onset on."""
+    # Curves of different restitutions have one exponent and differ in their height.
     falling = restitution * (ONSET / AMPLITUDES) ** 2
     return np.where(AMPLITUDES < ONSET, 1e-8, falling)
 
@@ -68,7 +68,7 @@ def write_sweep(folder: Path) -> None:
 
 
 def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, monkeypatch):
-    """They differ in neither law, reading, sites nor cycles: each has a page, named by the key and its value."""
+    """Curves that differ in a key alone have a page each, named by the key and its value, with the branch."""
     sweep = tmp_path / "sweep"
     sweep.mkdir()
     write_sweep(sweep)
@@ -76,7 +76,7 @@ def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, m
     branch.mkdir()
     write_branch(branch, largest=1e7)
     initiation = Initiation(amplitude=ONSET, energy=ONSET**2, onset=ONSET)
-    # The onset is found in a run, of which there is none here.
+    # The program takes the onset from a run; it is prescribed here.
     monkeypatch.setattr(backbone, "initiation_of", lambda folder, case: initiation)
     assert relate_folders([sweep, branch]) == [sweep / "backbone.h5"]
 
@@ -93,7 +93,7 @@ def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, m
 
 
 def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
-    """A member with a spectrum of one bin a wavenumber, with a warning that names it."""
+    """Return a member with a spectrum over wavenumber and frequency, and a warning that names it."""
     case = Case.load(
         overrides=[
             "lattice.cells=20",
@@ -107,7 +107,7 @@ def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
         np.outer(np.arange(1.0, 6.0), np.ones(9)),
         {"wavenumber": np.linspace(0, np.pi, 5), "frequency": np.linspace(0, 3000.0, 9)},
     )
-    # The warning of each run carries its name, by which it is found on the page.
+    # The warning of each run contains its name, by which the test finds it on the page.
     about = {"warnings": json.dumps([f"the run {folder}"])}
     analysis = xr.Dataset({"dispersion": spectrum, "ibtet": 0.01 * amplitude})
     varied = f"contacts.restitution {restitution}"
@@ -115,7 +115,7 @@ def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
 
 
 class MembersInMemory(Files):
-    """Members by their folders, as `Files` gives those that it has opened."""
+    """Given members by their folders, in place of members that ``Files`` reads."""
 
     def __init__(self, *members: MemberRun) -> None:
         super().__init__()
@@ -134,7 +134,10 @@ def titles(figure: Figure) -> list[str]:
 
 
 def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkeypatch):
-    """Two amplitudes of one restitution have a page of theirs, the lone ones of two others a page together."""
+    """Two amplitudes of one restitution have a page; single members of two other restitutions have one page together.
+
+    Each page has the warnings of its own members.
+    """
     members = [member_of("a", 10, 0.5), member_of("b", 20, 0.5), member_of("c", 10, 0.7), member_of("d", 30, 0.9)]
     table, page = dispersions(monkeypatch, *members)
     assert table.stem.endswith("contacts.restitution-0.5")
@@ -146,7 +149,7 @@ def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkey
         "restitution 0.7, 10 N",
         "restitution 0.9, 30 N",
     ]
-    # Sentences that differ in numbers alone would be one: these differ in letters.
+    # The warnings differ in letters, since those that differ in numbers alone are merged.
     assert [figure.get_label().splitlines() for figure in figures] == [
         ["Hertz, 10 N: the run a", "Hertz, 20 N: the run b"],
         [f"{member.labels.member}: the run {member.folder}" for member in members[2:]],
@@ -162,7 +165,7 @@ def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
 
 
 def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
-    # Two a page instead of the usual number, so that three members suffice.
+    # A page has two panels here, so that three members suffice.
     monkeypatch.setattr(transfer, "MOST_PANELS", 2)
     members = [member_of(letter, 10, restitution) for letter, restitution in zip("abc", (0.5, 0.7, 0.9), strict=True)]
     stems = [page.stem for page in dispersions(monkeypatch, *members)]
@@ -171,7 +174,7 @@ def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
 
 
 def test_a_page_without_members_has_the_warnings_of_its_sweeps():
-    """What shows all of the sweeps warns of all of them."""
+    """A picture without members, which shows whole sweeps, has the warnings of these sweeps."""
     sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
     spec = registry.FigureSpec("a_figure", sources.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
     with Files() as files:
@@ -180,7 +183,7 @@ def test_a_page_without_members_has_the_warnings_of_its_sweeps():
 
 
 def series_of_three(*warnings: str) -> AmplitudeSeries:
-    """A series of three amplitudes whose runs have these warnings, an empty text for none."""
+    """Return a series of three amplitudes whose runs have these warnings; an empty text stands for none."""
     runs = []
     for amplitude, warning in zip((0.1, 2, 20), warnings, strict=True):
         member = member_of(f"{amplitude:g}", amplitude, 0.5)
@@ -191,7 +194,7 @@ def series_of_three(*warnings: str) -> AmplitudeSeries:
 
 
 def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:
-    """The warnings below a picture of that ``series``."""
+    """Return the warnings below a picture of that ``series``."""
     monkeypatch.setattr(sweep_members, "series_of", lambda sweeps, *needs: iter([series]))
     spec = registry.FigureSpec("a_figure", sources.SWEEP, figure_of_series)
     with Files() as files:
@@ -200,7 +203,7 @@ def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch
 
 
 def test_a_warning_below_a_series_names_its_amplitude(monkeypatch):
-    """A sentence about the lowest amplitude is not true of the others."""
+    """A warning below a picture of several amplitudes names the amplitudes that it is about."""
     series = series_of_three("no contact", "", "coarse samples")
     whole = from_series()(lambda series: Figure())
     assert lines_below(whole, series, monkeypatch) == ["0.1 N: no contact", "20 N: coarse samples"]

@@ -1,4 +1,4 @@
-"""Trial cases of an identification against the same cases read from their tables, bit by bit."""
+"""Trial cases of an identification have the bits of the same cases read from their tables."""
 
 from __future__ import annotations
 
@@ -47,22 +47,22 @@ RECORDS: dict[str, dict[str, Any]] = {
 
 
 def quantities_of(name: str) -> list[str]:
-    """The quantities that can be sought in the case of that ``name`` in ``CASES``."""
+    """Return the quantities that can be sought in the case of that ``name`` in ``CASES``."""
     missing = set()
     # The clearance on the side w < 0 is sought where the case has one.
     if name != "two sides":
         missing.add("clearance_minus")
-    # Nothing is driven.
+    # A case without a drive has no amplitude.
     if CASES[name].get("drive") is AT_REST:
         missing.add("amplitude")
-    # A wall moves linear springs alone.
+    # Springs to a moved wall must be linear and without dashpots.
     if name == "wall":
         missing |= {"dashpot", "quadratic", "cubic"}
     return [quantity for quantity in QUANTITIES if quantity not in missing]
 
 
 def base_of(name: str) -> Case:
-    """The case of that ``name`` in ``CASES``, with a power law."""
+    """Return the case of that ``name`` in ``CASES``, with a power law."""
     table = with_sections(lattice_table(contacts=POWER), CASES[name])
     for section in ("lattice", "contacts", "drive"):
         table[section] = {key: value for key, value in table[section].items() if value is not None}
@@ -70,13 +70,13 @@ def base_of(name: str) -> Case:
 
 
 def sought(base: Case, quantity: str, of: str) -> list[SoughtParameter]:
-    """The parameters of an unknown with generous bounds."""
+    """Return the parameters of an unknown with wide bounds."""
     unknown = UnknownTable(quantity=quantity, of=of, bounds=[-1e30, 1e30], scale="linear")  # type: ignore[arg-type]
     return parameters_of(unknown, base)
 
 
 def assert_same(trials: TrialCases, values: list[float]) -> None:
-    """Both paths give the same case: text, model and coefficients of the motion, to the last bit."""
+    """Assert that a trial case and the case that is read have the same text, model and coefficients, to the bit."""
     cheap = trials.case(values)
     read = trials.read(values)
     assert cheap.to_toml() == read.to_toml()
@@ -87,7 +87,7 @@ def assert_same(trials: TrialCases, values: list[float]) -> None:
 
 
 def trial_values(base: Case, parameters: list[SoughtParameter], factor: float) -> list[float]:
-    """Values ``factor`` times those of the ``base``, all different; small ones where it has zeros."""
+    """Return values that are ``factor`` times those of the ``base``, all different, and small where it has zeros."""
     values = []
     for number, parameter in enumerate(parameters):
         start = np.mean([values_of(base, parameter.quantity)[member] for member in parameter.members])
@@ -97,9 +97,9 @@ def trial_values(base: Case, parameters: list[SoughtParameter], factor: float) -
 
 @pytest.mark.parametrize(("name", "quantity"), [(name, quantity) for name in CASES for quantity in quantities_of(name)])
 def test_trial_cases_are_those_that_are_read(name, quantity):
-    """Every quantity, of all members and of each; of two values in turn, the second is no longer read."""
+    """The second trial of a quantity, which is not read from a table, has the bits of the case that is read."""
     base = base_of(name)
-    # A read cell costs its bands: one value of all members is tried where there is nothing but the cell.
+    # Reading a cell computes its bands, which takes time: one common value is tried for the preset alone.
     for of in ("all", "each") if name == "preset" else ("each",):
         parameters = sought(base, quantity, of)
         trials = TrialCases(base, parameters, {})
@@ -109,7 +109,7 @@ def test_trial_cases_are_those_that_are_read(name, quantity):
 
 @pytest.mark.parametrize("record", RECORDS)
 def test_trial_cases_of_records_are_those_that_are_read(record):
-    """With a record's own drive and initial motion, several quantities at once."""
+    """Trial cases of several quantities, with the drive and initial motion of a record, are those that are read."""
     base = base_of("two sides")
     quantities = ("clearance", "restitution", "mass", "spring", "amplitude")
     parameters = [parameter for quantity in quantities for parameter in sought(base, quantity, "all")]
@@ -119,7 +119,7 @@ def test_trial_cases_of_records_are_those_that_are_read(record):
 
 
 def test_sites_may_come_to_have_one_number():
-    """Equal numbers of all sites stand in another place of the case than different ones."""
+    """Numbers of sites may become equal and differ again, though a case has another key for equal numbers."""
     base = base_of("preset")
     trials = TrialCases(base, sought(base, "restitution", "each"), {})
     for values in ([0.5, 0.6, 0.7], [0.6, 0.6, 0.6], [0.8, 0.8, 0.8], [0.7, 0.6, 0.5]):
@@ -127,7 +127,7 @@ def test_sites_may_come_to_have_one_number():
 
 
 def test_a_part_of_a_spring_may_vanish():
-    """A part that is zero does not stand in a case."""
+    """A nonlinear part of a spring may become zero, though the text of a case omits it then."""
     base = base_of("own cell")
     trials = TrialCases(base, sought(base, "quadratic", "each"), {})
     for values in ([1e5, 2e5], [1e5, 0.0]):
@@ -156,7 +156,7 @@ def test_impossible_trial_cases_are_refused_as_those_that_are_read(name, contact
 
 
 def test_a_lattice_may_come_out_too_fast_for_the_samples_of_the_case():
-    """Samples are those of the measurement: a light mass is no reason to refuse a trial, nor the case that is found."""
+    """A mass too light for the sample interval of the case is accepted, since samples are those of the measurement."""
     base = base_of("preset").varied(time={"sample_interval": 8e-4})
     mass = values_of(base, "mass")[0]
     trials = TrialCases(base, sought(base, "mass", "all"), {})

@@ -1,4 +1,4 @@
-"""What ``validate`` warns of: each sentence where it belongs, with its numbers, and none for the cases of the paper."""
+"""Warnings of ``validate``: their conditions and numbers, and none for the cases of the paper."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_wave_that_comes_back():
     """A wave that returns from an end before the run does is named with its times and a site that it meets."""
     (sentence,) = warnings_of(time={"end": 0.09})
 
-    # At 428.7 cells/s, 23 cells to the end, 11 back to cell 13.
+    # The wave travels at 428.7 cells/s, 23 cells to the end and 11 back to cell 13.
     assert "reaches the right end at 0.05365 s and returns to the site in cell 13 at 0.07931 s" in sentence
     assert "lattice.cells" in sentence
 
@@ -50,13 +50,13 @@ def test_a_wave_that_cannot_come_back():
 
 
 def test_a_wave_that_comes_back_where_it_is_recorded():
-    """Without sites it is the recorded window that the wave comes back to."""
+    """Without sites the warning names the recorded window to which the wave comes back."""
     sentence, *_ = warnings_of(contacts={"sites": []}, output={"window": [2, 20]}, time={"end": 0.09})
     assert "returns to the cell 20 at" in sentence
 
 
 def test_a_wave_that_comes_back_from_either_end():
-    """A short burst in the midst of a lattice comes back from both ends, one of six cycles from one of them."""
+    """A short burst from the middle of a lattice is warned of for both ends, a burst of six cycles for one of them."""
     midst = {"time": {"end": 0.2}, "contacts": {"sites": [18]}}
 
     short = warnings_of(drive={"cell": 20, "cycles": 1}, **midst)
@@ -96,7 +96,7 @@ def test_a_drive_that_samples_do_not_show():
     burst = {"frequency": 1000.0, "cycles": 6}
     fast = {"waveform": "harmonic", "frequency": 4000.0, "cell": 2, "ramp": 0.01}
     (sentence,) = warnings_of(drive=burst | {"more": [fast]}, time={"end": 0.04, "sample_interval": 8.5e-4})
-    # pi/8.5e-4 s.
+    # The highest frequency is pi/8.5e-4 s = 3696 rad/s.
     assert "4000 rad/s, beyond the 3696 rad/s" in sentence
 
 
@@ -132,7 +132,7 @@ def test_contacts_that_are_brief():
 
 
 def test_the_time_of_a_contact_is_that_of_the_masses_it_joins():
-    """A stop to ground turns the whole mass over, and a contact of two masses their reduced mass."""
+    """The warning of a brief contact has the time for the mass at a stop to ground, or the reduced mass of a pair."""
 
     def duration(**join) -> str:
         """Return the duration that the warning names, of a case with brief contacts."""
@@ -171,7 +171,7 @@ def drive_of_samples(folder, unit: float = 1.0, **keys) -> dict:
 
 @pytest.mark.parametrize(("unit", "span"), [(1e-3, 59.9), (1e-6, 5.99e4)])
 def test_times_that_are_not_in_seconds(tmp_path, unit, span):
-    """Samples far below the waves are asked about, with the unit in which they would be among them."""
+    """Samples far below the frequencies of the waves have a warning with the unit of time in which they would fit."""
     name = {1e-3: "ms", 1e-6: "us"}[unit]
     case = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive_of_samples(tmp_path, unit), time={"end": 0.1})
     (sentence,) = [sentence for sentence in case.warnings() if "in s?" in sentence]
@@ -182,7 +182,7 @@ def test_times_that_are_not_in_seconds(tmp_path, unit, span):
 
 
 def test_samples_far_over_the_waves(tmp_path):
-    """Samples that no wave of the lattice follows are asked about, in a further drive too."""
+    """Samples far above the frequencies of the waves have a warning, also in a further drive."""
     drive = {"amplitude": 1.0, "cycles": 5, "more": [drive_of_samples(tmp_path, 1e4, frequency=1020.0)]}
     case = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive, time={"end": 0.05})
     (sentence,) = [sentence for sentence in case.warnings() if "samples:" in sentence]
@@ -191,7 +191,7 @@ def test_samples_far_over_the_waves(tmp_path):
 
 
 def test_samples_among_the_waves_raise_no_question(tmp_path):
-    """A burst in a band and a slow push within the lattice's own time are as they should be."""
+    """Samples of a burst in a band, and of a slow push as long as waves need, have no warning."""
     quiet = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive_of_samples(tmp_path), time={"end": 0.1})
     assert not [sentence for sentence in quiet.warnings() if "samples:" in sentence]
 
@@ -202,7 +202,10 @@ def test_samples_among_the_waves_raise_no_question(tmp_path):
 
 
 def test_a_run_that_ends_within_its_burst_or_ramp():
-    """Of a harmonic drive, which goes on for ever, no end is missed but that of its ramp of ten periods."""
+    """A run that ends within a burst has a warning, and with a harmonic drive one that ends within its ramp.
+
+    A ramp lasts ten periods; a harmonic drive has no end.
+    """
     (burst,) = (sentence for sentence in warnings_of(time={"end": 0.01}) if "before the end" in sentence)
     assert "time.end = 0.01 s is before the end of the burst, at 0.0368" in burst
 
@@ -217,7 +220,10 @@ def test_a_run_that_ends_within_its_burst_or_ramp():
 
 
 def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
-    """Cell 299 of 300 is two cells from the first: the wave is back there after a revolution and two cells."""
+    """A run has a warning if the burst reaches the site on a ring a second time.
+
+    The drive is at cell 1 and the site at cell 299 of 300, two cells away: the second time is after 302 cells.
+    """
     table = {
         "lattice": {"preset": "four-band", "cells": 300, "ends": "periodic"},
         "contacts": {"sites": [299], "clearance": 1e-3},

@@ -31,7 +31,7 @@ def packet(kappa, cells=600, centre=300.0, width=40.0, phase=0.0):
 
 @pytest.mark.parametrize("kc", [6.0, 12.0])
 def test_transform_is_the_convolution_with_the_wavelet_in_space(kc):
-    """Nodes whose band ends below pi have the closed form of a Gaussian packet, rest on either side."""
+    """Transforms at nodes whose band ends below pi are sums over the cells with Morlet's wavelet in closed form."""
     kappa = np.pi / 60 * np.array([1, 2, 7, 13, 20])
     signal = noise(50)
     found = transform(signal, kappa, kc)
@@ -82,9 +82,9 @@ def test_bank_is_transform_binning_and_inverse(cells, kc, odd):
 
 @pytest.mark.parametrize("kc", [6.0, 12.0])
 def test_analytic_bank_sums_to_one_where_the_nodes_reach(kc):
-    """Above 1.6 times the lowest node the filters sum to 1 within 1 %; none of them passes a mean, or turns a sign.
+    """Above 1.6 times the lowest node the filters sum to 1 within 1 %; none passes a mean, and none is negative.
 
-    Nowhere is the sum above 1, so that the energies of the parts add up to no more than the whole.
+    The sum is nowhere above 1, hence the energies of the parts add up to no more than the whole.
     """
     bank = filter_bank(600, kc)
     eta = wavenumbers(bank.length)
@@ -98,7 +98,7 @@ def test_analytic_bank_sums_to_one_where_the_nodes_reach(kc):
 
 @pytest.mark.parametrize("kc", [6.0, 12.0])
 def test_constant_is_the_integral(kc):
-    """The constant of admissibility is the integral of |psi(s)|^2/s."""
+    """The constant of admissibility is the integral of exp(-(s - kc)^2)/s over s > 0."""
 
     def integrand(s):
         return np.exp(-((s - kc) ** 2)) / s
@@ -131,7 +131,7 @@ def test_nodes_lie_in_bins_of_equal_width():
 
 
 def test_padding_keeps_periodic_images_apart():
-    """Twice the length changes nothing on the lattice, for wavelets whose band ends below pi."""
+    """Twice the padding leaves the transform on the lattice the same, for wavelets whose band ends below pi."""
     kappa = np.pi / 60 * np.array([1, 5, 30])
     signal = noise(200)
     length = padded_length(200, 12.0)
@@ -187,7 +187,7 @@ def test_partition_accounts_for_its_energies():
     assert found.error[0] == 0
     assert found.cross_share[0] == 0
     assert np.allclose(found.cross_share[1:], 1 - found.energy.sum(axis=0)[1:] / found.kinetic[1:])
-    # Fields are as large as the record: without being asked for, none is kept.
+    # Fields are as large as the record and are kept on request alone.
     assert partition(velocity, masses).field is None
 
 
@@ -213,7 +213,7 @@ class Record:
 
 
 def test_records_are_read_in_chunks_that_do_not_matter():
-    """The last snapshots have the same bits, read as the second chunk of a long record or alone."""
+    """The last snapshots have the same bits as the second chunk of a long record and as a record alone."""
     velocity = noise((40, 30))
 
     whole = partition(Record(velocity), 2.0, mean_over=1)
@@ -225,7 +225,7 @@ def test_records_are_read_in_chunks_that_do_not_matter():
 
 
 def test_bad_requests_are_named():
-    """Too few voices, a wavelet without admissibility, a length below the signal's and masses that miss are refused."""
+    """Too few voices, an inadmissible wavelet, a length below the signal's and missing masses are refused."""
     with pytest.raises(ValueError, match="voices"):
         Nodes.log(12.0, 4.0)
     with pytest.raises(ValueError, match="admissible"):
