@@ -9,7 +9,7 @@ import numpy as np
 
 # A core, a node, and sixteen nodes.
 RANKS = (1, 64, 1024)
-# Of the network of a common cluster.
+# Latency and bandwidth of the network of a common cluster.
 LATENCY = 2e-6  # s a message
 BANDWIDTH = 10e9  # bytes/s a rank
 # The state of so many cells has some MB, which caches still hold; with fewer, messages cost a larger fraction.
@@ -38,9 +38,9 @@ class ScalingModel:
 
         self._cells = [row["cells"] for row in alone]
         self._seconds = [row["wall_ms"] / 1e3 for row in alone]
-        # From the largest lattice, which exceeds the caches. A ratio below 1 would be noise of the measurement.
+        # The largest lattice exceeds the caches, and its ratio is used. A ratio below 1 would be noise.
         self.shared = max(1.0, 2 / paired[-1]["memory_speedup"])
-        # The largest numbers of all lattices: what a rank sends does not grow with its cells.
+        # The largest numbers of all lattices are used: the messages of a rank do not grow with its cells.
         self.messages = max(row["messages"] for row in paired)
         self.bytes = max(row["message_bytes"] for row in paired)
         self.reductions = max(row["reductions"] for row in paired)
@@ -60,7 +60,7 @@ class ScalingModel:
         """Seconds that a rank among so many ``ranks`` sends, receives and reduces."""
         if ranks == 1:
             return 0.0
-        # With the left neighbour and then with the right one.
+        # A rank exchanges with its left neighbour and then with the right one.
         exchange = 2 * (self.messages * LATENCY + self.bytes / BANDWIDTH)
         return exchange + self.reductions * math.ceil(math.log2(ranks)) * LATENCY
 

@@ -81,7 +81,7 @@ class Flight:
 
 def solve(case: Case) -> Solution:
     """Solve ``case`` by its own engine on one rank."""
-    # Velocities alone, as the peers return: to record displacements too would cost time.
+    # Only velocities are recorded, because the peers return nothing else: displacements would cost time.
     output = case.output.model_copy(update={"fields": ["velocity"]})
     flight = Flight(case.model_copy(update={"output": output}), MPI.COMM_SELF)
     sampled, seconds = flight.velocities()
@@ -104,7 +104,7 @@ def own_solvers() -> dict[str, Solver]:
     return {f"vipetsc {name}": with_engine(name) for name in engines()}
 
 
-# At a microsecond each, 20,000 take a fiftieth of a second, which is long compared with the resolution of the clock.
+# 20,000 evaluations of about a microsecond take a fiftieth of a second, far above the resolution of the clock.
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
     """Microseconds of CPU time that one right-hand side of the case takes through PETSc; mean over ``evaluations``."""
     flight = Flight(_by_engine(case, "ts"), MPI.COMM_SELF)

@@ -104,7 +104,7 @@ def compile_peers(folder: Path) -> dict[str, Path]:
     if which("mpicxx") and (petsc := petsc_flags()):
         commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc]
 
-    # All at the same time, since each takes some seconds.
+    # All compilers run at the same time, because each takes some seconds.
     programs = {name: (folder / name).resolve() for name in commands}
     building = {name: subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()}
     ended = {name: compiler.wait() for name, compiler in building.items()}
@@ -146,7 +146,7 @@ def diffrax(folder: Path) -> Solver:
     """
     given = folder / "parameters.txt"
     output = folder / "diffrax.bin"
-    # On one core, as all solvers.
+    # The process runs on one core, as all solvers do.
     core = min(os.sched_getaffinity(0))
     command = ["taskset", "-c", str(core), str(DIFFRAX), str(SOURCES / "diffrax_dopri8.py"), str(output)]
 
@@ -281,7 +281,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
             f[n + driven] += amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase) * inverse_mass[driven]
         return f
 
-    # Called once, which compiles it: that is no part of a solution's time.
+    # The first call compiles the function, which is no part of a solution's time.
     slope(0.0, np.zeros(2 * n))
     return slope
 

@@ -39,8 +39,8 @@ def error(sampled: np.ndarray, exact: np.ndarray) -> float:
 
 def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, dict[str, Any]]:
     """Velocities by the engine ``ts`` at a tolerance of 1e-13, and the distances from them of other tight solutions."""
-    # By ts, whose error falls with the tolerance down to rounding. The propagator, which takes other steps, is compared
-    # with it like the peers.
+    # The reference is by ts, whose error falls with the tolerance down to rounding errors. The propagator takes other
+    # steps, and is compared with the reference as the peers are.
     exact = solvers["vipetsc ts"](at_tolerance(case, 1e-13)).velocity
     tight = {"vipetsc ts": 3e-14}
     # A solver by others confirms the reference: odeint, or SciPy's where that was not built.

@@ -26,7 +26,7 @@ BASELINE = "b03848f"
 # The slowest program, a first run of the earlier version, compiles for a minute; ten leave room for a slow machine.
 PATIENCE = 600  # seconds that one call may take
 
-# Six amplitudes, of which the lower ones touch nothing and the upper ones have many contacts.
+# Six amplitudes: at the lower ones there are no contacts, at the upper ones many.
 SWEEP = """
 name = "six"
 [sweep]
@@ -59,13 +59,13 @@ PROGRAMS = {
     "run without pictures, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/plain"
     ),
-    # The folder that it draws is that of the row before.
+    # This call draws the results of the row before.
     "plot": Program("plot {folder}/plain", target=2.2 / 4.9),
     "run with pictures, propagator": Program(
         "run --set time.engine=propagator --force --out {folder}/propagator", target=3.0 / 8.4
     ),
     "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
-    # By CPU time, since the wall time depends on how many members run at once, on the cores of the machine.
+    # This target is a CPU time, because the wall time depends on the number of cores, on which members run at once.
     "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
     # The largest steps of the paper at fewer amplitudes and wavenumbers: every third member is scaled, as there.
     "members of the step interband": Program(
@@ -112,7 +112,7 @@ class Version:
         if program.ranks > 1:
             command = ["mpirun", "-n", str(program.ranks), *command]
 
-        # The time of children that have ended: of ranks too, since mpirun waits for them.
+        # This is the time of children that have ended, with that of ranks, because mpirun waits for them.
         before = _cpu_seconds_of_children()
         begin = time.perf_counter()
         ended = subprocess.run(
@@ -143,7 +143,7 @@ def unpack(commit: str, folder: Path) -> Path:
     archive = subprocess.run(["git", "-C", str(ROOT), "archive", commit, "vipetsc"], capture_output=True, check=False)
     if archive.returncode:
         raise RuntimeError(archive.stderr.decode().strip())
-    # Unpacked under another name: a bench that is ended meanwhile leaves no half of a package.
+    # The package is unpacked under another name: a bench that is ended meanwhile leaves no incomplete package.
     aside = folder / f"{commit}.part"
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
@@ -195,7 +195,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
     """Medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
     before = np.array(measured["before"])
     now = np.array(measured["now"])
-    # Ratios of calls that followed each other, in which the speed of the machine cancels; it changes over a bench.
+    # The speed of the machine changes during a bench, but cancels in ratios of calls that follow each other.
     ratios = now / before
     found = {}
     for column, kind in enumerate(("wall", "cpu")):

@@ -44,7 +44,7 @@ class Counting(MPI.Intracomm):
     __module__ = "mpi4py.MPI"  # what petsc4py asks of a communicator
 
     def __new__(cls, comm: MPI.Intracomm) -> Counting:
-        """As ``comm``, with no reduction yet."""
+        """Return a communicator with the group of ``comm`` that has counted no reduction yet."""
         counting = super().__new__(cls, comm)
         counting.reductions = 0
         return counting
@@ -101,7 +101,7 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
     comm = Counting(COMM)
     moving = Flight(case, comm)
     model = moving.model
-    # Timed from a third of the burst on: in a lattice at rest ts takes its longest steps.
+    # The time is measured from a third of the burst on: in a lattice at rest ts takes its longest steps.
     first = round(model.drive.duration / 3 / model.sample_interval)
     moving.advance(0, first)
     COMM.Barrier()
@@ -112,7 +112,7 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
     wall = (time.perf_counter() - begin) / intervals
     cpu = COMM.allreduce(time.process_time() - begin_cpu) / intervals
 
-    # Before the triad, whose arrays may be larger than all else.
+    # The peak is read before the triad, whose arrays may be larger than all else.
     memory = peak()
     traffic = counted(moving, comm, first + intervals, min(intervals, 50))
     gigabytes = bandwidth()
@@ -168,7 +168,7 @@ def build(cells: int, sites: int) -> dict:
     sys.addaudithook(mark)
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_FOLDER")) as own:
         folder = Path(COMM.bcast(own))
-        # A short lattice first, which compiles the kernels: that is not to be measured.
+        # The run of a short lattice compiles the kernels first, which is not measured.
         simulate(_spread(1000, 10), folder / "compiles", COMM)
         marks[:] = [("read", time.perf_counter())]
         simulate(_spread(cells, sites), folder / "run", COMM)
@@ -192,7 +192,7 @@ def build(cells: int, sites: int) -> dict:
 
 def _spread(cells: int, sites: int) -> Case:
     """A case with evenly spread ``sites``, which no wave reaches in its three samples."""
-    # Away from the ends, of which the first is driven.
+    # Sites are away from both ends, because the first end is driven.
     places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
     # "auto" would choose by size: with the same writer rows of all sizes can be compared.
     writer = "parallel" if h5py.get_config().mpi else "gather"

@@ -1,9 +1,9 @@
-"""Makes the pictures of the manual's gallery again: runs the commands of its pages, and keeps small copies of figures.
+"""Draws the pictures of the manual's gallery again: runs the commands of its pages, and keeps small copies of figures.
 
     python scripts/gallery.py [--folder FOLDER] [PAGE ...]
 
-The commands run in ``FOLDER``, by default a temporary one; without a ``PAGE`` those of all pages. The picture
-``RUN.FIGURE`` of a page is a copy of ``runs/RUN/figures/FIGURE`` there. A copy larger than ``MOST`` is refused.
+The commands of each ``PAGE``, or of all pages if none is given, run in ``FOLDER``, by default a temporary one. The
+picture ``RUN.FIGURE`` of a page is a copy of ``runs/RUN/figures/FIGURE`` there. A copy larger than ``MOST`` is refused.
 """
 
 from __future__ import annotations

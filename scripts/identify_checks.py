@@ -1,4 +1,4 @@
-"""Checks of identification: without noise, of its derivatives, and of its errors over the length of a record.
+"""Checks of identification: recovery without noise, derivatives of motions, and errors over the length of a record.
 
     python scripts/identify_checks.py exact
     python scripts/identify_checks.py derivatives [--out PICTURE]
@@ -23,7 +23,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-# For records and tables of the tests, which are no part of the installed package.
+# The tests' modules for records and tables are not installed with the package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.conftest import run_of
@@ -79,7 +79,7 @@ def exact(folder: Path) -> None:
     table = {key: example[key] for key in ("lattice", "drive")}
     table |= {"name": "truth", "contacts": contacts, "time": time, "output": {"points": points}}
 
-    # Alternately too large and too small: a factor that all have in common would be an easier start.
+    # Starts are alternately too large and too small: a common factor would be an easier start.
     factors = np.array([1.3, 0.7, 1.3, 0.7, 1.3])
     unknowns = [
         {"quantity": "clearance", "of": "each", "bounds": [3e-4, 5e-3], "start": (factors * CLEARANCES).tolist()},
@@ -159,9 +159,10 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
 
     rows = []
     times = misfit.records[0].times
-    # Spaced evenly in logarithms, since derivatives grow as powers or exponentials of the number of impacts.
+    # Windows are spaced evenly in the logarithm of the number of impacts, of which derivatives grow as powers or
+    # exponentials.
     for impacts in np.unique(np.geomspace(1, len(onsets) - 1, 16).astype(int)):
-        # Until the next impact begins: the window then has the number of impacts that is printed.
+        # The window ends where the next impact begins, and has the number of impacts that is printed.
         window = times < onsets[impacts]
         largest = float(np.abs(slopes[window]).max())
         # Before the first contact with this clearance nothing depends on it, and there is no relative error.
@@ -197,8 +198,8 @@ def length(folder: Path, seeds: int) -> None:
     truth = np.array([4e-4, 0.7])
     print("length  impacts  standard errors                actual errors")
     for duration in (0.5, 1.0, 2.0, 4.0):
-        # Without the first second, in which the drive rises: it says more of the parameters than a second of the
-        # steady state does.
+        # The first second, in which the drive rises, is left out: it determines the parameters better than a second of
+        # the steady state does.
         end = 1.0 + duration
         timed = table | {"time": {"end": end, "sample_interval": 2e-3, "engine": "propagator", "rtol": 1e-12}}
         found = []
@@ -219,7 +220,7 @@ def length(folder: Path, seeds: int) -> None:
 
 
 def main() -> None:
-    """Do what the first argument says."""
+    """Make the check that the first argument names."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("what", choices=["exact", "derivatives", "length"])
     parser.add_argument("--out", type=Path, default=PICTURE)

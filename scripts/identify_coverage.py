@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-# For records and tables of the tests, which are no part of the installed package.
+# The tests' modules for records and tables are not installed with the package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.identified import identify_table, lattice_table, measured_table
@@ -47,13 +47,13 @@ def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
 
     inside = []
     errors = []
-    # A record with other noise for each seed, of the same lattice.
+    # Each seed gives a record of the same lattice with other noise.
     for seed in range(seeds):
         plan = IdentifyCase.from_table(identify_table(table, measured_table(folder, table, noise=noise, seed=seed)))
         work = Identification(plan, read_records(plan), StopRequest())
         windows, z = work.placed(work.fit(0))
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
-        # In the coordinates of the fit, which are logarithms of positive quantities: there intervals are symmetric.
+        # Intervals are symmetric in the coordinates of the fit, which are logarithms of positive quantities.
         expected = [p.to_coordinate(value) for p, value in zip(plan.parameters, truth, strict=True)]
         inside.append(np.abs(z - expected) < quantile(0.9) * uncertainty.errors)
         errors.append(z - expected)

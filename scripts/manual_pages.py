@@ -7,9 +7,9 @@ read from the sources, not imported, so that neither PETSc nor compiled kernels 
 they stand: indented formulas are code.
 
 Formulas are LaTeX, which MathJax sets in the reader's browser. The pages contain one file of MathJax that needs no
-other, from the package sphinx-mathjax-offline, so that they can be read without a network. Used as an extension that
-package would add all of MathJax, 24 MB. Of the alternatives, pictures of formulas (sphinx.ext.imgmath) need LaTeX where
-pages are built, and neither scale nor follow a dark theme; KaTeX needs sixty files of fonts.
+other, from the package sphinx-mathjax-offline, so that they can be read without a network. As an extension of Sphinx,
+that package would add all of MathJax, 24 MB. There are two alternatives: pictures of formulas (sphinx.ext.imgmath) need
+LaTeX where pages are built, and neither scale nor follow a dark theme; KaTeX needs sixty files of fonts.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ Named = ast.ClassDef | ast.FunctionDef
 def write_sources(folder: Path, packages: list[str]) -> None:
     """Write all pages to ``folder`` as Markdown, with their pictures.
 
-    Of the interface there are pages of the ``packages`` alone, or of all if the list is empty.
+    The interface has pages of ``packages`` only, or of all packages if the list is empty.
     """
     (folder / GALLERY.name).mkdir(parents=True)
 
@@ -78,7 +78,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     tables = "".join(contents(title, names) for title, names in listed.items())
     put(folder / "index.md", index + tables, CHAPTERS)
     start = (ROOT / "README.md").read_text(encoding="utf-8")
-    # In a table of contents the package's name says nothing; the page says what to do first.
+    # In a table of contents the title tells the page's purpose, which the package's name would not.
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
     for name in WRITTEN:
         put(folder / f"{name}.md", chapter(name), CHAPTERS)
@@ -186,7 +186,7 @@ def interface(package: Path) -> str:
         if path != first:
             module = dotted(path)
             lines += [f"## {module}", ""]
-        # An empty directive of the module: names that follow belong to it, and links can lead to it.
+        # After an empty directive of the module, names that follow belong to it, and links can lead to it.
         lines += [f":::{{py:module}} {module}", ":::", ""]
         lines += [prose(tree), ""]
         for node in public(tree):
@@ -255,7 +255,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     folder = options.folder.resolve()
     source = folder / "source"
-    # From nothing, since the page of a chapter that was removed would stay in the index.
+    # The sources are written anew, because the page of a removed chapter would stay in the index.
     shutil.rmtree(source, ignore_errors=True)
     write_sources(source, options.python)
     add_static(folder)

@@ -1,4 +1,4 @@
-"""Makes the pictures of the chapters theory and read-pictures and of the notebooks again, as small files.
+"""Draws the pictures of the chapters *theory* and *read-pictures* and of the notebooks again, as small files.
 
     python scripts/manual_pictures.py [--folder FOLDER]
 
@@ -91,10 +91,11 @@ def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray,
     rate = SPEED
     indentation = [0.0]
     force = [0.0]
-    # Up to four times as long as an elastic impact, which takes STEPS/2 steps: one with loss takes longer.
+    # The loop ends after four times the duration of an elastic impact, STEPS/2 steps: an impact with loss takes longer.
     for _ in range(2 * STEPS):
         pressed = float(contact.elastic_force(x) * contact.dissipation_factor(rate, SPEED))
-        # Velocity before displacement: this order keeps the energy of an elastic impact bounded.
+        # The velocity is updated before the displacement (semi-implicit Euler): the energy of an elastic impact remains
+        # bounded.
         rate -= dt * pressed / mass
         x += dt * rate
         if x < 0:
@@ -129,7 +130,7 @@ def contact_law(case: Case) -> Figure:
     left.legend(loc="upper left")
     left.set_title(f"(a) One impact at {SPEED:g} m/s")
 
-    # From 0.06, since the factor flores is defined above a restitution of 0.05.
+    # The curves begin at 0.06, because the factor flores is defined above a restitution of 0.05.
     asked = np.linspace(0.06, 1, 95)
     for factor, colour in (("paper", style.BLUE), ("flores", style.ORANGE), ("exact", style.BLACK)):
         effective = [Contact("hertz", 1.0, r, factor=factor).effective_restitution for r in asked]
@@ -159,7 +160,7 @@ def named_cell(run: xr.Dataset) -> Figure:
         x = box.get_x() + box.get_width() / 2
         y = box.get_y() + 0.8 * box.get_height()
         if box is frame:
-            # At its edge, since the other two are drawn in its middle.
+            # The line ends at the edge of the host, because the other two boxes are drawn in its middle.
             x = box.get_x() + 0.1
             y = top
         arrow = {"arrowstyle": "-", "color": style.GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
@@ -185,7 +186,7 @@ def draw_notebook(notebook: Path, folder: Path) -> None:
                 continue
 
             with contextlib.redirect_stdout(nowhere):
-                # In one namespace for all cells, which use names of earlier ones.
+                # All cells share one namespace, because they use names of earlier cells.
                 exec(compile("".join(cell["source"]), f"{notebook.name}, cell {number}", "exec"), names)
             if plt.get_fignums():
                 plt.savefig("cell.png", dpi=style.SCREEN)

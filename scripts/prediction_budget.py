@@ -105,7 +105,7 @@ class Budget:
         """Simulate the lattice under ``amplitude``; the waves that arrive at the sites, and the times of contact."""
         run = self._run(amplitude)
         burst = self.burst
-        # Above the last band no wave travels and compliances are small: the quotient would be noise.
+        # Above the last band no wave travels, and compliances are so small that forces from them would be noise.
         carried = burst.omega < TOP * burst.bands[-1].high
         w = np.array([burst.spectrum(column) for column in self._motion(run).displacement.T])
         free = amplitude * np.array([burst.spectrum(column) for column in self.linear.displacement.T])
@@ -156,7 +156,7 @@ class Budget:
         above = modes.frequency > self.burst.bands[int(self.data.attrs["drive_band"])].low * (1 - 1e-9)
         rows = []
         for change in SCATTER:
-            # The first and the last sample alone, since energies at the end are compared.
+            # The run records only its first and last sample, because energies at the end are compared.
             output = {"stride": self.case.model().samples - 1}
             case = self.case.varied(without=("output",), drive={"amplitude": amplitude * (1 + change)}, output=output)
             run, result = run_in_memory(case, MPI.COMM_SELF, StopRequest())

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
-# One less than a palette holds. With 64 colours a picture has a third fewer bytes, and colours are off by up to 35 of
-# 255, not 20.
+# A palette holds one colour more. With 64 colours a picture would have a third fewer bytes, but colours would be off by
+# up to 35 of 255 instead of 20.
 COLOURS = 255
 
 

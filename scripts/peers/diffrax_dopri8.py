@@ -107,14 +107,14 @@ class Lattice:
 
 
 def main(output: str) -> None:
-    """Answer each line of the standard input."""
+    """Solve the case of each line of stdin; the velocities go to the file ``output``, a line of JSON to stdout."""
     compiled: dict[str, tuple[Lattice, Callable[[float, float], diffrax.Solution]]] = {}
     for line in sys.stdin:
         path, rtol, atol = line.split()
         text = "\n".join(words_in(path))
         if text not in compiled:
             lattice = Lattice(path)
-            # Kept by the content of the file, since the files of all cases have the same name.
+            # The key is the content of the file, because the files of all cases have the same name.
             compiled[text] = lattice, lattice.solver()
             # A first solution at loose tolerances compiles. Tolerances are arguments, so that others need no further
             # compilation.

@@ -1,4 +1,4 @@
-"""Faults in number, with a report: ``scripts/campaign faults | kills | cases``."""
+"""Campaigns of many faults, with a report: ``scripts/campaign faults | kills | cases``."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
-# A row of the report: a task, and how it went.
+# A row of the report: a task and its outcome.
 Row = dict[str, Any]
-# Scenarios of verbs that leave results of their own: after a kill the same command goes on with them.
+# Scenarios of verbs with results: after a kill the same command resumes them.
 KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:
-    """Meet every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
+    """Cause every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
     rows: list[Row] = []
     reached: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
@@ -43,7 +43,7 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
                 for task, stages in crew.do(tasks[:: options.every]):
                     rows.append(judged(task | {"ranks": ranks}, stages, options))
 
-    # Some scenarios need not come to all phases.
+    # A part of the scenarios need not reach all phases.
     missed = [] if options.only else sorted(phases() - reached)
     print(fault_table(rows, options.kinds, options.ranks))
     if missed:
@@ -54,14 +54,14 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def kills(options: argparse.Namespace) -> dict[str, Any]:
-    """Send signals at random times to whole calls and to single ranks; call the same command, and compare its bits."""
+    """Send signals at random times to whole calls and to single ranks; repeat the command, and compare its results."""
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="kills-") as work, ExitStack() as leaving:
         crews = {}
         for ranks in options.ranks:
             crews[ranks] = leaving.enter_context(Crew(Path(work) / str(ranks), ranks, options.patience))
 
-        # Kernels may be compiled in the first call: the time of the second is that of a call.
+        # The first call may compile kernels: the time of the second one is the time of a call.
         for _ in range(2):
             unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
         seconds = {(name, ranks): unbroken[ranks][name]["seconds"] for ranks in crews for name in options.only}
@@ -81,7 +81,7 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Row:
-    """Return a row of the report; print what is wrong at once, as a campaign takes hours."""
+    """Return a row of the report. A campaign takes hours: the defects of a trial are printed at once."""
     wrong = judge(task, stages, options.allowed)
     ended = stages.get("ended", {})
     if wrong:
@@ -90,7 +90,7 @@ def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Ro
 
 
 def cases(options: argparse.Namespace) -> dict[str, Any]:
-    """Read random changes of case files as every verb does: to a sentence, never to a traceback or a long wait."""
+    """Read randomly changed case files as every verb does: each must soon be valid or refused, without a traceback."""
     from tests.faults import mutations
 
     rows: list[Row] = []
@@ -100,7 +100,7 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
             verdict = mutations.judge(mutation, Path(work) / "case.toml", options.seconds)
             defect = verdict.defect
 
-            # A run takes much longer than its reading: every N-th one that is valid is simulated.
+            # To simulate a case takes much longer than to read it: only every N-th valid one is simulated.
             runs = [case for case in verdict.cases if isinstance(case, Case)]
             if runs and endings["valid"] % options.every == 0:
                 defect = mutations.run_shortly(runs[0], options.seconds)
@@ -134,7 +134,7 @@ def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Seq
 
 
 def main() -> int:
-    """Do one campaign; 1 if anything was not as it should be."""
+    """Run one campaign; returns 1 if any outcome is not as it should be, otherwise 0."""
     parser = argparse.ArgumentParser(prog="scripts/campaign", description=__doc__)
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--patience", type=float, default=40.0, metavar="S", help="time in which a call has to end")

@@ -1,7 +1,7 @@
-"""A fault at one phase: ``python -m tests.faults.inject PHASE NUMBER RANK KIND -- ARGUMENTS`` of the command line.
+"""Call the program with a fault at one phase: ``python -m tests.faults.inject PHASE NUMBER RANK KIND -- ARGUMENTS``.
 
-At the NUMBER-th time (from 1) that world rank RANK comes to PHASE it meets a fault of KIND: ``exception``, ``memory``
-(MemoryError), ``full-disk`` (OSError), ``sigterm`` or ``sigkill``.
+ARGUMENTS are the program's own. The fault comes at the NUMBER-th time (from 1) that world rank RANK reaches PHASE. KIND
+is ``exception``, ``memory`` (MemoryError), ``full-disk`` (OSError), ``sigterm`` or ``sigkill``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class InjectedError(Exception):
 
 
 class Injector:
-    """Counts the phases that this rank comes to, and strikes once at the one that it is armed for."""
+    """Counts the phases that this rank reaches, and causes a fault once, at the phase that it is armed for."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -34,16 +34,16 @@ class Injector:
         sys.addaudithook(self._hook)
 
     def arm(self, phase: str, number: int, kind: str, mark: Path | None = None) -> None:
-        """Strike with ``kind`` when ``phase`` comes for the ``number``-th time from now on.
+        """Cause a fault of ``kind`` when ``phase`` is reached for the ``number``-th time from now on.
 
-        The time in s at which it strikes is written to ``mark``.
+        The time of the fault, in s since the epoch, is written to ``mark``.
         """
         self.counts.clear()
         self.armed = (phase, number, kind)
         self.mark = mark
 
     def disarm(self) -> Counter[str]:
-        """Strike no more; returns how often every phase has come since the last call of this or of ``arm``."""
+        """Cause no fault; returns how often each phase has been reached since the last call of this or of ``arm``."""
         counts = self.counts
         self.counts = Counter()
         self.armed = None
@@ -58,7 +58,7 @@ class Injector:
         self.counts[phase] += 1
         if self.armed and self.armed[:2] == (phase, self.counts[phase]):
             kind = self.armed[2]
-            # Disarmed before it strikes: the clean-up after the fault comes to phases too.
+            # The injector is disarmed first, because the clean-up after the fault reaches phases too.
             self.armed = None
             if self.mark:
                 self.mark.write_text(str(time.time()))
@@ -79,7 +79,7 @@ def strike(kind: str, where: str) -> None:
 
 
 def main() -> int:
-    """Arm the rank that is meant, then call the program; returns its exit code."""
+    """Arm the injector on the chosen rank, then call the program; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.inject", description=__doc__)
     parser.add_argument("phase")
     parser.add_argument("number", type=int)
@@ -88,7 +88,7 @@ def main() -> int:
     parser.add_argument("arguments", nargs="*", help="after --: what vipetsc is called with")
     options = parser.parse_args()
 
-    # mpirun names the rank; the program that it starts has not begun MPI.
+    # MPI is not initialised yet: the rank comes from mpirun's environment variable.
     injector = Injector()
     if int(os.environ.get("OMPI_COMM_WORLD_RANK", "0")) == options.rank:
         injector.arm(options.phase, options.number, options.kind)

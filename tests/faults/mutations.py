@@ -1,6 +1,7 @@
-"""Case files spoilt at random from a seed, read in process as ``validate`` reads them.
+"""Case files that are damaged at random, from a seed, and read in this process as ``validate`` reads them.
 
-``mutations(seed)`` never ends; ``judge`` reads one file and says how that went. The campaign and a short test use both.
+``mutations(seed)`` yields files without end; ``judge`` reads one file and returns a verdict. The campaign and a short
+test use both.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ HOSTILE: list[Any] = [
     {"first": 1, "last": 10**9, "count": 5}, {"first": 5, "count": 3, "spacing": 10**9}, [{"start": 1, "end": 9}],
     {"log": [1.0, 100.0], "count": 3}, {"linear": [0, 1], "count": 10**9}, {"log": [0, 0], "count": 2},
 ]  # fmt: skip
-# Options of PETSc that are put into cases, with values of which some are valid.
+# Options of PETSc to put into cases, with some valid and some invalid values.
 PETSC: dict[str, tuple[Any, ...]] = {
     "ts_rk_type": ("5dp", "8vr", "3bs", "1fe", "magic"), "ts_adapt_type": ("basic", "none", "dsp", "glee"),
     "ts_adapt_clip": ("0.1,2", "2", "0,0"), "ts_dt": ("1e-6", "0", "-1"), "ts_max_steps": ("0", "5"), "ts_rtol": ("1",),
     "ts_type": ("rk", "euler"), "ts_max_time": ("1e-3",), "ts_adapt_wnormtype": ("2", "infinity"), "ksp_type": ("cg",),
     "ts_adapt_safety": ("0.9", "7"), "ts_adapt_dt_max": ("1e-5",), "log_view": ("",), "snes_rtol": (1e-3,),
 }  # fmt: skip
-# A lattice of the reader's own, which no example has.
+# A case with a cell of its own, which no example has.
 OWN: dict[str, Any] = {
     "lattice": {
         "cells": 20,
@@ -62,13 +63,13 @@ OWN: dict[str, Any] = {
     "drive": {"frequency": 300.0},
     "time": {"end": 0.2},
 }
-# Keys and list positions that lead to a value.
+# The keys and list positions that lead to a value.
 KeyPath = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class Mutation:
-    """A spoilt case file: its ``text``, the case it was written from, what was done to it."""
+    """A damaged case file: its ``text``, the name ``parent`` of the original case, and the ``changes`` in words."""
 
     parent: str
     changes: tuple[str, ...]
@@ -77,7 +78,7 @@ class Mutation:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How the reading of a file ended: the ``cases`` if it is valid, the refusal, or the defect; seconds of CPU."""
+    """The outcome of reading a file: ``cases`` if it is valid, the ``refusal`` or the ``defect``; CPU ``seconds``."""
 
     cases: tuple[CaseFile, ...] = ()
     refusal: str = ""
@@ -86,16 +87,16 @@ class Verdict:
 
 
 def parents() -> dict[str, dict[str, Any]]:
-    """Return the tables that are spoilt, by name."""
+    """Return the tables of the original cases, by name."""
     files = {}
     for path in sorted(EXAMPLES.glob("*.toml")):
-        # A spoilt file lies elsewhere: without its modules it would be refused whatever else is in it.
+        # A damaged file is in another folder: with relative paths of its modules it would always be refused.
         files[path.stem] = with_located(tomllib.loads(path.read_text(encoding="utf-8")), EXAMPLES)
     return {"builtin": copy.deepcopy(Case.builtin_table), "own": OWN} | files
 
 
 def known_keys() -> dict[KeyPath, list[Any]]:
-    """Return every key of every section with values of its kind: the choices of a literal, or none."""
+    """Return the path of every key of every section, with its values if these are a list of choices."""
     found: dict[KeyPath, list[Any]] = {}
     for section, table in SECTIONS.items():
         _collect(table, (section,), found)
@@ -103,9 +104,10 @@ def known_keys() -> dict[KeyPath, list[Any]]:
 
 
 def _collect(annotation: Any, path: KeyPath, found: dict[KeyPath, list[Any]]) -> None:
+    """Add the keys of an ``annotation`` at ``path``, and of tables within it, to ``found``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
-            # A key of the file may be a word that Python reserves, as lambda.
+            # A key may be a word that Python reserves, such as lambda, and have an alias.
             _collect(field.annotation, (*path, field.alias or name), found)
         return
 
@@ -118,15 +120,15 @@ def _collect(annotation: Any, path: KeyPath, found: dict[KeyPath, list[Any]]) ->
 
 
 def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> Iterator[Mutation]:
-    """Yield spoilt case files for ever, the same ones from the same seed, from all parents but those ``without``.
+    """Yield damaged case files without end, from all parents except those in ``without``.
 
-    ``mild``: few changes, of the kinds that often leave a valid case.
+    The same ``seed`` yields the same files. ``mild`` asks for few changes, of kinds that often leave a valid case.
     """
     rng = random.Random(seed)
     keys = known_keys()
     sources = {name: table for name, table in parents().items() if name not in without}
     names = sorted(sources)
-    # Changes that are listed twice are made twice as often.
+    # A kind of change that is listed twice is chosen twice as often.
     counts = (1, 1, 2) if mild else (1, 1, 1, 2, 2, 3, 5)
     kinds = (_scale, _put) if mild else (_replace, _replace, _scale, _remove, _misspell, _lists, _put, _put)
 
@@ -163,17 +165,20 @@ def _places(node: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
 
 
 def _at(table: Any, path: KeyPath) -> Any:
+    """Return the value at ``path`` of a table."""
     for key in path:
         table = table[key]
     return table
 
 
 def _choose(rng: random.Random, table: Any, wanted: Callable[[Any], bool] = lambda value: True) -> KeyPath | None:
+    """Return the path of a random value for which ``wanted`` is true, None if there is none."""
     places = [path for path in _places(table) if wanted(_at(table, path))]
     return rng.choice(places) if places else None
 
 
 def _replace(rng: random.Random, table: Any, keys: Any) -> str:
+    """Replace a value by a hostile one; returns the change in words, as do the functions below."""
     path = _choose(rng, table)
     if path is None:
         return "nothing to replace"
@@ -183,19 +188,21 @@ def _replace(rng: random.Random, table: Any, keys: Any) -> str:
 
 
 def _scale(rng: random.Random, table: Any, keys: Any) -> str:
-    # A bool is an int to isinstance.
+    """Multiply a number by a factor."""
+    # ``isinstance`` would take a bool for an int.
     path = _choose(rng, table, lambda value: type(value) in (int, float))
     if path is None:
         return "nothing to scale"
     factor = rng.choice((-1, 0.5, 2, 10, 100, 1e3, 1e6, 1e12, 0.1, 1e-3, 1e-6, 1e-12, 1e40, 1e-40))
     old = _at(table, path)
-    # An integer beyond the largest float cannot be multiplied by one.
+    # An integer beyond the largest float cannot be multiplied by a float.
     new = type(old)(old * factor) if abs(old) < 1e300 else old
     _at(table, path[:-1])[path[-1]] = new
     return f"{path} = {new!r:.60}"
 
 
 def _remove(rng: random.Random, table: Any, keys: Any) -> str:
+    """Remove a key or an element of a list."""
     path = _choose(rng, table)
     if path is None:
         return "nothing to remove"
@@ -204,6 +211,7 @@ def _remove(rng: random.Random, table: Any, keys: Any) -> str:
 
 
 def _misspell(rng: random.Random, table: Any, keys: Any) -> str:
+    """Change the name of a key."""
     path = _choose(rng, table)
     if path is None or not isinstance(path[-1], str):
         return "nothing to misspell"
@@ -218,6 +226,7 @@ def _misspell(rng: random.Random, table: Any, keys: Any) -> str:
 
 
 def _lists(rng: random.Random, table: Any, keys: Any) -> str:
+    """Lengthen, shorten, empty or nest a list."""
     path = _choose(rng, table, lambda value: isinstance(value, list))
     if path is None:
         return "no list"
@@ -238,7 +247,7 @@ def _lists(rng: random.Random, table: Any, keys: Any) -> str:
 
 
 def _put(rng: random.Random, table: Any, keys: dict[KeyPath, list[Any]]) -> str:
-    """Put a key of any section, with one of its choices, a plausible number or nonsense; sometimes into a sweep."""
+    """Add a key of any section, or of a sweep, with one of its choices, a plausible number or a hostile value."""
     path = rng.choice(sorted(keys))
     numbers = (1, 2, 3, 5, 40, 0.3, 0.9, 1e-3, 1e4, [1], [1, 2], [2, 1], [1.0, 2.0], True)
     plausible = rng.random() < 0.6
@@ -248,7 +257,7 @@ def _put(rng: random.Random, table: Any, keys: dict[KeyPath, list[Any]]) -> str:
         if not isinstance(value, list):
             value = [value, value]
 
-    # Where another change has left no section, the key is left out.
+    # If another change has removed the section, the key is not added.
     section = table
     for key in path[:-1]:
         section = section.setdefault(key, {}) if isinstance(section, dict) else section
@@ -258,6 +267,7 @@ def _put(rng: random.Random, table: Any, keys: dict[KeyPath, list[Any]]) -> str:
 
 
 def _spoil_text(rng: random.Random, text: bytes) -> tuple[bytes, str]:
+    """Return the text of a file with a damage that TOML may refuse, and the damage in words."""
     lines = text.splitlines(keepends=True) or [b"\n"]
     i = rng.randrange(len(lines))
     what = rng.choice(("BOM", "twice", "cut", "bytes", "brackets", "digits", "crlf"))
@@ -280,9 +290,9 @@ def _spoil_text(rng: random.Random, text: bytes) -> tuple[bytes, str]:
 
 @contextmanager
 def limit(seconds: int) -> Iterator[None]:
-    """Raise TimeoutError in the block after ``seconds`` of this process's time, or ten times as many by the clock."""
+    """Raise TimeoutError in the block after ``seconds`` of this process's CPU time, or 10 times as much wall time."""
 
-    # A process that waits uses no time of its own: the clock ends it.
+    # A process that only waits uses no CPU time: the clock ends it.
     def expire(number: int, frame: Any) -> None:
         raise TimeoutError(f"longer than {seconds} s")
 
@@ -309,7 +319,7 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
             for case in cases:
                 verb_of(case).table(case, 1)
                 case.warnings()
-                # Texts are compared, since a NaN differs from itself.
+                # Texts are compared, because a NaN differs from itself.
                 assert type(case).from_toml(case.to_toml()).to_toml() == case.to_toml()
     except CaseError as error:
         return Verdict(refusal=str(error), seconds=time.process_time() - begin)
@@ -319,7 +329,7 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
 
 
 class Deadline(StopRequest):
-    """A request to stop that comes after ``seconds``: an exception from a signal would leave PETSc in a step."""
+    """A request to stop after ``seconds``: an exception from a signal would leave PETSc in the middle of a step."""
 
     def __init__(self, seconds: float) -> None:
         self.end = time.monotonic() + seconds
@@ -331,9 +341,10 @@ class Deadline(StopRequest):
 
 
 def run_shortly(case: Case, seconds: float = 20, samples: int = 100) -> str:
-    """Simulate the first ``samples`` samples of ``case`` in memory; return the defect, "" if it ends with a sentence.
+    """Simulate the first ``samples`` samples of ``case`` in memory; return the defect, or "" if there is none.
 
-    Cases of more than 2000 cells are left out, and those that take longer than ``seconds`` are stopped.
+    A run without a defect ends with a sentence or is refused. Cases of more than 2000 cells are left out, and runs that
+    take longer than ``seconds`` are stopped.
     """
     if case.lattice.cells > 2000:
         return ""

@@ -19,7 +19,7 @@ def phases() -> set[str]:
     for path in Path(vipetsc.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "sys.audit":
-                # A name that is put together at run time could not be found here, and would meet no fault.
+                # A name that is composed at run time cannot be found here, and no fault would be tested there.
                 if not (node.args and isinstance(node.args[0], ast.Constant)):
                     raise ValueError(f"{path}:{node.lineno}: the name of a phase has to be a plain string")
                 found.add(str(node.args[0].value).removeprefix(PREFIX))

@@ -1,4 +1,4 @@
-"""Tiny cases of every verb: what is called, with what before it, and how two outcomes are compared."""
+"""Tiny cases of every verb: the calls of the program, and the comparison of two outcomes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ engine = "propagator"
 samples = 101
 rtol = 1e-8
 """
-# Debian's h5py loads the one of its two builds that has MPI under mpirun alone.
+# Debian's h5py has two builds, and loads the one with MPI only under mpirun.
 has_parallel_hdf5 = h5py.get_config().mpi or find_spec("h5py._debian_h5py_mpi")
 WRITER = "parallel" if has_parallel_hdf5 else "gather"
 TS = RUN.replace("propagator", "ts") + f'[output]\nfigures = false\nwriter = "{WRITER}"\n'
@@ -74,7 +74,7 @@ springs = [
 ]
 smooth = [{ start = 0, end = 1, cubic = 0.5 }]
 """
-# Both methods that follow motions of a lattice: by harmonics of its sites, and by shooting on all ranks together.
+# Branches of a lattice by both methods: harmonic balance of its sites, and shooting by all ranks together.
 CONDENSED = """
 [lattice]
 preset = "four-band"
@@ -129,7 +129,7 @@ tolerance = 0.5
 finest = 0.5
 samples = 1
 """
-# Two curves, so that two ranks have one each.
+# There are two curves, one for each of two ranks.
 NFRC = """
 [lattice]
 preset = "four-band"
@@ -144,7 +144,7 @@ points = 5
 """
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
-# One clearance in a record of a few contacts, in two starts, so that two ranks have one each.
+# One clearance is identified from a record with contacts, in two starts: one for each of two ranks.
 IDENTIFY = f"""
 [lattice]
 preset = "four-band"
@@ -171,12 +171,12 @@ mass = 1
 quantity = "clearance"
 bounds = [3e-4, 5e-3]
 """
-# A picture for each kind of folder is enough, and costs the least.
+# One picture for each kind of results is enough: these are the cheapest ones.
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
-# So few that a run of 101 samples has several chunks.
+# A run of 101 samples then has several chunks.
 SAMPLES_A_CHUNK = 20
 
-# The paper's steps that are left in it, and what makes them tiny.
+# The steps that remain in the tiny paper, and the changes that shorten them.
 PAPER = {
     "design": ("design.lambda.count=2", "design.eta.count=3"),
     "nnm-hertz-calibrated": ("nnm.energy=[0.0, 1.0]", "nnm.locate_grazing=false"),
@@ -189,10 +189,10 @@ PAPER = {
 
 @dataclass(frozen=True)
 class Scenario:
-    """A call of the program: ``words`` with {case} and {out} in them.
+    """A call of the program: ``words`` with the places {case} and {out} for paths.
 
-    ``before``: the words of a call that comes first, undisturbed, and ``stop`` the number of the step at which it is
-    asked to stop. The short test meets faults in it on so many ``ranks`` (0: the campaign alone does).
+    ``before`` are the words of an earlier call without a fault; at its step ``stop``, if not 0, it is asked to stop.
+    ``ranks`` is the number of ranks on which the short test causes faults; with 0 only the campaign does.
     """
 
     name: str
@@ -249,15 +249,15 @@ SCENARIOS = {
 
 
 def shrink_pictures() -> None:
-    """Make the program's own pieces as small as the cases: pictures and chunks."""
-    # Workers alone call this: what is replaced stays so in the process.
+    """Reduce the program's pictures and the size of its chunks, as the cases are tiny."""
+    # Only workers call this function: its replacements remain in the process.
     from vipetsc.cli.verbs import run_verb
     from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
     for name in registry.FIGURES.keys() - {*DRAWN}:
         del registry.FIGURES[name]
-    # Frozen: the verb holds it already.
+    # The record is frozen, and the verb holds it already: it is changed in place.
     object.__setattr__(run_verb.PICTURES, "unmeasured", tuple({*run_verb.PICTURES.unmeasured} & {*DRAWN}))
     measures_of = measure_pages.measures_of
     measure_pages.measures_of = lambda ensemble: measures_of(ensemble)[:1]
@@ -266,7 +266,7 @@ def shrink_pictures() -> None:
 
 @cache
 def shrink_paper() -> None:
-    """Make the paper small."""
+    """Replace the paper's plan by the steps of ``PAPER``, shortened, and one figure."""
     import vipetsc.paper.plan as plan
     from tests.cli.tiny_paper import tiny_plan
 
@@ -281,7 +281,7 @@ def shrink_paper() -> None:
 
 
 def words_of(text: str, case: Path, out: Path) -> list[str]:
-    """Return the words of a call of ``Scenario``, with the paths in them."""
+    """Return the words of a scenario's call ``text``, with paths for {case} and {out}."""
     return [word.format(case=case, out=out) for word in text.split()]
 
 
@@ -293,10 +293,10 @@ def prepare(scenario: Scenario, work: Path) -> Path:
 
 
 def unreadable(folder: Path) -> list[str]:
-    """Return the files of results in ``folder`` that are not whole, each with the error."""
+    """Return the files of results in ``folder`` that cannot be read, each with its error."""
     broken = []
     for path in sorted(folder.rglob("*")):
-        # Hidden files and parts will become results.
+        # Hidden files are parts of results that are not finished.
         if any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
         try:
@@ -310,10 +310,10 @@ def unreadable(folder: Path) -> list[str]:
 
 
 def difference(wanted: Path, found: Path) -> str:
-    """Return what differs between two outcomes of the same case, in words; empty if nothing does.
+    """Return the difference between two outcomes of the same case, in words; "" if they agree.
 
-    Compared are the files that are there, every bit of the datasets, tables and claims, and the numbers of the
-    summaries but for times.
+    The function compares the names of files, every bit of datasets, tables and claims, and the numbers of summaries
+    except durations.
     """
     names_wanted = {str(path.relative_to(wanted)) for path in wanted.rglob("*")}
     names_found = {str(path.relative_to(found)) for path in found.rglob("*")}
@@ -329,7 +329,7 @@ def difference(wanted: Path, found: Path) -> str:
 
 
 def _content(path: Path) -> dict:
-    """Return what has to be the same in a file; of pictures nothing has to."""
+    """Return the content of a file that must be the same; pictures have none."""
     found: dict = {}
     if path.name == "modes.h5":
         found = _digits(path)
@@ -342,7 +342,7 @@ def _content(path: Path) -> dict:
         rows = map(json.loads, path.read_text().splitlines())
         for row in rows:
             if "key" in row:
-                # As text, in which NaN equals NaN.
+                # Records are compared as text, in which NaN equals NaN.
                 found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None})
             else:
                 found[row.get("id") or row["linear"]] = (row.get("status"), row.get("measures"))
@@ -353,7 +353,7 @@ def _content(path: Path) -> dict:
 
 
 def _digits(path: Path) -> dict:
-    """Return six digits of linear modes, whose solver on three ranks adds in the order in which messages come."""
+    """Return linear modes to six digits: their solver on three ranks adds in the order in which messages arrive."""
     found = {}
     with h5py.File(path) as file:
         # Residuals are rounding errors.
@@ -361,7 +361,7 @@ def _digits(path: Path) -> dict:
             values = file[name][...]
             if values.dtype.kind == "f":
                 largest = np.abs(values).max() or 1.0
-                # No -0, whose bytes are not those of 0.
+                # The sum makes -0 a 0, whose bytes differ.
                 found[name] = (np.round(values / largest, 6) + 0.0).tobytes()
             else:
                 found[name] = values.tolist()
@@ -369,17 +369,18 @@ def _digits(path: Path) -> dict:
 
 
 def _bits(item: h5py.Dataset | h5py.Group) -> object:
+    """Return the shape and the bytes of a dataset, None for a group."""
     if not isinstance(item, h5py.Dataset):
         return None
 
     values = item[...]
-    # The bytes of texts are addresses.
+    # The bytes of an array of texts are addresses.
     content = values.tolist() if values.dtype == object else values.tobytes()
     return values.shape, content
 
 
 def copy(source: Path, target: Path) -> None:
-    """Make ``target`` as ``source`` is, which may be missing."""
+    """Make ``target`` a copy of the folder ``source``, or remove it if there is no ``source``."""
     shutil.rmtree(target, ignore_errors=True)
     if source.exists():
         shutil.copytree(source, target)

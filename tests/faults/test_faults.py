@@ -1,6 +1,6 @@
-"""Every phase meets a fault once, of kinds and in verbs in turn: all end, the same command goes on to the same bits.
+"""Every phase has one fault, with kinds and verbs in turn: all ranks end, and the same command completes the results.
 
-``scripts/campaign faults`` does all of them.
+``scripts/campaign faults`` causes every kind of fault at every phase of every verb.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from vipetsc.case.nnm_table import NnmTable
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.dynamics import simulate
 
-# Names of scenarios by the number of ranks on which each meets faults here; all phases are among them.
+# Names of scenarios by the number of ranks on which each has faults here; together they reach all phases.
 ON_RANKS: dict[int, list[str]] = {}
 for scenario in SCENARIOS.values():
     if scenario.ranks:
         ON_RANKS.setdefault(scenario.ranks, []).append(scenario.name)
-# As far as faults are concerned, a system of one's own.
+# The reduced system passes through the same phases as a system of one's own.
 ONE_CELL = {"reduced"}
-# Every one ends a worker and costs seconds.
+# The number of kills: each ends a worker, and a new one takes seconds.
 KILLS = 2
 
 
 def test_every_verb_that_leaves_results_meets_faults_and_kills():
-    """The verbs with results are those of the faults below and those of the campaign's kills."""
+    """Every verb with results has a scenario with faults in this module, and one with kills in the campaign."""
     leaving = {verb.name for verb in VERBS.values() if verb.results}
     assert {verb.name for verb in study_verbs()} < leaving
     assert {scenario.verb.name for scenario in SCENARIOS.values() if scenario.ranks} == leaving
@@ -42,7 +42,7 @@ def test_every_verb_that_leaves_results_meets_faults_and_kills():
 
 
 def test_every_verb_that_reads_or_writes_files_meets_faults():
-    """The verbs that take a case, a folder or a file are those of the scenarios."""
+    """Every verb that takes a case, a folder or a file has a scenario."""
     flags = {"case", "path", "--out"}
     with_files = {verb.name for verb in VERBS.values() if flags & {argument.flag for argument in verb.arguments}}
     assert with_files > {verb.name for verb in study_verbs()}
@@ -50,7 +50,7 @@ def test_every_verb_that_reads_or_writes_files_meets_faults():
 
 
 def test_every_system_of_normal_modes_meets_faults():
-    """The systems of the scenarios of nnm are all that its case has, but for one that is like another."""
+    """The scenarios of nnm have every system of its case, except ``ONE_CELL``."""
     systems = set()
     for scenario in SCENARIOS.values():
         if scenario.verb.name == "nnm":
@@ -61,14 +61,14 @@ def test_every_system_of_normal_modes_meets_faults():
 
 @pytest.mark.mpirun
 def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
-    """A fault at each phase ends as it should, and the same command then leaves what an unbroken one leaves."""
+    """A fault at each phase ends all ranks with the right code; the same command then leaves undisturbed results."""
     with ExitStack() as leaving:
         crews = {}
         tasks = []
         for ranks, names in ON_RANKS.items():
             crews[ranks] = leaving.enter_context(Crew(tmp_path / str(ranks), ranks))
             tasks += [task | {"ranks": ranks} for task in matrix(references(crews[ranks], names))]
-        assert phases() - {task["phase"] for task in tasks} == set(), "phases that no verb here comes to"
+        assert phases() - {task["phase"] for task in tasks} == set(), "phases that no scenario reaches"
 
         chosen = one_of_each(tasks)
         found = {}
@@ -81,14 +81,14 @@ def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
                     found[task["id"]] = (*wrong, last_words(stages))
             crew.dismiss()
 
-    # Pytest shows it when the test fails.
+    # Pytest shows the table if the test fails.
     print(fault_table(rows, KINDS, list(ON_RANKS)))
     assert found == {}
     assert processes_of(tmp_path) == []
 
 
 def one_of_each(tasks):
-    """Choose one trial for every phase: ranks, verbs and kinds in turn, at most KILLS of them kills."""
+    """Choose one of ``tasks`` for every phase, with ranks, verbs and kinds in turn, and at most ``KILLS`` kills."""
     chosen = []
     kills = 0
     for turn, phase in enumerate(sorted({task["phase"] for task in tasks})):
@@ -98,7 +98,7 @@ def one_of_each(tasks):
         numbers = sorted({task["ranks"] for task in here})
         here = [task for task in here if task["ranks"] == numbers[turn % len(numbers)]]
 
-        # From here on there may be none of the kind whose turn it is, as of kills.
+        # The kind whose turn it is may be missing, as kills are after ``KILLS`` of them.
         begin = turn % len(here)
         kind = KINDS[turn % len(KINDS)]
         task = next((task for task in here[begin:] if task["kind"] == kind), here[begin])
@@ -111,13 +111,13 @@ def one_of_each(tasks):
 @pytest.mark.mpirun
 @pytest.mark.parametrize(("kind", "code"), [("sigterm", 75), ("sigkill", 137)])
 def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
-    """A signal to one rank of a user's command ends it with its code; the plain command goes on to the same bits."""
+    """A signal to one rank of a user's command ends it with its code; the same command then leaves the same bits."""
     case = prepare(SCENARIOS["run-ts"], tmp_path)
     whole = tmp_path / "whole"
     out = tmp_path / "out"
     simulate(Case.load(case), whole)
 
-    # Real processes from their beginning to their end, which the workers above are not.
+    # The command has processes of its own from beginning to end, which the trials of a worker do not have.
     fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
     assert fault.returncode == code, fault.stderr
     assert "Traceback" not in fault.stderr

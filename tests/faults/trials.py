@@ -1,4 +1,4 @@
-"""Trials with faults: which there are, done by workers under mpirun, and judged."""
+"""Trials with faults: their list, their execution by workers under mpirun, and the judgement of their outcomes."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from tests.faults.inject import KINDS
 from tests.faults.scenarios import unreadable
 
 ROOT = Path(__file__).parents[2]
-# Tasks that one worker is given before a new one is started.
+# The number of tasks of one worker, after which a new one is started.
 AT_ONCE = 60
 # Time in s from the fault to the end of all ranks, at most.
 ALLOWED = 10.0
 STOPPED = 75
-# What a call may end with; mpirun, which a kill or the signal itself may end, has codes of its own.
+# Exit codes that a call may have after a signal, and those of an mpirun that the signal itself, or a kill, has ended.
 CODES = {"sigterm": {0, STOPPED}, "sigkill": {128 + signal.SIGKILL}}
 OF_MPIRUN = {"sigterm": {128 + signal.SIGTERM, 1}, "sigkill": {-signal.SIGKILL}}
-# Phases at which the program may get over an exception. A file that cannot be read may belong to another program, or be
-# written again. A sweep's linear run is a job of its own: if it fails, the first member that needs the run simulates
-# it.
+# Exit codes at phases where the program may survive an exception. A file that cannot be read may belong to another
+# program, or be written again. A sweep's linear run is a separate job: if it fails, the first member that needs the run
+# simulates it.
 CODES_AT_PHASES = {"read": {0, 1, 2}, "member": {0, 1}}
 Task = dict[str, Any]
 Record = dict[str, Any]
@@ -39,9 +39,9 @@ Record = dict[str, Any]
 
 @dataclass
 class Crew:
-    """Workers on a number of ``ranks`` that do tasks in ``folder``; a call has ``patience`` s to end.
+    """Workers on ``ranks`` ranks that do tasks in ``folder``; a call must end within ``patience`` s.
 
-    A worker goes on from task to task until one of them ends it. ``with Crew(...) as crew`` leaves none behind.
+    A worker does one task after another until one of them ends it. ``with Crew(...) as crew`` leaves no process behind.
     """
 
     folder: Path
@@ -61,12 +61,12 @@ class Crew:
         self.dismiss()
 
     def do(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, dict[str, Record]]]:
-        """Do all ``tasks``; yield each one when it is done, with its records by stages."""
+        """Do all ``tasks``; yield each task when it is done, with its records by stage."""
         for task in tasks:
             stages, end = self._put(task)
             if end and task["do"] == "trial" and "begun" in stages:
                 stages.setdefault("ended", end | {"broken": unreadable(self.folder / task["scenario"])})
-                # The old worker did not come to call the same command again: a new one does.
+                # The fault has ended the worker: a new one calls the same command again.
                 found, end = self._put(task | {"do": "finish"})
                 stages |= found
 
@@ -75,7 +75,7 @@ class Crew:
             yield task, stages
 
     def dismiss(self) -> None:
-        """Let the worker end, if there is one."""
+        """End the worker, if there is one: by closing its stdin, or by a kill after ``patience``."""
         if self.worker is None:
             return
 
@@ -87,7 +87,7 @@ class Crew:
         self._bury()
 
     def _put(self, task: Task) -> tuple[dict[str, Record], Record | None]:
-        """Have a worker do a task; return the records by stages, and the end of the worker if the task ended it."""
+        """Have a worker do a task; return its records by stage, and the record of the worker's end, or None."""
         if self.left == 0:
             self.dismiss()
         if self.worker is None:
@@ -107,26 +107,26 @@ class Crew:
         return stages, self._end(*self._bury())
 
     def _records(self) -> list[Record]:
-        """What the worker has reported of its task."""
-        # The last line may not be whole.
+        """The records that the worker has written about its task."""
+        # The last line may be incomplete.
         whole = (self.folder / "results.jsonl").read_text().rpartition("\n")[0]
         return [json.loads(line) for line in whole.splitlines()]
 
     def _end(self, code: int, messages: str) -> Record:
-        """Return what a call that ended its worker has left: exit code, messages, the time since its fault."""
+        """Return the record of a call that ended its worker: exit code, messages, and the time in s since its fault."""
         errors = "".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("errors-*")))
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
         return {"code": code, "errors": errors, "since": since, "fired": fired.exists(), "mpirun": messages}
 
     def _launch(self) -> None:
-        """Call mpirun with a worker."""
+        """Start a worker under mpirun."""
         worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), str(self.patience)]
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
         environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
         with (self.folder / "mpirun.log").open("w") as file:
-            # A group can be killed. Linux gives a session of its own a fair part of the cores: priorities, by which
-            # scripts/test has mpirun come before serial tests, hold within a session alone.
+            # The worker gets a process group, which can be killed, but no session: Linux gives each session a fair part
+            # of the cores, and the priority that scripts/test gives to mpirun holds only within a session.
             self.worker = subprocess.Popen(
                 command, cwd=ROOT, env=environment, process_group=0,
                 stdin=subprocess.PIPE, stdout=file, stderr=file, text=True,
@@ -134,7 +134,7 @@ class Crew:
         self.left = AT_ONCE
 
     def _bury(self) -> tuple[int, str]:
-        """Return the code and the messages of the mpirun of a worker that ends; no process of it is left."""
+        """Wait for the end of the worker and kill its remaining processes; return mpirun's code and messages."""
         code = self.worker.wait()
         self.worker = None
         self.left = 0
@@ -145,9 +145,9 @@ class Crew:
         return code, (self.folder / "mpirun.log").read_text(errors="replace")
 
     def _await(self, task: Task) -> None:
-        """Wait until the worker is done with a task, or has ended: killed if it is silent longer than any call may be.
+        """Wait until the worker has finished a task or has ended; a worker that reports nothing for too long is killed.
 
-        A task with a ``delay`` is to meet a signal from outside, so many s after it began.
+        For a task with a ``delay``, send its signal ``delay`` s after the call has begun.
         """
         results = self.folder / "results.jsonl"
         reported = -1
@@ -162,29 +162,29 @@ class Crew:
                 if record.get("stage") == "finished":
                     return
 
-                # A call that has ended in the meantime is past being killed.
+                # A call that has ended within the delay gets no signal.
                 is_begun = record.get("stage") == "begun"
                 if is_begun and "delay" in task and not self._changes(results, size, record["time"] + task["delay"]):
                     (self.folder / "fired").write_text(str(time.time()))
                     self._kill(self.worker.pid, record["processes"], task)
-            # A reference may take ten times the patience, since kernels may have to be compiled in it.
+            # A reference may take ten times the patience, because it may have to compile kernels.
             elif time.monotonic() - last > 15 * self.patience:
                 os.killpg(self.worker.pid, signal.SIGKILL)
             time.sleep(0.01)
 
     def _changes(self, results: Path, size: int, until: float) -> bool:
-        """Return whether the worker reports something before the time ``until``."""
+        """Return whether the worker writes a record before the time ``until``, in s since the epoch."""
         while (left := until - time.time()) > 0 and results.stat().st_size == size:
             time.sleep(min(left, 0.01))
         return results.stat().st_size != size
 
     def _kill(self, mpirun: int, processes: list[int], task: Task) -> None:
-        """Send the signal of ``task`` to one rank, or to all: as a terminal or a scheduler does it, to mpirun."""
+        """Send the signal of ``task`` to one rank, or to mpirun for all ranks, as a terminal or a scheduler does."""
         number = {"sigterm": signal.SIGTERM, "sigkill": signal.SIGKILL}[task["kind"]]
         if task["rank"] >= 0:
             victims = [processes[task["rank"]]]
         elif number == signal.SIGKILL:
-            # mpirun cannot pass this one on.
+            # mpirun cannot forward SIGKILL.
             victims = [mpirun, *processes]
         else:
             victims = [mpirun]
@@ -195,10 +195,10 @@ class Crew:
 
 
 def processes_of(folder: Path) -> list[int]:
-    """Return the processes that were started for ``folder`` and have not ended."""
+    """Return the numbers of the processes whose command names ``folder`` and that have not ended."""
     found = []
     for path in Path("/proc").glob("[0-9]*"):
-        # A process may end while it is looked at.
+        # A process may end while its files are read.
         with suppress(OSError):
             ended = (path / "stat").read_text().rpartition(")")[2].split()[0] in "ZX"
             if not ended and os.fsencode(folder) in (path / "cmdline").read_bytes().split(b"\0"):
@@ -207,10 +207,10 @@ def processes_of(folder: Path) -> list[int]:
 
 
 def references(crew: Crew, names: Sequence[str]) -> dict[str, Record]:
-    """Call the scenarios unbroken; return what was found, by scenario.
+    """Call the scenarios without a fault; return the record of each call, by scenario.
 
-    ``counts`` is how often every phase came, by rank, and ``seconds`` the time of the call. Raises RuntimeError if one
-    fails.
+    ``counts`` of a record has, for each rank, how often it reached each phase; ``seconds`` is the time of the call.
+    Raises RuntimeError if a call fails.
     """
     found = {}
     for task, stages in crew.do([{"id": name, "do": "reference", "scenario": name} for name in names]):
@@ -222,7 +222,7 @@ def references(crew: Crew, names: Sequence[str]) -> dict[str, Record]:
 
 
 def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterator[Task]:
-    """Yield a trial with every kind of fault at every phase of the scenarios, rank and occurrence in turn."""
+    """Yield a trial for every kind of fault at every phase of the scenarios, with ranks and occurrences in turn."""
     turn = 0
     for name, reference in unbroken.items():
         ranks = reference["counts"]
@@ -231,7 +231,8 @@ def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterato
             for kind in kinds:
                 rank = taking_part[turn % len(taking_part)]
                 most = ranks[rank][phase]
-                # The first time, the last or one in the middle: the next when all ranks have had a turn.
+                # The fault comes at the first, the last or the middle occurrence: the next choice when every rank has
+                # had a turn.
                 number = (1, most, (most + 1) // 2)[turn // len(ranks) % 3]
                 yield {
                     "id": f"{name} {phase} {kind} rank {rank} of {len(ranks)}, time {number}", "do": "trial",
@@ -243,14 +244,14 @@ def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterato
 def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Iterator[Task]:
     """Yield trials with signals to one rank or to all at random times.
 
-    ``seconds`` is the time that a call takes, by scenario and ranks.
+    ``seconds`` is the time that a call takes, by scenario and number of ranks.
     """
     random = Random(seed)
     for number in range(count):
         (name, ranks), duration = random.choice(sorted(seconds.items()))
         kind = random.choice(("sigkill", "sigterm"))
         rank = random.randrange(-1, ranks)
-        # A signal towards the end would often come after it.
+        # A signal in the last fifth of the call's time would often come after its end.
         delay = round(0.8 * random.random() * duration, 3)
         whom = "all" if rank < 0 else f"rank {rank}"
         yield {
@@ -260,11 +261,11 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
 
 
 def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> list[str]:
-    """Return what is wrong with how a trial ended, in words."""
+    """Return the defects of a trial, in words; ``allowed`` is the time in s from the fault to the end of all ranks."""
     ended = stages.get("ended", {})
     finished = stages.get("finished", {})
-    # Ranks draw their jobs from a common count. The rank that was to meet the fault may have drawn fewer than in the
-    # unbroken call: then no fault has come, and all must be well.
+    # Ranks draw their jobs from a common counter. The rank of the fault may draw fewer jobs than in the reference, and
+    # may not reach the phase often enough: then there is no fault, and both calls must end with 0.
     if not ended.get("fired"):
         return [] if ended.get("code") == finished.get("code") == 0 else ["it ends before the fault"]
 
@@ -282,7 +283,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     if ended["code"] not in codes:
         wrong.append(f"exit code {ended['code']}")
 
-    # One message for all ranks at most, and none where a rank is killed.
+    # All ranks together print at most one message, and none if a rank is killed.
     messages = re.findall(r"^vipetsc: (?!warning:)", errors, re.MULTILINE)
     if len(messages) > (kind != "sigkill"):
         wrong.append(f"{len(messages)} messages")
@@ -298,7 +299,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
 
 
 def last_words(stages: dict[str, Record]) -> str:
-    """Return the last line on stderr of the call after the fault, else of the one with it."""
+    """Return the last line on stderr of the call after the fault, or else of the call with the fault."""
     lines: list[str] = []
     for stage in ("ended", "finished"):
         lines += stages.get(stage, {}).get("errors", "").splitlines()

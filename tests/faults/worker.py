@@ -1,9 +1,9 @@
-"""Does trials one after the other, all ranks of mpirun together: ``python -m tests.faults.worker FOLDER PATIENCE``.
+"""Does trials one after another, on all ranks of mpirun together: ``python -m tests.faults.worker FOLDER PATIENCE``.
 
-Tasks come to stdin, a line of JSON each, until it is closed. A trial calls the program in this process while one rank
-meets a fault, looks at what is left, calls the program again as nothing had happened, and compares with an unbroken
-call. What ends the process ends all; ``trials`` then starts a new one, whose first task is to call again. Lines of JSON
-in FOLDER/results.jsonl say how far the task is.
+Each line of stdin is a task in JSON, until stdin is closed. A trial calls the program in this process while one rank
+meets a fault, checks the files that are left, calls the program again, and compares the results with those of a call
+without a fault. A fault that ends one process ends all; ``trials`` then starts a new worker, whose first task is the
+second call. Lines of JSON in FOLDER/results.jsonl report the stages of a task.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Task = dict[str, Any]
 
 
 class _Quiet:
-    """A communicator for the abort hook whose processes go on after it."""
+    """A communicator for the abort hook that does not end its processes."""
 
     def __init__(self, comm: MPI.Comm) -> None:
         self.rank = comm.rank
@@ -61,7 +61,7 @@ class _Quiet:
 
 @dataclass
 class Worker:
-    """Does tasks in ``folder``; ``patience`` is the time in s in which a call has to end."""
+    """Does tasks in ``folder``; a call must end within ``patience`` s."""
 
     folder: Path
     patience: float
@@ -74,7 +74,7 @@ class Worker:
     def do(self, task: Task) -> None:
         """Do one task; all ranks call it."""
         scenario = SCENARIOS[task["scenario"]]
-        # To load the paper takes a second, which its own scenario alone needs.
+        # To load the paper takes a second, and only its own scenario needs it.
         if scenario.verb.name == "paper":
             shrink_paper()
         if task["do"] == "reference":
@@ -85,7 +85,7 @@ class Worker:
         words = words_of(scenario.words, self._case(scenario), out)
         if task["do"] == "trial":
             self._meet_the_fault(task, words, out, self._before(scenario))
-            # Another worker calls again: a signal may still reach this one.
+            # Another worker makes the second call, because the signal may still reach this one.
             if "delay" in task:
                 raise SystemExit(0)
 
@@ -94,7 +94,7 @@ class Worker:
         self._report(task, "finished", **ended, differs=differs)
 
     def _meet_the_fault(self, task: Task, words: list[str], out: Path, before: Path) -> None:
-        """Call the program on the folder ``out`` as it was ``before``, while a rank meets the fault of ``task``."""
+        """Call the program on the folder ``out``, a copy of ``before``, while a rank meets the fault of ``task``."""
         if self.comm.rank == 0:
             copy(before, out)
             (self.folder / "fired").unlink(missing_ok=True)
@@ -108,16 +108,19 @@ class Worker:
         self._report(task, "ended", **ended, **self._left_behind(out))
 
     def _case(self, scenario: Scenario) -> Path:
+        """The scenario's case file."""
         return self.folder / f"{scenario.name}.toml"
 
     def _before(self, scenario: Scenario) -> Path:
+        """The folder of results as the scenario's earlier call leaves it."""
         return self.folder / f"{scenario.name}-before"
 
     def _wanted(self, scenario: Scenario) -> Path:
+        """The folder of results as the scenario's call without a fault leaves it."""
         return self.folder / f"{scenario.name}-done"
 
     def _reference(self, task: Task, scenario: Scenario) -> None:
-        """Call the program undisturbed, and keep what it leaves and how often every phase comes."""
+        """Call the program without a fault; keep its results, and report how often each rank reaches each phase."""
         case = self._case(scenario)
         before = self._before(scenario)
         wanted = self._wanted(scenario)
@@ -135,25 +138,25 @@ class Worker:
         self.comm.Barrier()
 
         self.injector.disarm()
-        # Kernels may have to be compiled.
+        # The call may have to compile kernels.
         ended = self._call(words_of(scenario.words, case, wanted), 10.0)
         counts = self.comm.gather(self.injector.disarm())
         self._report(task, "finished", **ended, counts=counts)
 
     def _left_behind(self, out: Path) -> dict[str, Any]:
-        """Return whether the fault came, the time in s since then, and files of results that are not whole."""
+        """Return whether the fault came, the time in s since then, and files of results that cannot be read."""
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
-        # Rank 0 alone reports.
+        # Only rank 0 reports.
         broken = unreadable(out) if self.comm.rank == 0 else []
         return {"fired": fired.exists(), "since": since, "broken": broken}
 
     def _call(self, words: list[str], leave: float = 1.0) -> dict[str, Any]:
-        """Call the program as its front door does; return code, lines on stderr and time of all ranks, on all ranks.
+        """Call the program; return, on all ranks, the largest exit code, the time, and the stderr of all ranks.
 
-        It has ``leave`` times the usual time to end.
+        The call must end within ``leave`` times ``patience``.
         """
-        # As in a process that begins.
+        # A new process begins with the default handlers too.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
 
@@ -169,9 +172,9 @@ class Worker:
             except BaseException as raised:
                 error = raised
 
-            # An error that not all ranks raise leaves the others waiting for this one.
+            # If only some ranks raise an error, the others wait for them and do not come here.
             if not self._all_are_here(1.0 if error else 2 * leave * self.patience):
-                # As at the end of a process: it ends all.
+                # The hook ends all ranks, as it does at the end of a process with an error.
                 sys.excepthook(type(error), error, error.__traceback__)
             self._report_error(error)
             faulthandler.cancel_dump_traceback_later()
@@ -181,13 +184,13 @@ class Worker:
         return {"code": max(codes), "errors": "".join(errors), "seconds": time.monotonic() - begin}
 
     def _report_error(self, error: BaseException | None) -> None:
-        """Say what all ranks raised as the abort hook does, but go on."""
+        """Print the error that all ranks raised as the abort hook prints it, and continue."""
         agreed = getattr(error, "from_root", False)
         everywhere = all(self.comm.allgather(agreed))
         if error is None or (agreed and everywhere and self.comm.rank):
             return
 
-        # The program's own hook would end this process.
+        # The program's own communicator would end this process.
         hook = sys.excepthook
         install_abort_hook(_Quiet(self.comm))
         try:
@@ -198,7 +201,7 @@ class Worker:
             sys.excepthook = hook
 
     def _all_are_here(self, patience: float) -> bool:
-        """Return whether all ranks come to this call within ``patience`` s."""
+        """Return whether all ranks make this call within ``patience`` s."""
         request = self.comm.Ibarrier()
         deadline = time.monotonic() + patience
         while not request.Test():
@@ -209,7 +212,7 @@ class Worker:
 
     @contextmanager
     def _redirected(self) -> Iterator[None]:
-        """Lead stderr into the file of this rank's errors, and stdout nowhere; by number, for PETSc and MPI too."""
+        """Redirect stderr to this rank's file of errors and discard stdout, by descriptor, for PETSc and MPI too."""
         sys.stdout.flush()
         sys.stderr.flush()
         saved = [os.dup(number) for number in (1, 2)]
@@ -230,14 +233,14 @@ class Worker:
             os.close(target)
 
     def _report(self, task: Task, stage: str, **more: Any) -> None:
-        """Write a line that says how far a task is."""
+        """Write a line that reports a ``stage`` of a task."""
         if self.comm.rank == 0:
             with (self.folder / "results.jsonl").open("a") as file:
                 file.write(json.dumps({"id": task["id"], "stage": stage, "time": time.time(), **more}) + "\n")
 
 
 def tasks(comm: MPI.Comm) -> Iterator[Task]:
-    """Yield the tasks that come to the stdin of rank 0, on all ranks, which sleep until one comes."""
+    """Yield, on all ranks, the tasks that come to the stdin of rank 0; ranks sleep until a task comes."""
     while line := on_root(comm, sys.stdin.readline):
         yield json.loads(line)
 

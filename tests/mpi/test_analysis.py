@@ -1,4 +1,4 @@
-"""Measures of one run by several ranks: the bits of one rank, one error for all."""
+"""Several ranks measure one run: the measures have the bits of one rank, and an error is raised on all ranks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parallel([1, 2, 3])
 def test_ranks_take_different_measures_of_one_run(monkeypatch):
-    """Every rank gets all of them, in the order and with the attributes of one rank; an error is raised on all."""
+    """Each measure is computed on one rank; all ranks get all measures, with the order and attributes of one rank.
+
+    An error in a measure is raised on all ranks.
+    """
 
     def measured() -> tuple[xr.Dataset, xr.Dataset]:
         run = simulate(small_case(time={"end": 0.02}), comm=MPI.COMM_SELF).dataset

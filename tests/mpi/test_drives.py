@@ -1,4 +1,4 @@
-"""The same bits on any number of ranks under several drives, each on the rank that has its cell, and a moved end."""
+"""Runs under drives of cells on different ranks and of a moved end have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRIVES = [
 
 
 class InParts(Observer):
-    """Observes ten samples at a time, so that a run can stop after each ten."""
+    """An observer of blocks of ten samples: a run can stop after each block."""
 
     name = "in-parts"
     longest = 10
@@ -30,7 +30,8 @@ def test_same_bits_under_several_drives(folder, engine):
 
 
 @pytest.mark.parallel([1, 2, 3])
-# The time stepper looks after every step, the propagator after every ten samples: both amid the drives.
+# The time stepper looks for a request to stop after every step, the propagator after every ten samples: both runs stop
+# while the drives act.
 @pytest.mark.parametrize(("engine", "looks"), [*on_two(("ts", 31)), ("propagator", 2)])
 def test_a_run_goes_on_amid_its_drives(folder, engine, looks):
     case = small_case(drive={"more": DRIVES}, time={"end": 0.02, "engine": engine})

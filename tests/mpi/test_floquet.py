@@ -1,4 +1,4 @@
-"""A branch of breathers shot on all ranks together: the same orbits and multipliers on any number of them."""
+"""Breathers by shooting on all ranks together: orbits and Floquet multipliers do not depend on the number of ranks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_same_branch_on_any_number_of_ranks(folder):
     if COMM.rank == 0:
         together = read_branch(folder / "branch-breather-1600.h5")
         (alone,) = follow_all(breather_case(multipliers=2), folder, MPI.COMM_SELF)
-        # Sums over ranks are in another order: the same to rounding, magnified by the orbit, not to the last bit.
+        # Ranks add in another order than one rank does: orbits differ by rounding errors, which the motion magnifies.
         assert len(together.points) == len(alone.points) == 3
         for a, b in zip(together.points, alone.points, strict=True):
             assert a.period == pytest.approx(b.period, rel=1e-10)

@@ -1,4 +1,4 @@
-"""Contacts that join cells of two ranks: the same bits on any number of them, of both engines."""
+"""Contacts that join cells of two ranks: runs by both engines have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vipetsc.io.store import RunMemory
 
 
 def contact_table(**each: list) -> dict:
-    """Contacts of eight sites in seven cells: cell 3 has two."""
+    """The table of contacts at eight sites in seven cells, of which cell 3 has two; ``each`` are keys by site."""
     return {"stiffness": 1e7, "clearance": 1e-5, "sites": [1, 2, 3, 3, 4, 5, 6, 7], "each": each}
 
 
@@ -42,7 +42,7 @@ CHAIN = {
     "time": {"end": 0.02, "sample_interval": 2e-4, "rtol": 1e-8},
 }
 
-# A ring whose joint a contact crosses, with a pressed contact, for exact steps.
+# A ring for the propagator: a contact joins the last cell and the first, and another one is pressed at rest.
 RING = CHAIN | {
     "lattice": LATTICE | {"ends": "periodic"},
     "contacts": contact_table(
@@ -57,7 +57,7 @@ RING = CHAIN | {
 
 
 def digest(comm: MPI.Comm, table: dict) -> tuple | None:
-    """A hash of fields, impacts and energies of a run, and its numbers of switches and steps; None beyond rank 0."""
+    """A hash of a run's fields, impacts and energies, and its numbers of switches and steps; None except on rank 0."""
     memory = RunMemory(comm)
     result = simulate(Case.from_table(table), memory)
     assert result.complete, result.sentence

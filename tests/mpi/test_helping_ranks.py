@@ -1,4 +1,4 @@
-"""Ranks that draw pictures for rank 0: the same files, errors of either side on all ranks, requests to stop."""
+"""Ranks that draw pictures for rank 0: the files are the same, and errors and requests to stop reach all ranks."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.reanalysis import measure_run
 
 COMM = MPI.COMM_WORLD
-PATIENCE = 60.0  # s for what takes a tenth of one where the machine is idle
+PATIENCE = 60.0  # s to wait for a request, which takes 0.1 s on an idle machine
 
 
 @pytest.fixture
 def run(folder):
-    """The folder of a run that is not measured, which rank 0 has simulated."""
+    """The folder of a run that rank 0 has simulated; it has no measures yet."""
     case = small_case(time={"engine": "propagator", "end": 0.03}, output={"fields": ["velocity"]})
     on_root(COMM, lambda: simulate(case, folder / "run", MPI.COMM_SELF))
     return folder / "run"
 
 
 def pictures_in(folder):
+    """The bytes of each picture of a run, by its name."""
     return {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
 
 
@@ -58,7 +59,8 @@ def test_all_ranks_together_draw_what_one_draws(run, monkeypatch):
 
     files = with_helping_ranks(COMM, StopRequest(), work)
     by_rank = COMM.allgather(drawn_here)
-    # What shows no measures is left to the helpers, two or four pictures for each; rank 0 may be late for the others.
+    # Pictures without measures are left to the helping ranks, which draw two or four each. The others are divided, and
+    # rank 0 may come too late for any of them.
     assert all(by_rank[1:])
     drawn = sorted(name for names in by_rank for name in names)
     assert drawn == [path.name for path in files]
@@ -76,7 +78,7 @@ def test_all_ranks_together_draw_what_one_draws(run, monkeypatch):
 
 
 def fail(*arguments, **options):
-    """Raise an error as of a picture that cannot be drawn."""
+    """Raise the error of a picture that cannot be drawn, with the number of the rank."""
     raise ValueError(f"rank {COMM.rank} cannot draw")
 
 
@@ -92,7 +94,7 @@ def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
     with pytest.raises(ValueError, match=f"rank {COMM.size - 1} cannot draw"):
         with_helping_ranks(COMM, StopRequest(), work)
 
-    # It has drawn nothing, but is there for the next request.
+    # The rank that failed has drawn nothing, but takes part in the next request.
     monkeypatch.undo()
     files = with_helping_ranks(COMM, StopRequest(), work)
     assert {path.stem for path in files} == {"unit_cell", "ledger"}
@@ -100,7 +102,7 @@ def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
 
 @pytest.mark.parallel([2, 3])
 def test_what_rank_0_raises_is_raised_on_all(run):
-    """An answer that rank 0 does not wait for is not taken for that of a later request."""
+    """If rank 0 fails before it receives an answer, that answer is not taken for the answer to a later request."""
 
     def work(helpers):
         helpers.ask("run", [run], names=["no figure"])
@@ -113,14 +115,14 @@ def test_what_rank_0_raises_is_raised_on_all(run):
         helpers.ask("run", [run], divided=True, names=["unit_cell"])
         return helpers.drawn()
 
-    # Rank 0 takes no turn here.
+    # Rank 0 draws none of these pictures.
     (path,) = with_helping_ranks(COMM, StopRequest(), work_again)
     assert path.name == "unit_cell.png"
 
 
 @pytest.mark.parallel([2, 3])
 def test_a_request_to_stop_that_any_rank_gets_reaches_rank_0():
-    """Rank 0 sees the request of another rank while it works, and not when that work is over."""
+    """Rank 0 sees the request of another rank while it works; a later piece of work does not see it."""
     stop = StopRequest()
     stop.requested = COMM.rank == COMM.size - 1
 

@@ -1,4 +1,4 @@
-"""The same identification on any number of ranks, and after a stop."""
+"""An identification has the same bits on any number of ranks, and after a stop."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.parallel import StoppedError, StopRequest, divided, on_root
 from vipetsc.studies.identification import run_identification
 
-# Two starts and two places of a profile: fewer jobs than three ranks, and more than one.
+# Two starts and two points of a profile: several jobs, but fewer than three ranks.
 OPTIONS = {"starts": 2, "profile": 2, "steps": 4}
 
 
 class StopAfter(StopRequest):
-    """A request to stop that comes with the check of that number."""
+    """A request to stop that is granted after it has been checked ``checks`` times."""
 
     def __init__(self, checks: int) -> None:
         self.left = checks
@@ -34,20 +34,20 @@ class StopAfter(StopRequest):
 
 
 def plan_of(folder: Path, changes: dict[str, Any], end: float = 0.009, **options: Any) -> IdentifyCase:
-    """A fit of one clearance to a record of a few contacts until ``end`` (s), with ``changes`` of the record."""
+    """A fit of one clearance to a record with contacts, up to ``end`` in s; ``changes`` update the record's table."""
     table = lattice_table(time={"end": end})
 
     def written() -> str:
         record = measured_table(folder, table, noise=0.01) | changes
         unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [2e-4, 8e-4], "start": 6e-4}]
-        # As text, which rank 0 hands to the others: each would write a record of its own.
+        # Rank 0 alone writes the record, and hands the case to the others as text.
         return IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, **options)).to_toml()
 
     return IdentifyCase.from_toml(on_root(MPI.COMM_WORLD, written))
 
 
 def result_of_one_rank(plan: IdentifyCase, folder: Path) -> dict[str, np.ndarray]:
-    """Every dataset of the identification that rank 0 makes alone, on all ranks."""
+    """The datasets of the identification that rank 0 computes alone; all ranks get them."""
 
     def identified() -> dict[str, np.ndarray]:
         run_identification(plan, folder, MPI.COMM_SELF)
@@ -58,14 +58,14 @@ def result_of_one_rank(plan: IdentifyCase, folder: Path) -> dict[str, np.ndarray
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    """A fit from two starts."""
+    """The case of a fit from two starts."""
     return plan_of(tmp_path_factory.mktemp("data"), {}, **OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def single(tmp_path_factory):
-    """A fit from one start with an initial state, whose derivatives the ranks divide, and its result of one rank."""
-    # A state has many coordinates, whose derivatives are the jobs that ranks divide.
+    """The case of a fit from one start that also estimates the initial state, and its result on one rank."""
+    # A state has many coordinates: the derivatives with respect to them are the jobs that ranks divide.
     changes = {"begin": 0.004, "initial": "estimate"}
     plan = plan_of(tmp_path_factory.mktemp("single"), changes, end=0.007, profile=0, steps=3)
     return plan, result_of_one_rank(plan, tmp_path_factory.mktemp("single-whole"))
@@ -73,7 +73,7 @@ def single(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(plan, tmp_path_factory):
-    """The result of one rank."""
+    """The result of ``plan`` on one rank."""
     return result_of_one_rank(plan, tmp_path_factory.mktemp("whole"))
 
 
@@ -98,6 +98,7 @@ def test_a_stopped_identification_goes_on(folder, plan, whole):
 
 @pytest.mark.parallel([2, 3])
 def test_ranks_divide_a_single_start_to_the_same_bits(folder, single):
+    """Ranks that divide the derivatives of one start get the result of one rank."""
     plan, whole = single
     run_identification(plan, folder, MPI.COMM_WORLD)
     assert_same_bits(datasets(folder / "identified.h5"), whole)
@@ -106,7 +107,7 @@ def test_ranks_divide_a_single_start_to_the_same_bits(folder, single):
 
 @pytest.mark.parallel([1, 2])
 def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
-    """Two stops inside the only start: every window is solved once, and the bits are those of a fit without a stop."""
+    """A fit that is stopped twice within its only start solves every window once, with the bits of an unstopped fit."""
     plan, whole = single
     solve = GrowingWindows._solve
     solved: list[int] = []
@@ -116,7 +117,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
         solved.append(len(arguments[1]))
         return solution
 
-    # Windows from the record are taken without this function.
+    # Windows that are read from the records do not call this function.
     monkeypatch.setattr(GrowingWindows, "_solve", counted)
     for resume in (False, True):
         with pytest.raises(StoppedError):
@@ -125,7 +126,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
     assert before >= 2
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
     lines = (folder / "identified-runs.jsonl").read_text().splitlines()
-    # Each record of a window stands for one solution.
+    # There is one record for each window that was solved.
     assert len(solved) == sum(" window " in line for line in lines) > before
     assert_same_bits(datasets(folder / "identified.h5"), whole)
     MPI.COMM_WORLD.Barrier()
@@ -133,6 +134,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
 
 @pytest.mark.parallel([1, 2, 3])
 def test_jobs_are_divided_and_their_first_failure_is_that_of_all():
+    """``divided`` computes job k on rank k mod size, gives all ranks all values, and raises one error on all ranks."""
     comm = MPI.COMM_WORLD
     computed: list[int] = []
 
@@ -144,9 +146,9 @@ def test_jobs_are_divided_and_their_first_failure_is_that_of_all():
 
     jobs = [lambda number=number: job(number) for number in range(2)]
     assert divided(comm, jobs) == [0, 1]
-    # Every rank has all values, and has computed its own alone.
+    # Every rank has all values, and has computed only its own.
     assert computed == [number for number in range(2) if number % comm.size == comm.rank]
-    # The first failure by number, not by time: all ranks raise the same one.
+    # All ranks raise the failure with the smallest number, not the earliest one.
     with pytest.raises(ArithmeticError, match="job 2"):
         divided(comm, [lambda number=number: job(number) for number in range(5)])
     comm.Barrier()

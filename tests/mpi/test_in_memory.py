@@ -23,7 +23,7 @@ TABLE = {
 
 @pytest.mark.parallel(2)
 def test_rank_0_has_the_run():
-    """The run is gathered on rank 0, with the bits of one rank."""
+    """A run in memory is gathered on rank 0, with the bits of a run on one rank."""
     case = small_case(time={"end": 0.02})
     result = simulate(case)
     assert result.complete
@@ -35,7 +35,7 @@ def test_rank_0_has_the_run():
 
 @pytest.mark.parallel(2)
 def test_rank_0_has_the_ensemble():
-    """The members are divided over the ranks, and rank 0 reads the ensemble before the folder goes."""
+    """Rank 0 has the ensemble of a sweep without a folder; the temporary folder is removed."""
     result = run_sweep(Sweep(**TABLE, sweep={"drive": {"amplitude": [1.0, 2.0, 3.0]}, "measures": ["transfer"]}))
     assert result.complete
     assert result.folder is None
@@ -46,6 +46,6 @@ def test_rank_0_has_the_ensemble():
 
 @pytest.mark.parallel(2)
 def test_all_ranks_refuse_fields_without_a_folder():
-    """The refusal is raised on every rank."""
+    """A sweep with fields but without a folder is refused on every rank."""
     with pytest.raises(CaseError, match="give a folder"):
         run_sweep(Sweep(**TABLE, sweep={"drive": {"amplitude": [1.0]}, "fields": True}))

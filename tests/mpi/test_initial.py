@@ -15,7 +15,7 @@ MODE = {"kind": "mode", "number": 40, "energy": 0.5}
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize(("initial", "ends"), [(PACKET, "periodic"), *on_two((PACKET, "fixed"), (MODE, "free"))])
 def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, ends):
-    # On 2 and 3 ranks, 24 cells are cut after 12; 8, 16.
+    # 24 cells are cut after cell 12 on 2 ranks, and after cells 8 and 16 on 3.
     case = small_case(
         lattice={"ends": ends},
         contacts={"sites": [6, 8, 9, 12, 13, 16, 17], "clearance": 1e-3, "stiffness": 1e5},
@@ -29,7 +29,7 @@ def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, 
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_struck_masses_of_any_rank_have_the_same_bits(folder, engine):
-    """Masses in the first, the last and a cell next to a border between ranks are struck."""
+    """Struck masses are in the first cell, in the last cell and on both sides of a border between ranks."""
     strikes = [{"cell": 12, "mass": 2, "velocity": -0.4}, {"cell": 13, "velocity": 0.2}, {"cell": 24, "velocity": -0.3}]
     case = small_case(
         contacts={"sites": [6, 12, 13], "clearance": 1e-5},

@@ -1,4 +1,4 @@
-"""Orbits of a lattice and their variations on any number of ranks: the same bits as on one."""
+"""Orbits of a lattice and their tangent motions have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parallel([2, 3])
 def test_losses_have_the_same_bits():
-    """What dashpots and contacts take from an orbit does not depend on how the lattice is cut."""
+    """The energy that dashpots and contacts dissipate along an orbit does not depend on the number of ranks."""
     table = {
         "lattice": {"preset": "four-band", "cells": 18, "damping": {"mass": 0.1}},
         "contacts": {"sites": [6, 9, 10], "restitution": 0.9},
@@ -36,7 +36,7 @@ def test_losses_have_the_same_bits():
     case = NnmCase.from_table(table)
 
     def losses(comm):
-        """Loss and force of an orbit in which all sites touch, whether or not it is periodic."""
+        """The loss and the force of a motion in which all sites touch; it need not be periodic."""
         method = LatticeMethod(case, comm)
         x = 1e-2 * np.random.default_rng(3).standard_normal(method.system.dofs)
         point = Point(
@@ -64,14 +64,17 @@ def test_losses_have_the_same_bits():
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("restitution", [*on_two(1.0), 0.7])
 def test_variations_have_the_same_bits(restitution):
-    """An orbit and variations of it, with clusters across the borders: 18 cells are cut after 9 or after 6 and 12."""
+    """An orbit and three tangent motions have the same bits, with clusters of sites across borders of ranks.
+
+    18 cells are cut after cell 9 on 2 ranks, and after cells 6 and 12 on 3.
+    """
     sites = (5, 8, 9, 12)
     cells = 18
     dofs = 4
     chain = Chain(four_band("calibrated"), cells, "fixed", sites, (CLEARANCE,) * len(sites))
     contact = replace(four_band_contact("hertz"), restitution=restitution)
 
-    # Resonators that move towards their stops, so that every site is met within a period.
+    # Resonators move towards their stops: every site has a contact within a period.
     random = np.random.default_rng(3)
     state = 1e-5 * random.standard_normal((2, cells, dofs))
     state[0, sites, 2] += 1.6e-3
@@ -79,7 +82,7 @@ def test_variations_have_the_same_bits(restitution):
     variations = random.standard_normal((3, 2, cells, dofs)).reshape(3, -1)
 
     def after_a_period(comm):
-        """State, variations and number of closed contacts after a period."""
+        """The state, the tangent motions and the number of closed contacts after a period."""
         flow = LatticeFlow(chain, [Stops.both(contact, clearance) for clearance in chain.clearances], comm)
         arc = flow.arc(flow.scatter(state.ravel()), 2 * np.pi / 1600)
         assert arc.episodes >= len(sites)
@@ -98,7 +101,7 @@ def test_variations_have_the_same_bits(restitution):
 
 @pytest.mark.parallel([2])
 def test_one_rank_alone_may_look_at_an_orbit():
-    """All ranks stop at the samples that it looks at, and its orbit is the one that nobody looks at."""
+    """If one rank observes an orbit, all ranks stop at its samples, and the end has the bits of an unobserved orbit."""
     chain = Chain(four_band("calibrated"), 18, "fixed", (8,), (CLEARANCE,))
     flow = LatticeFlow(chain, [Stops.both(four_band_contact("hertz"), CLEARANCE)], COMM)
     start = flow.scatter(1e-5 * np.random.default_rng(3).standard_normal(2 * 18 * 4))

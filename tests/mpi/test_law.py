@@ -1,4 +1,4 @@
-"""The same scattering law, bit for bit, on any number of ranks."""
+"""A scattering law has the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vipetsc.studies.one_site import make_law
 @pytest.mark.parallel([2])
 def test_law_is_the_same_on_any_number_of_ranks(folder):
     comm = MPI.COMM_WORLD
-    # Two runs a point, whose means must not depend on who computed them.
+    # Each point is the mean of two runs, and must not depend on which rank computed them.
     case = law_case(law=COARSE | {"samples": 2})
 
     make_law(case, folder / "together", comm)

@@ -1,4 +1,4 @@
-"""Stiffness and mass as shared matrices; linear modes near a frequency, on any number of ranks."""
+"""Distributed matrices of stiffness and mass, and linear modes near a frequency, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from vipetsc.lattice.modes import mode_frequency, mode_shape
 from vipetsc.studies.linear_modes import find_modes
 
 COMM = MPI.COMM_WORLD
-# A cell of whole numbers, whose sums are exact in any order.
+# Masses and stiffnesses are whole numbers, whose sums are exact in any order.
 WHOLE = UnitCell((1.0, 2.0, 4.0), (Spring(0, 0, 3.0, True), Spring(0, 1, 5.0), Spring(2, 1, 7.0, True)), 0, 1)
 
 
 def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
-    """-M u'' (cell, dof) of this rank's cells by the right-hand side that PETSc calls."""
+    """-M u'' (cell, dof) of this rank's cells, from the right-hand side that PETSc calls."""
     model = small_case(drive={"amplitude": 1e-3}).model()
     model = replace(model, chain=chain, drives=(replace(model.drives[0], mass=0),))
     layout = Layout(model, COMM)
@@ -38,7 +38,7 @@ def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
     engine.ts.computeRHSFunction(0.0, engine.state, rate)
     engine.destroy()
 
-    # Rates of the velocities lie behind those of the displacements, mass by mass.
+    # Rates of displacements come first, then those of velocities; each part is ordered mass by mass.
     d = layout.dofs
     n = layout.owned
     acceleration = rate.array[d * n : 2 * d * n].reshape(d, n).T
@@ -50,7 +50,7 @@ def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("cells", [2, 3, 25])
 @pytest.mark.parametrize(("cell", "rounding"), [(WHOLE, 0), (four_band(), 1e-10)], ids=["whole", "four-band"])
 def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, rounding):
-    """They agree to the last bit in whole numbers, otherwise to the rounding of their sums."""
+    """K u by the matrix is -M u'' by the right-hand side: exactly in whole numbers, otherwise to rounding errors."""
     rng = np.random.default_rng(3)
     u = rng.standard_normal((cells, cell.dofs))
     if cell is WHOLE:
@@ -65,7 +65,7 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, roundin
     momentum = (matrices.mass * matrices.vector(own)).array_r.reshape(own.shape)
     assert np.array_equal(momentum, own * np.asarray(cell.masses))
 
-    # Exactly as many entries as were needed are there.
+    # The matrix was allocated with exactly the entries that it needs.
     assert matrices.stiffness.getInfo()["nz_unneeded"] == 0
     matrices.destroy()
 
@@ -77,15 +77,15 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, roundin
         *on_two(("fixed", 60, 2034.0, 4), ("free", 40, 0.0, 3)),
         ("periodic", 60, 1000.0, 7),
         ("fixed", 3, 900.0, 12),
-        # 445 rad/s is nearer in the square.
+        # The mode at 445 rad/s is nearer in the squared frequency, and another one in the frequency.
         ("fixed", 1, 668.0, 1),
         ("fixed", 60, 1850.0, 3),
-        # Copies of ring modes at the edge of a band take more than a few restarts.
+        # Modes of a ring come in pairs of one frequency; at the edge of a band the solver needs many restarts for them.
         ("periodic", 60, 1850.0, 3),
     ],
 )
 def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(ends, cells, near, count):
-    """Frequencies are those of the closed form, modes that have one frequency are all found, and shapes orthonormal."""
+    """Frequencies are those of the closed form, with their multiplicity, and shapes are mass-orthonormal."""
     chain = Chain(four_band("calibrated"), cells, ends)
     matrices = LatticeMatrices(chain, COMM)
     starts = []
@@ -98,7 +98,7 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
     matrices.vector = counted
     modes = modes_near(matrices, count, near)
 
-    # The search ends with the first mode that is not nearer.
+    # After ``count`` modes the search looks for missed ones, and ends with the first mode that is not nearer.
     assert len(starts) <= count + 3
     every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
     nearest = np.sort(every[np.argsort(np.abs(every - near), kind="stable")[:count]])
@@ -114,6 +114,7 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
 
 @pytest.mark.parallel(2)
 def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
+    """Without a direct solver for several ranks, two ranks find the modes of the closed form."""
     monkeypatch.setattr(eigen, "ON_SEVERAL", ())
     chain = Chain(four_band("calibrated"), 60, "fixed")
     matrices = LatticeMatrices(chain, COMM)
@@ -127,6 +128,7 @@ def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
 
 @pytest.mark.parallel([1, 2])
 def test_the_edge_modes_of_the_lattice_and_their_file(folder):
+    """The file of modes tells two edge modes of one frequency, in a gap, from a bulk mode of the closed form."""
     case = small_case(lattice={"cells": 100}, contacts={"sites": [30]})
     found = find_modes(case, 3, 2034.0, folder, COMM)
     assert (found is None) == (COMM.rank > 0)
@@ -136,11 +138,12 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
         assert data["frequency"].values[:2] == pytest.approx(2034.8251, abs=1e-4)
         assert data["kind"].values.tolist() == ["edge", "edge", "bulk"]
         assert data["band"].values.tolist() == [0, 0, 3]
-        # Deep in the gap a mode sits in a cell or two of one end, or of both: they have one frequency.
+        # Deep in the gap an edge mode occupies a cell or two at one end, or at both ends: as the frequencies are equal,
+        # any combination is a mode.
         assert data["participation"].values[:2].max() < 4 < 50 < data["participation"].values[2]
         assert (data["left"] + data["right"]).values[:2] == pytest.approx(1.0, abs=1e-6)
 
-        # The third one is a mode of the closed form.
+        # The third mode is one of the closed form.
         bulk = mode_shape(Chain(four_band("calibrated"), 100), 202)
         shape = data["shape"].values[2]
         assert np.abs(shape / np.abs(shape).max()) == pytest.approx(np.abs(bulk), abs=1e-6)
@@ -148,6 +151,7 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
 
 @pytest.mark.parallel([1])
 def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
+    """With cells that differ, modes are those of the dense matrices, and shares of energy use each cell's masses."""
     profiles = {"masses[1]": [0.005, 0.02], "springs[2].stiffness": [1e4, 3e4]}
     case = small_case(lattice={"cells": 2, "profiles": profiles}, contacts={"sites": [1]})
     data = find_modes(case, 8, 900.0, folder, COMM)
@@ -156,13 +160,16 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
     stiffness = chain.stiffness_matrix().toarray()
     masses = chain.masses()
     assert data["frequency"].values ** 2 == pytest.approx(eigvalsh(stiffness, np.diag(masses)), rel=1e-9)
-    # The outer tenths of two cells are one cell each: together they hold all.
+    # The outer tenth of two cells at either end is one cell: together they hold the whole energy.
     assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parallel([1, 2])
 def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
-    """Of the slope 3/2 k d^(1/2) of Hertz's force: in a cell, to the ground, across a joint; an open one has none."""
+    """A pressed Hertzian contact is a spring of the slope 3/2 k d^(1/2) at the indentation d; an open one is none.
+
+    Pressed contacts lie within a cell, between a mass and the ground, and across the joint of the ring.
+    """
     pressed = 1e-4
     contacts = {
         "sites": [3, 7, 12, 9],
@@ -179,7 +186,7 @@ def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
 
     stiffness = case.model().chain.stiffness_matrix().toarray()
     spring = 1.5 * case.contacts.stiffness * np.sqrt(pressed)
-    # Masses of the pairs, four to a cell; None is the ground.
+    # Hosts and resonators by the number of their mass, four to a cell; None is the ground.
     for host, resonator in ((8, 9), (None, 26), (44, 0)):
         ends = np.zeros(48)
         ends[resonator] = 1.0
@@ -193,6 +200,7 @@ def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
 
 @pytest.mark.parallel([1])
 def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
+    """Impossible requests, a contact that just touches, and a search without convergence are refused."""
     case = small_case()
     # 24 cells have 96 modes.
     for count, near, key in ((0, 1.0, "--modes"), (97, 1.0, "--modes"), (2, -1.0, "--near")):

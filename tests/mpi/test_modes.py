@@ -1,4 +1,4 @@
-"""Branches that ranks follow side by side: the same bits on 1 and on 2 ranks; a failure on one leaves the others."""
+"""Branches on different ranks have the same bits as on one rank, and a branch that fails does not affect the others."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vipetsc.parallel import StopRequest
 
 
 def three_cells(**nnm) -> NnmCase:
-    """Two branches of twelve degrees of freedom, from the lowest modes through grazing; ``nnm`` updates its section."""
+    """Branches from the two lowest modes of twelve degrees of freedom, into contact; ``nnm`` updates its section."""
     table = {
         "name": "cells",
         "lattice": {"preset": "four-band", "reading": "printed", "cells": 3},
@@ -31,7 +31,7 @@ def test_same_bits_on_every_number_of_ranks(folder):
     branches = follow_all(case, folder, comm)
     comm.Barrier()
     if comm.rank:
-        # Rank 0 collects the branches of all.
+        # Rank 0 collects the branches of all ranks.
         assert branches == []
         return
 
@@ -49,7 +49,7 @@ def test_same_bits_on_every_number_of_ranks(folder):
 
 @pytest.mark.parallel([1, 2])
 def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
-    """A half-trace that may not move at all stops the branches at their first contact, with their points on disk."""
+    """A tight bound on the half-trace ends both branches at their first contact, with their points on disk."""
     comm = MPI.COMM_WORLD
     case = three_cells(smallest_step=1e-3, guards={"half_trace": 1e-3})
 
@@ -61,16 +61,19 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
         for branch in branches:
             assert branch.ending.startswith("failed: step below")
             assert "nnm.guards.half_trace" in branch.ending
-            # A row of names, then one a point.
+            # The table has a row of names, and then one row for each point.
             rows = (folder / f"branch-{branch.name}.csv").read_text().splitlines()
             assert len(rows) == len(branch.points) + 1 > 2
 
 
 @pytest.mark.parallel([1, 2])
 def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
-    """A request that one rank gets ends its branch at the next point, whole on disk; the other rank goes on."""
+    """A request to stop on one rank ends its branch at the next point; the other branch goes on.
+
+    A resumed branch has the same bits as an uninterrupted one.
+    """
     comm = MPI.COMM_WORLD
-    # On two ranks each follows one branch: only that with mode-1 sees the request.
+    # Each of two ranks follows one branch: only the rank with mode-1 sees the request.
     case = three_cells(points=20)
     stop = StopRequest()
 
@@ -99,7 +102,7 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
 
 @pytest.mark.parallel([2])
 def test_an_error_of_one_rank_is_raised_on_all_when_the_others_have_finished(folder):
-    """Such as a listener's, which is not one of the method's failures."""
+    """An error that is no failure of the method, here of a listener, is raised on all ranks after all branches."""
     comm = MPI.COMM_WORLD
 
     def listener(branch, point):
@@ -117,12 +120,12 @@ def test_an_error_of_one_rank_is_raised_on_all_when_the_others_have_finished(fol
 
 @pytest.mark.parallel([2])
 def test_an_error_of_the_listener_is_raised_on_all_ranks_that_follow_one_branch(folder):
-    """It is called on rank 0 alone, between the points of a lattice that all ranks shoot together."""
+    """A listener is called on rank 0, between points that all ranks compute together; its error reaches all ranks."""
 
     def listener(branch, point):
         raise RuntimeError("of the listener")
 
-    # As many cells as the orbits' steps couple.
+    # The lattice has as many cells as one time step couples.
     table = {
         "lattice": {"preset": "four-band", "cells": 6},
         "contacts": {"sites": [2], "clearance": 1.8e-3},

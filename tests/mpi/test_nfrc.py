@@ -1,4 +1,4 @@
-"""The same curves of steady states, bit for bit, on any number of ranks."""
+"""Curves of steady states have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CELLS = {"family": {"contacts": {"sites": [[10], [11]]}}}
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("kind", ["restitutions", "family"])
 def test_curves_are_the_same_on_any_number_of_ranks(kind, folder):
-    """Two restitutions, or two members of a family, are two curves: ranks work on different ones, and one has none."""
+    """Two restitutions, or two members of a family, are two curves on different ranks; a third rank has none."""
     comm = MPI.COMM_WORLD
     options = {"harmonics": 3, "range": [0.999, 1.0005], "first_step": 1e-3, "points": 3}
     case = nfrc_case(**options, restitutions=[1.0, 0.7]) if kind == "restitutions" else nfrc_case(**options, **CELLS)
@@ -29,7 +29,7 @@ def test_curves_are_the_same_on_any_number_of_ranks(kind, folder):
 
     curves = follow_all(case, together, comm)
 
-    # Rank 0 collects the curves of all.
+    # Rank 0 collects the curves of all ranks.
     assert len(curves) == (2 if comm.rank == 0 else 0)
     if comm.rank == 0:
         follow_all(case, alone, MPI.COMM_SELF)

@@ -1,4 +1,4 @@
-"""The same optimum on any number of ranks, alone or in teams, and after any stop."""
+"""A search has the same bits on any number of ranks, with ranks in teams or not, and after any stop."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from vipetsc.studies.optimum_search import run_search
 
 
 def plan(*changes: str) -> OptimiseCase:
-    """A search for clearances and cells of two sites; ``changes`` are overrides of its case."""
+    """A search for the clearances and the cells of two sites; ``changes`` are overrides of its case."""
     bounds = {"variables": {"clearance": [1e-5, 1e-3], "sites": [3, 12]}}
     table = search_table(16, [4, 9])
     return OptimiseCase.from_table(table | {"optimise": table["optimise"] | bounds}, changes)
 
 
 def found_by_one_rank(case: OptimiseCase, folder: Path) -> dict[str, np.ndarray]:
-    """Every dataset of the search that rank 0 makes alone in ``folder``, on all ranks."""
+    """The datasets of the search that rank 0 computes alone in ``folder``; all ranks get them."""
 
     def found() -> dict[str, np.ndarray]:
         run_search(case, folder, MPI.COMM_SELF)
@@ -35,7 +35,7 @@ def found_by_one_rank(case: OptimiseCase, folder: Path) -> dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The optimum that one rank finds."""
+    """The datasets of the search ``plan()`` on one rank."""
     return found_by_one_rank(plan(), tmp_path_factory.mktemp("whole"))
 
 
@@ -60,7 +60,7 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
 
 
 @pytest.mark.parallel([1, 2])
-# At the first look of the search, and after some designs.
+# The search stops at its first look at the request, or after some designs.
 @pytest.mark.parametrize("looks", [1, 12])
 def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
     comm = MPI.COMM_WORLD
@@ -70,7 +70,7 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
         run_search(plan(), folder, comm, stop=stop)
     assert not (folder / "optimum.h5").exists()
 
-    # No rank goes on while another one still looks for the file.
+    # No rank continues while another one still looks for the file.
     comm.Barrier()
     run_search(plan(), folder, comm, resume=True)
 
@@ -80,8 +80,8 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
 
 @pytest.mark.parallel([2])
 def test_responses_do_not_depend_on_the_ranks(folder, tmp_path_factory):
-    """Designs fall to different ranks, or the curves of each to the ranks of a team; a search that goes on too."""
-    # Near the lower resonance, where the stops hold the mass back at 2 N and are not reached at 1 N.
+    """A search for responses has the same bits if ranks divide the designs, and if a team divides a design's curves."""
+    # The range is near the lower resonance: the mass meets its stops at 2 N, and does not reach them at 1 N.
     curves = {"fixed": [1.0, 2.0], "range": [0.84, 0.9], "largest_step": 1.0}
     sections = {"contacts": {"clearance": 14.0}, "nfrc": curves, "optimise": {"budget": 3}}
     table = with_sections(TABLE, sections)

@@ -1,4 +1,4 @@
-"""Ranks that write together agree on attributes, learn of each other's failures, and leave whole files."""
+"""Ranks that write a run together agree on attributes, know of each other's failures, and leave complete files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("writer", ["gather", in_parallel])
 def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writer):
-    """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
+    """All ranks write the same attributes, such as the duration of a run: HDF5 could not close the file otherwise."""
     finish = RunFolder.finish
     outcome = []
 
@@ -45,6 +45,7 @@ def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writ
 @needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_a_run_in_memory_is_gathered_on_rank_0(folder):
+    """The dataset of a run in memory is on rank 0, with the bits of the file that ranks write together."""
     case = small_case(output={"writer": "parallel"}, time={"end": 0.02})
     memory = RunMemory(COMM)
     simulate(case, memory)
@@ -54,7 +55,7 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
         return
 
     run = datasets(folder / "run" / "run.h5")
-    # The state at the end is in memory alone.
+    # The state at the end is in memory, not in the file.
     held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])
     assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
@@ -62,7 +63,11 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
 @needs_parallel_hdf5
 @pytest.mark.parallel([2, 3])
 def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
-    """The files agree for several sites a rank in no order, several chunks, fields of a window, open episodes."""
+    """A file that ranks write together has the bits of a gathered one.
+
+    Each rank has several sites, which are not sorted; there are several chunks, fields of a window, and contacts that
+    are closed at the end.
+    """
     monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 20)
     sites = {"sites": [13, 5, 6, 18, 12, 2], "clearance": [2e-4, 1e-4, 3e-5, 1e-4, 5e-5, 2e-4]}
     for writer in ("gather", "parallel"):
@@ -78,7 +83,10 @@ def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
 
 @pytest.mark.parallel([2, 3])
 def test_rows_are_sorted_over_ranks_and_none_has_all():
-    """Ranks begin with different numbers of rows, a third with none; of equal onset the lower site comes first."""
+    """Rows are sorted by onset, then by site, and each rank gets about the same number of them.
+
+    Ranks begin with different numbers of rows, a third rank with none.
+    """
     random = np.random.default_rng(3)
     table = np.zeros(900, [("onset", float), ("site", np.int64)])
     table["onset"] = random.integers(300, size=900) / 7
@@ -96,11 +104,12 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("writer", ["gather", in_parallel])
 def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
+    """An error of the rank that writes is raised on all ranks; the earlier run and the parts of the new one remain."""
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
     before = (path / "run.h5").read_bytes()
 
-    # Gathered files are written by rank 0.
+    # Rank 0 writes a gathered file.
     failing = COMM.size - 1 if writer == "parallel" else 0
     case = small_case(output={"writer": writer}, time={"end": 0.02})
 
@@ -123,6 +132,7 @@ def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypa
 
 @pytest.mark.parallel([2, 3])
 def test_what_one_rank_raises_all_raise():
+    """``on_every_rank`` returns each rank's value, or raises the error of one rank on all."""
     assert on_every_rank(COMM, lambda: COMM.rank) == COMM.rank
 
     def fails() -> None:
@@ -135,6 +145,7 @@ def test_what_one_rank_raises_all_raise():
 
 @pytest.mark.parallel([2, 3])
 def test_a_request_that_one_rank_got_stops_all():
+    """All ranks agree on a request to stop that one rank has received."""
     stop = StopRequest()
     assert not stop.agreed(COMM)
     stop.requested = COMM.rank == COMM.size - 1
@@ -145,6 +156,7 @@ def test_a_request_that_one_rank_got_stops_all():
 
 @pytest.mark.parallel(2)
 def test_only_checkpoints_that_all_ranks_wrote_count(folder):
+    """A run resumes from the last checkpoint that every rank has written; later chunks are removed."""
     chunks = RunFolder(folder, COMM)
     parts = folder / "parts"
     if COMM.rank == 0:
@@ -155,7 +167,7 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
         chunks.save_state({"number": np.array(number)})
     COMM.Barrier()
 
-    # The last two are kept: of the very last one a rank may have been killed in the midst.
+    # Two checkpoints are kept, because a rank may be killed while it writes the last one.
     kept = sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy"))
     assert kept == [f"state-000002-{COMM.rank}-2.npy", f"state-000003-{COMM.rank}-2.npy"]
     COMM.Barrier()
@@ -167,19 +179,20 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
 
     assert [state["number"] for state in again.last_state()] == [2, 2]
     assert again.count == 3
-    # Another number of ranks would leave chunks behind the checkpoint there.
+    # A resumed run on another number of ranks would not overwrite later chunks.
     assert not list(parts.glob("part-000003-*"))
 
 
 @pytest.mark.parallel(2)
 def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
+    """A checkpoint that is damaged on one rank raises an error on every rank."""
     case = small_case().to_toml()
     output = RunFolder(folder / "run", COMM)
     output.begin(case)
     output.append({"x": np.zeros(1)})
     output.save_state({"number": np.array(1)})
 
-    # Cut off within its header.
+    # The file is cut off within its header.
     if COMM.rank == 1:
         (state,) = (folder / "run" / "parts").glob("state-*-1-2.npy")
         state.write_bytes(state.read_bytes()[:20])
@@ -191,6 +204,7 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
 
 @pytest.mark.parallel(2)
 def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeypatch):
+    """Without MPI in h5py a parallel writer is refused on all ranks; a writer that is left open gathers."""
     monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
     case = small_case(output={"writer": "parallel"}, time={"end": 0.01})
     with pytest.raises(CaseError, match=r"output\.writer = 'parallel': needs an h5py with MPI support"):
@@ -198,6 +212,6 @@ def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeyp
     COMM.Barrier()
     assert not (folder / "run").exists()
 
-    # A run of any size gathers where the case leaves the choice.
+    # Where the case leaves the choice, a run above the limit is gathered too.
     monkeypatch.setattr(recorded_sizes, "GATHER_LIMIT", 1000)
     assert simulate(small_case(time={"end": 0.01}), folder / "run").complete

@@ -1,4 +1,4 @@
-"""The same bits on any number of ranks: samples, impact log, ledger; gathered and parallel files."""
+"""Runs have the same bits on any number of ranks: samples, impacts and energies, in gathered and parallel files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vipetsc.parallel import on_root
 
 
 def runs_alike(folder: Path, case: Case) -> None:
-    """Simulate ``case`` on all ranks and on rank 0 alone: every dataset has the same bits."""
+    """Simulate ``case`` on all ranks and on rank 0 alone, and assert that every dataset has the same bits."""
     together = simulate(case, folder / "together")
     assert together.complete
 
@@ -30,7 +30,7 @@ def runs_alike(folder: Path, case: Case) -> None:
 
         run = datasets(folder / "together" / "run.h5")
         assert_same_bits(run, datasets(folder / "alone" / "run.h5"))
-        # Impacts are where ranks could part.
+        # Results of different numbers of ranks could differ at impacts.
         assert len(run["impacts/site"]) > 0
         for name in ("episodes", "steps", "rejected", "landings", "switches", "ledger_error", "work", "dissipated"):
             assert together.statistics[name] == alone.statistics[name], name
@@ -42,7 +42,7 @@ def runs_alike(folder: Path, case: Case) -> None:
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 @pytest.mark.parametrize("law", [*on_two("hertz"), "bilinear"])
 def test_same_bits_with_sites_on_the_borders(folder, ends, law):
-    # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
+    # 24 cells are cut after cell 12 on 2 ranks, after 8 and 16 on 3, and after 6, 12 and 18 on 4.
     sites = [6, 7, 12, 13, 16, 17]
     case = small_case(lattice={"ends": ends}, contacts={"law": law, "sites": sites}, time={"end": 0.03})
     runs_alike(folder, case)
@@ -51,7 +51,7 @@ def test_same_bits_with_sites_on_the_borders(folder, ends, law):
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 def test_same_bits_with_dashpots_in_cells_that_differ(folder, ends):
-    """Cells scattered from one seed are the same on any number of ranks, and stand in the file."""
+    """Cells that are scattered from one seed, and their dashpots, are the same on any number of ranks."""
     scatter = {"masses[1]": {"relative": 0.02}, "springs[1].stiffness": {"relative": 0.02}}
     lattice = {"ends": ends, "damping": {"mass": 10.0, "stiffness": 1e-5}}
     case = small_case(lattice=lattice, disorder={"seed": 2, "cells": scatter}, time={"end": 0.02})
@@ -111,10 +111,10 @@ def test_parallel_writing_gives_the_gathered_file(folder):
 
 
 class Spoiler(Observer):
-    """Makes one number of the last rank's state NaN after the first block."""
+    """An observer that makes one number of the last rank's state NaN after the first block of samples."""
 
     name = "test-spoiler"
-    # Samples of a block: the state turns invalid behind the first one.
+    # A block has 61 samples.
     longest = 61
 
     def observe(self, block):
@@ -125,6 +125,8 @@ class Spoiler(Observer):
 
 @pytest.mark.parallel(2)
 def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
+    """An error of one rank in the set-up of the propagator is raised on all ranks."""
+
     def forces(*arguments):
         if MPI.COMM_WORLD.rank == 1:
             raise ValueError("no room")
@@ -147,7 +149,10 @@ def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
     ],
 )
 def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, observers, reason):
-    """One rank owns the site, and in the propagator another one does not feel it at all."""
+    """A step that fails on the rank of the only site ends the run on all ranks, with the same outcome.
+
+    In the propagator the forces of the site do not even reach another rank within a sample interval.
+    """
     table = {
         "name": "failing",
         "lattice": {"preset": "diatomic", "cells": 40},
@@ -174,12 +179,13 @@ def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, ob
 def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(
     folder, monkeypatch, engine, looks, damping, writer
 ):
-    """A run goes on one rank, then on all, then on all but one; contacts last over both checkpoints.
+    """A run begins on one rank, continues on all and ends on all but one, with the bits of an uninterrupted run.
 
-    That by exact steps has dashpots, too, whose losses are kept cell by cell.
+    Some contacts are closed at both checkpoints. The propagator's run has dashpots, whose losses checkpoints keep cell
+    by cell.
     """
     comm = MPI.COMM_WORLD
-    # Blocks of 25 samples: the propagator can stop between them.
+    # Blocks have 25 samples, and the propagator can stop between two blocks.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 25)
     sections = {
         "lattice": {"damping": damping},
@@ -218,6 +224,6 @@ def test_the_whole_builtin_run_has_the_same_bits(folder):
         simulate(case, folder / "one", MPI.COMM_SELF)
         run = datasets(folder / "one" / "run.h5")
         assert_same_bits(run, datasets(folder / "two" / "run.h5"))
-        # 181 episodes in all (SPEC section 5).
+        # SPEC section 5: there are 181 contact episodes in all.
         assert np.bincount(run["impacts/site"])[1:].tolist() == [50, 43, 33, 37, 18]
     assert result.statistics["ledger_error"] < 1e-8

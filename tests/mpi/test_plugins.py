@@ -1,4 +1,4 @@
-"""A module that one rank alone cannot import ends all ranks, before anything is written."""
+"""A module that only one rank cannot import ends all ranks, before anything is written."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ amplitude = [1.0, 2.0]
 @pytest.mark.parametrize("verb", ["run", "sweep"])
 @pytest.mark.parametrize("failing", [0, 1])
 def test_a_module_that_fails_on_one_rank_ends_all(folder, failing, verb, capfd):
-    """All ranks return the code of bad input, rank 0 prints one message that names the rank, and no folder is left."""
+    """All ranks return 2, rank 0 prints one message, which names another rank than 0, and no folder is left."""
     comm = MPI.COMM_WORLD
     if comm.rank == 0:
         (folder / "part.py").write_text(MODULE.format(rank=failing))
@@ -50,7 +50,7 @@ def test_a_module_that_fails_on_one_rank_ends_all(folder, failing, verb, capfd):
     comm.Barrier()
 
     code = main([verb, str(folder / "case.toml"), "--out", str(folder / "out"), "--quiet"])
-    # All ranks compare the same values: one that fails alone would leave the other waiting.
+    # All ranks compare the same values, because a rank that fails alone would leave the other one waiting.
     codes = comm.allgather(code)
     messages = comm.allgather(capfd.readouterr().err)
     is_left = comm.bcast((folder / "out").exists())

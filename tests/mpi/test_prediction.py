@@ -1,4 +1,4 @@
-"""The same prediction on any number of ranks."""
+"""A prediction has the same bits on any number of ranks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The propagator on any number of ranks: the same bits as on one."""
+"""Runs by the propagator have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vipetsc.case import Case
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 @pytest.mark.parametrize("law", ["hertz", *on_two("bilinear")])
 def test_same_bits_with_clusters_across_borders(folder, ends, law):
-    # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
+    # 24 cells are cut after cell 12 on 2 ranks, after 8 and 16 on 3, and after 6, 12 and 18 on 4.
     case = small_case(
         lattice={"ends": ends},
         contacts={"law": law, "sites": [1, 6, 7, 12, 13, 16, 17, 24]},
@@ -24,7 +24,7 @@ def test_same_bits_with_clusters_across_borders(folder, ends, law):
 
 @pytest.mark.parallel([2, 4])
 def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
-    """Samples 0.8 ms apart: the band reaches over several ranks of a few cells."""
+    """The matrix of one sample interval has a band wider than the cells of a rank, with samples 0.8 ms apart."""
     case = small_case(
         lattice={"cells": 11},
         contacts={"sites": [3, 8]},
@@ -37,7 +37,7 @@ def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("disorder", [*on_two({}), {"seed": 2, "cells": {"masses[1]": {"relative": 0.02}}}])
 def test_same_bits_with_dashpots(folder, disorder):
-    """Energies of dashpots, too: of uniform cells 8 and more a rank, and of cells that all differ."""
+    """Runs with dashpots, and the energies of the dashpots, have the same bits, for equal and for different cells."""
     damping = {"mass": 10.0, "stiffness": 5e-6}
     sections = {"lattice": {"cells": 60, "damping": damping}, "time": {"end": 0.02, "engine": "propagator"}}
     if disorder:

@@ -1,4 +1,4 @@
-"""Bad input on two ranks: what is wrong is printed once, all ranks return the code of bad input, nothing is written."""
+"""Bad input on two ranks: each problem is printed once, all ranks return 2, and nothing is written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tomli_w
 from tests.conftest import search_table, set_words
 from vipetsc.cli.main import main
 
-# Of each verb: changes of its case that are wrong, and what is said of them.
+# For each verb: wrong changes of its case, and sentences that the message must contain.
 REFUSED = {
     "design": (
         ["design.eta.last=1.5", "design.lambda.coutn=3", "design.wavenumbers=2"],
@@ -25,13 +25,13 @@ REFUSED = {
 
 
 def refused(capfd: pytest.CaptureFixture[str], *words: object) -> str:
-    """Return what all ranks print of a call that every rank refuses."""
+    """Call the program with ``words``, assert that every rank returns 2, and return the messages of all ranks."""
     comm = MPI.COMM_WORLD
     comm.Barrier()
     capfd.readouterr()
     code = main(list(map(str, words)))
 
-    # All ranks compare the same values: one that fails alone would leave the other waiting.
+    # All ranks compare the same values, because a rank that fails alone would leave the other one waiting.
     assert comm.allgather(code) == [2] * comm.size
     return "".join(comm.allgather(capfd.readouterr().err))
 
@@ -39,7 +39,7 @@ def refused(capfd: pytest.CaptureFixture[str], *words: object) -> str:
 @pytest.mark.parallel([2])
 @pytest.mark.parametrize("verb", REFUSED)
 def test_bad_cases_write_nothing(folder, capfd, verb):
-    """Everything wrong is said at once, once."""
+    """All problems of a case are reported together, each once, and no folder is created."""
     changes, sentences = REFUSED[verb]
     if MPI.COMM_WORLD.rank == 0:
         table = {"design": {"wavenumbers": 21}}

@@ -1,4 +1,4 @@
-"""Nonlinear springs across the borders of ranks: the same bits on any number of them."""
+"""Runs with nonlinear springs across the borders of ranks have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from tests.conftest import on_two, small_case
 from tests.mpi.test_partition import runs_alike
 
-# 24 cells are cut after 12 on two ranks, after 8 and 16 on three: springs begin in the last cells before the cuts.
+# 24 cells are cut after cell 12 on 2 ranks, and after cells 8 and 16 on 3: the cubic springs begin in the last cells
+# before the cuts.
 SPRINGS = {
     "springs[1].cubic": {"cells": [8, 12, 16], "value": 3e11},
     "springs[4].quadratic": {"cells": [13], "value": 1e5},

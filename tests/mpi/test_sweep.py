@@ -1,4 +1,4 @@
-"""The same ensemble file on any number of ranks, alone or in teams."""
+"""Sweeps leave the same ensemble on any number of ranks, in teams or not, also after failures and stops."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ amplitude = [0.1, 20.0, 40.0]
 
 @pytest.fixture(scope="module")
 def injector():
-    """Faults at chosen phases; it patches the package, and so stands once."""
+    """The injector of faults at chosen phases; a process may have only one, because its hook cannot be removed."""
     return Injector()
 
 
 def sweep(*changes: str) -> Sweep:
-    """The sweep of the table; ``changes`` are overrides of its case."""
+    """The sweep of ``TABLE``; ``changes`` are overrides of its case."""
     return Sweep.from_table(tomllib.loads(TABLE), list(changes))
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The ensemble of the sweep that rank 0 makes alone, on all ranks."""
+    """The datasets of the ensemble that rank 0 computes alone; all ranks get them."""
     folder = tmp_path_factory.mktemp("whole")
 
     def swept() -> dict[str, np.ndarray]:
@@ -99,7 +99,7 @@ def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
         assert turned.tolist() == together["ibtet"][[2, 0, 1]].tolist()
         assert len({*turned}) == 3
 
-        # Clearances are scattered, the lattice is not: one linear run serves all samples.
+        # Only clearances are scattered, and the lattice is the same: one linear run serves all samples.
         assert (folder / "all" / "members.jsonl").read_bytes().count(b'"envelope"') == 1
     comm.Barrier()
 
@@ -110,13 +110,17 @@ def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
     [(2, "analyse", "exception"), (2, "append", "full-disk"), (1, "append", "full-disk"), (1, "step", "memory")],
 )
 def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, injector, whole, team, phase, kind):
+    """An error within a member is recorded and the sweep goes on; a full disk ends the sweep.
+
+    In both cases the same command then completes the sweep with the bits of an undisturbed one.
+    """
     comm = MPI.COMM_WORLD
     plan = sweep(f"sweep.ranks={team}")
-    # A team's rank 0 measures and writes for it; alone, rank 1 is the one that fails.
+    # Rank 0 of a team measures and writes for the team. Without teams the fault meets rank 1.
     failing = 0 if team == 2 else 1
     if comm.rank == failing:
-        # The first record of rank 0 is that of the linear run: it fails one record later. Of the members rank 1 may get
-        # one alone, where rank 0 is quicker.
+        # The fault comes at the third record of rank 0, whose first one is that of the linear run, and at the second
+        # record of rank 1, which gets few members where rank 0 is faster.
         time_of_fault = {"append": 3 - comm.rank, "step": 1, "analyse": 2}
         injector.arm(phase, time_of_fault[phase], kind)
 
@@ -131,7 +135,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
         assert expected[kind] in reason
         assert not result.complete
         assert not result.resumable
-        # A rank alone fails in its linear run, and may have drawn all members before the other rank has its own.
+        # Without teams a rank fails in its linear run, and may take all members before the other rank takes one.
         assert 1 <= result.count(2) < 6 + (team == 1)
 
     injector.disarm()
@@ -162,10 +166,11 @@ def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
 
 @pytest.mark.parallel([1, 2, 3])
 def test_every_number_is_drawn_once():
+    """Ranks that draw from a shared counter together get every number once."""
     comm = MPI.COMM_WORLD
     counter = SharedCounter(comm)
     drawn = []
-    # Ranks draw at their own speed: which one gets a number is not fixed.
+    # Ranks draw at their own speed, and any of them may get a number.
     while (number := counter.draw()) < 200:
         drawn.append(number)
 
@@ -181,7 +186,7 @@ def test_after_a_request_on_one_rank_no_rank_begins_another_job():
     pool = TaskPool(comm, MPI.COMM_SELF, stop)
 
     def work(job: int) -> None:
-        # So long that the other rank sees the request before it has done its half.
+        # A job takes so long that the other rank sees the request before it has done its half.
         time.sleep(0.01)
         stop.requested = comm.rank == 1
 
@@ -192,6 +197,7 @@ def test_after_a_request_on_one_rank_no_rank_begins_another_job():
 
 @pytest.mark.parallel([1, 2, 3])
 def test_blocks_of_jobs_hold_every_job_once():
+    """The pool does every one of 1007 jobs once, and reports the 101 jobs whose number ends in 3, which fail."""
     comm = MPI.COMM_WORLD
     done = list[int]()
     failed = list[int]()
@@ -208,5 +214,5 @@ def test_blocks_of_jobs_hold_every_job_once():
     assert sorted(job for jobs in comm.allgather(failed) for job in jobs) == list(range(3, 1007, 10))
     assert completed == 1007 - 101
     if comm.size == 1:
-        # The first come first.
+        # One rank does the jobs in their order.
         assert done == list(range(1007))

@@ -1,4 +1,4 @@
-"""Contacts that touch at rest, within and between the cells of two ranks: the same bits on any number of them."""
+"""Runs with contacts that touch at rest, within cells and between cells of two ranks, have the same bits on 2 ranks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vipetsc.io.store import RunMemory
 
 
 def digest(comm, case):
-    """A hash of motion, energies and impacts on rank 0, and the landings; None on the others."""
+    """A hash of motion, energies and impacts, and the number of landings, on rank 0; None on other ranks."""
     memory = RunMemory(comm)
     result = simulate(case, memory)
     assert result.complete, result.sentence
