@@ -66,7 +66,7 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     kappa = np.asarray(kappa, float)
     root = 1 / np.sqrt(cell.masses)
     scale = root[:, None] * root
-    squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
+    squared, vectors = _eigenpairs(cell, kappa)
 
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
     near_zero = np.abs(kappa) < OFF_ZERO
@@ -75,7 +75,7 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     eigenvalue = squared.copy()
     u = vectors.copy()
     if near_zero.any():
-        eigenvalue[near_zero], u[near_zero] = np.linalg.eigh(cell.stiffness_matrix(OFF_ZERO) * scale)
+        eigenvalue[near_zero], u[near_zero] = _eigenpairs(cell, OFF_ZERO)
     stiffness_slope = _stiffness_slope(cell, off_zero)
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
     return BlochPoint(
@@ -83,6 +83,13 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
         vectors=vectors * root[:, None],
         group_velocity=eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny))),
     )
+
+
+def _eigenpairs(cell: UnitCell, kappa: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Squared frequencies (..., band), and vectors (..., dof, band) of displacements times the roots of the masses."""
+    root = 1 / np.sqrt(cell.masses)
+    squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * (root[:, None] * root))
+    return squared, vectors
 
 
 def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
@@ -118,9 +125,11 @@ def _grid(cell: UnitCell) -> BandGrid:
 
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
     """Frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
+    # Without the group velocities of ``bloch``, which cost as much again as the frequencies.
     if cell.dofs <= MANY_MASSES:
-        return sign * float(bloch(cell, kappa).frequency[band - 1])
-    squared, _ = _eigenpair(cell, band, kappa)
+        squared = float(_eigenpairs(cell, kappa)[0][band - 1])
+    else:
+        squared, _ = _eigenpair(cell, band, kappa)
     return sign * float(np.sqrt(max(squared, 0.0)))
 
 
