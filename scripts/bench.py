@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import petsc4py
 
-# Without PETSc's signal handlers: they end the process by MPI_Abort, and peers that run then would be left behind.
+# PETSc's signal handlers are left out: they end the process by MPI_Abort, and would leave running peers behind.
 petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
@@ -42,7 +42,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 
 PARTS = ("precision", "whole", "programs", "members", "scaling", "builds")
-# What a machine must have for a peer whose name begins so.
+# The packages that a machine must have for the peers, by the beginning of a peer's name.
 NEEDED = {
     "odeint": "g++ and libboost-dev",
     "ARKODE": "g++ and libsundials-dev",
@@ -59,7 +59,7 @@ FULL = {
     "sizes": [(10**6, 1000), (10**6, 10**5), (10**7, 10**4)],
 }
 QUICK = {
-    # These span the errors from 1e-5 to 1e-9 at which solvers are compared.
+    # These tolerances span the errors from 1e-5 to 1e-9 at which solvers are compared.
     "tolerances": [1e-7, 1e-9, 1e-11, 1e-13],
     "rounds": 1,
     "cells": [300, 30_000, 100_000],
@@ -87,7 +87,7 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     if options.rounds is not None and options.rounds < 1:
         parser.error(f"--rounds {options.rounds}: must be at least 1")
     for key, value in (QUICK if options.quick else FULL).items():
-        # What the command line gives has precedence.
+        # A value from the command line has precedence.
         if getattr(options, key, None) is None:
             setattr(options, key, value)
     return options
@@ -123,7 +123,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
         if "programs" in parts:
             found["programs"] = measured_programs(options)
         if "members" in parts:
-            # At most three, since a round has four sweeps.
+            # Three rounds are enough, because each has four sweeps.
             found["members"] = member_seconds(Path(folder), min(options.rounds, 3))
             found["paper"] = paper_budget(options.paper)
         if "scaling" in parts:
@@ -184,7 +184,7 @@ def main(arguments: list[str]) -> int:
             write_manual(found, options.out)
         return 0
 
-    # Refused before anything is measured, if the peers cannot solve it.
+    # A case that the peers cannot solve is refused before anything is measured.
     try:
         case = lattice_case(options.set)
         parameters(case.model())

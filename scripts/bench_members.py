@@ -55,7 +55,7 @@ def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
     amplitudes = [kind.amplitude * (1 + 1e-4 * k) for k in range(members)]
     table["sweep"] = {"measures": list(kind.measures), "drive": {"amplitude": amplitudes}}
 
-    # After the case file was read, which is no part of a member.
+    # The time begins after the case file was read, which is no part of a member.
     begin = time.process_time()
     result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
     # A failed member ends early and would pass for a fast one.
@@ -72,7 +72,7 @@ def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
     measured: dict[str, list[float]] = {name: [] for name in KINDS}
     for turn in range(rounds + 1):
         for name, seconds in measured.items():
-            # In the difference the linear run that members share, set-up and the final file cancel.
+            # The common linear run, the set-up and the final file cancel in the difference.
             one = _sweep_seconds(KINDS[name], 1, folder / f"{name}-{turn}-one")
             many = _sweep_seconds(KINDS[name], 1 + MEMBERS, folder / f"{name}-{turn}-many")
             # The first turn fills caches.

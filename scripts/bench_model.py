@@ -52,7 +52,7 @@ class ScalingModel:
         are its time, a bound from above.
         """
         largest = self._cells[-1]
-        # In logarithms, since lengths and times span decades.
+        # The interpolation is in logarithms, because lengths and times span decades.
         within = np.exp(np.interp(np.log(min(cells, largest)), np.log(self._cells), np.log(self._seconds)))
         return float(within) * max(1.0, cells / largest) * self.shared
 

@@ -190,7 +190,7 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
         slope = right_hand_side(model)
         n = model.chain.masses().size
         times = np.arange(model.samples) * model.sample_interval
-        # One tolerance for displacements and one for velocities, as the engines have.
+        # Displacements have one absolute tolerance and velocities another, as in the engines.
         atol = np.repeat(model.atol, n)
 
         begin = time.process_time()
@@ -259,7 +259,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         f = np.empty_like(y)
         for i in range(n):
-            # One by one: numba takes seconds to compile the assignment of a slice.
+            # Elements are assigned one by one, because numba takes seconds to compile the assignment of a slice.
             f[i] = y[n + i]
             total = 0.0
             for k in range(first[i], first[i + 1]):

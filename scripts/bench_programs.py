@@ -102,7 +102,7 @@ class Version:
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
         environment["PYTHONPATH"] = str(self.source)
         if program.compiles:
-            # With an empty cache of machine code: kernels in the user's cache would not be compiled.
+            # The cache of machine code is empty: kernels in the user's cache would not be compiled.
             kernels = self.folder / "kernels"
             shutil.rmtree(kernels, ignore_errors=True)
             environment["NUMBA_CACHE_DIR"] = str(kernels)

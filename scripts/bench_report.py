@@ -201,7 +201,7 @@ def _power(value: float) -> str:
 def draw(found: dict[str, Any], folder: Path) -> list[Path]:
     """Draw ``work-precision.png`` and ``scaling.png`` to ``folder``, if they were measured; returns the files."""
     pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
-    # Without rows of failures, which have no numbers to draw.
+    # Rows of failures are left out: they have no numbers to draw.
     found = found | {"scaling": [row for row in found.get("scaling", []) if "failure" not in row]}
     paths = []
     for key, (name, make) in pictures.items():
@@ -252,7 +252,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
 
     _limit(left, found["scaling"])
-    # From zero, so that heights are in proportion to memory.
+    # The axis begins at zero, so that heights are in proportion to memory.
     right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
     left.set_ylabel("wall time per 2e-4 s of model time (ms)")
     right.set_ylabel("peak memory a rank (GiB)")

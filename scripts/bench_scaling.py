@@ -37,7 +37,7 @@ def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
         raise RuntimeError(f"{task} on {ranks} ranks took more than {PATIENCE} s") from error
     if ended.returncode:
         raise RuntimeError(f"{task} on {ranks} ranks failed: {ended.stderr.strip()[-2000:]}")
-    # From the last line, since libraries may print before it.
+    # The measures are on the last line, because libraries may print before it.
     return json.loads(ended.stdout.strip().splitlines()[-1])
 
 
@@ -49,7 +49,7 @@ def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
     rows = []
     for engine in engines():
         for n in cells:
-            # From 30,000 cells on its time is in proportion to the cells.
+            # The time of ts is in proportion to the cells from 30,000 cells on.
             if engine == "ts" and n > MOST_TS_CELLS:
                 continue
             try:
@@ -102,7 +102,7 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
             if turn == 0:
                 # The warm-up loads the compiled kernels, for which a hundredth of a second of motion is enough.
                 overrides.append("time.end=0.01")
-            # With force, since all rounds use one folder.
+            # All rounds use one folder, and must replace its results.
             result = simulate(Case.load(overrides=overrides), folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
             if turn:
                 found.append(result.statistics["cpu_seconds"])

@@ -90,7 +90,7 @@ def _whole_programs(rows: list[dict[str, Any]]) -> list[Target]:
 
 def _studies(found: dict[str, Any]) -> list[Target]:
     """CPU time of a sweep's member, and of the whole paper."""
-    # What a member of either kind took when targets were set. The two largest stages of the paper are sweeps of them.
+    # Targets by kind: the seconds of a member when targets were set. The paper's two largest stages are such sweeps.
     most = {"four-band": 0.35, "diatomic": 0.25}
     measured = []
     for kind, seconds in found.get("members", {}).items():

@@ -1,4 +1,4 @@
-"""What the bench runs under mpirun: ``bench_worker.py flight|build|large JSON``; rank 0 prints its measures as JSON."""
+"""Measurements of the bench under mpirun: ``bench_worker.py flight|build|large JSON``; rank 0 prints a line of JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import petsc4py
 
-# Without PETSc's handlers a failure ends as an exception of Python, of which the bench reports the last lines.
+# PETSc's signal handlers are left out: a failure is then an exception of Python, whose last lines the bench reports.
 petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI

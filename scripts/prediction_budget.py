@@ -116,8 +116,8 @@ class Budget:
         network = self.network
         waves = [_at(network.time, burst.time, row) for row in arriving]
         on = np.zeros((len(waves), len(network.time)), bool)
-        # As in the prediction, contact goes on between impacts that follow each other: each one is extended by half a
-        # period of the drive before and behind, in which a site touches on both sides.
+        # As in the prediction, contact lasts from one impact to the next: each impact is extended, before and after, by
+        # half a period of the drive, in which a site touches on both sides.
         period = 2 * np.pi / burst.drive
         impacts = (run[f"impacts/{name}"].values for name in ("site", "onset", "separation"))
         for site, onset, separation in zip(*impacts, strict=True):

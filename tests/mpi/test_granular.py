@@ -80,6 +80,7 @@ def digest(comm: MPI.Comm, table: dict) -> tuple | None:
 @pytest.mark.parallel([1, 2, 3])
 @pytest.mark.parametrize("table", [CHAIN, RING])
 def test_contacts_between_cells_of_two_ranks_have_the_bits_of_one(table):
+    """Fields, impacts, energies, switches and steps of a run on all ranks are those of a run on one rank."""
     comm = MPI.COMM_WORLD
     together = digest(comm, table)
 

@@ -84,6 +84,7 @@ def fail(*arguments, **options):
 
 @pytest.mark.parallel([2, 3])
 def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
+    """An error of a helping rank is raised on all ranks, and the rank takes part in the next request."""
     if COMM.rank == COMM.size - 1:
         monkeypatch.setattr(registry, "draw", fail)
 

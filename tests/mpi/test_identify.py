@@ -79,6 +79,7 @@ def whole(plan, tmp_path_factory):
 
 @pytest.mark.parallel([1, 2])
 def test_the_result_does_not_depend_on_the_ranks(folder, plan, whole):
+    """A fit from two starts on all ranks has the bits of a fit on one rank."""
     text = run_identification(plan, folder, MPI.COMM_WORLD)
     assert "clearance 1" in text
     assert "2 starts" in text
@@ -88,6 +89,7 @@ def test_the_result_does_not_depend_on_the_ranks(folder, plan, whole):
 
 @pytest.mark.parallel([1, 2])
 def test_a_stopped_identification_goes_on(folder, plan, whole):
+    """A fit that is stopped and resumed has the bits of an uninterrupted one."""
     with pytest.raises(StoppedError):
         run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAfter(30))
     assert not (folder / "identified.h5").exists()

@@ -15,6 +15,7 @@ MODE = {"kind": "mode", "number": 40, "energy": 0.5}
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize(("initial", "ends"), [(PACKET, "periodic"), *on_two((PACKET, "fixed"), (MODE, "free"))])
 def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, ends):
+    """A packet or a mode that closes contacts on both sides of a border evolves alike on any number of ranks."""
     # 24 cells are cut after cell 12 on 2 ranks, and after cells 8 and 16 on 3.
     case = small_case(
         lattice={"ends": ends},

@@ -13,6 +13,7 @@ from vipetsc.studies.one_site import make_law
 
 @pytest.mark.parallel([2])
 def test_law_is_the_same_on_any_number_of_ranks(folder):
+    """Two ranks write the same datasets as one."""
     comm = MPI.COMM_WORLD
     # Each point is the mean of two runs, and must not depend on which rank computed them.
     case = law_case(law=COARSE | {"samples": 2})

@@ -26,6 +26,7 @@ def three_cells(**nnm) -> NnmCase:
 
 @pytest.mark.parallel([1, 2])
 def test_same_bits_on_every_number_of_ranks(folder):
+    """Branches on one rank each have the files of branches on a single rank, and rank 0 gets all of them."""
     comm = MPI.COMM_WORLD
     case = three_cells()
     branches = follow_all(case, folder, comm)

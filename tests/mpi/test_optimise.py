@@ -42,6 +42,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parallel([1, 2, 3])
 @pytest.mark.parametrize("team", [*on_two(1), 2])
 def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
+    """A search on all ranks, each alone or in teams of two, has the bits of a search on one rank."""
     text = run_search(plan(f"optimise.ranks={team}"), folder, MPI.COMM_WORLD)
 
     assert "14 designs" in text
@@ -51,6 +52,7 @@ def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
 
 @pytest.mark.parallel([2])
 def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
+    """A search for two objectives on two ranks has the bits of a search on one rank."""
     case = plan(TWO, "optimise.population=6")
     alone = found_by_one_rank(case, tmp_path_factory.mktemp("alone"))
     run_search(case, folder, MPI.COMM_WORLD)
@@ -63,6 +65,7 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
 # The search stops at its first look at the request, or after some designs.
 @pytest.mark.parametrize("looks", [1, 12])
 def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
+    """A request to stop on one rank ends the search on all; the resumed search has the bits of an unstopped one."""
     comm = MPI.COMM_WORLD
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
 

@@ -42,6 +42,7 @@ def runs_alike(folder: Path, case: Case) -> None:
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 @pytest.mark.parametrize("law", [*on_two("hertz"), "bilinear"])
 def test_same_bits_with_sites_on_the_borders(folder, ends, law):
+    """A run by ``ts`` with sites on both sides of every border has the same bits on any number of ranks."""
     # 24 cells are cut after cell 12 on 2 ranks, after 8 and 16 on 3, and after 6, 12 and 18 on 4.
     sites = [6, 7, 12, 13, 16, 17]
     case = small_case(lattice={"ends": ends}, contacts={"law": law, "sites": sites}, time={"end": 0.03})
@@ -61,6 +62,7 @@ def test_same_bits_with_dashpots_in_cells_that_differ(folder, ends):
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_same_bits_with_springs_that_are_not_linear(folder, ends):
+    """A run with quadratic and cubic springs in every cell has the same bits on any number of ranks."""
     springs = [
         {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True, "quadratic": -1e7, "cubic": 1e10},
         {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 1e9},
@@ -77,6 +79,7 @@ def test_same_bits_with_springs_that_are_not_linear(folder, ends):
 
 @pytest.mark.parallel(2)
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
+    """A run of another cell, driven near the border of two ranks, has the same bits on any number of ranks."""
     table = {
         "lattice": {"preset": "diatomic", "cells": 31},
         "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
@@ -89,6 +92,7 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
 @pytest.mark.parallel([3, 4])
 @pytest.mark.parametrize("writer", ["gather", in_parallel])
 def test_ranks_without_cells_take_part(folder, writer):
+    """A lattice of fewer cells than ranks is simulated with the bits of one rank."""
     case = small_case(
         lattice={"cells": 2},
         contacts={"sites": [1, 2], "clearance": 5e-5},
@@ -101,6 +105,7 @@ def test_ranks_without_cells_take_part(folder, writer):
 @needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_parallel_writing_gives_the_gathered_file(folder):
+    """A file that two ranks write together has the bits of a gathered one, with every second cell of a window."""
     output = {"window": [3, 20], "every": 2, "stride": 3}
     for writer in ("gather", "parallel"):
         simulate(small_case(output=output | {"writer": writer}), folder / writer)
@@ -215,6 +220,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(
 
 @pytest.mark.parallel(2)
 def test_the_whole_builtin_run_has_the_same_bits(folder):
+    """The built-in run has the same bits on two ranks, and the recorded number of episodes at each site."""
     case = Case.load()
     comm = MPI.COMM_WORLD
 

@@ -13,6 +13,7 @@ from vipetsc.studies.prediction import predict
 
 @pytest.mark.parallel([2])
 def test_ranks_predict_the_same(folder):
+    """Predicted and simulated energies, and z, of two ranks equal those of one rank."""
     comm = MPI.COMM_WORLD
     case = prediction_case(
         lattice={"cells": 60},

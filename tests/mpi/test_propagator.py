@@ -13,6 +13,7 @@ from vipetsc.case import Case
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 @pytest.mark.parametrize("law", ["hertz", *on_two("bilinear")])
 def test_same_bits_with_clusters_across_borders(folder, ends, law):
+    """A run with clusters of sites across every border has the same bits on any number of ranks."""
     # 24 cells are cut after cell 12 on 2 ranks, after 8 and 16 on 3, and after 6, 12 and 18 on 4.
     case = small_case(
         lattice={"ends": ends},
@@ -47,6 +48,7 @@ def test_same_bits_with_dashpots(folder, disorder):
 
 @pytest.mark.parallel([2, 3])
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
+    """A run of another cell, driven near the border of two ranks, has the same bits on any number of ranks."""
     table = {
         "lattice": {"preset": "diatomic", "cells": 31},
         "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},

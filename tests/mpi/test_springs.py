@@ -19,5 +19,6 @@ SPRINGS = {
 @pytest.mark.parametrize("damping", [*on_two({}), {"mass": 30.0}])
 @pytest.mark.parametrize("engine", [*on_two("ts"), "propagator"])
 def test_same_bits_with_springs_across_borders(folder, engine, damping):
+    """Nonlinear springs between cells of two ranks act alike on any number of ranks, with dashpots and without."""
     lattice = {"profiles": SPRINGS, "damping": damping, "ends": "periodic"}
     runs_alike(folder, small_case(lattice=lattice, time={"end": 0.02, "engine": engine}))

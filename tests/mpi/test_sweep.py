@@ -66,6 +66,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parallel([1, 2, 3])
 @pytest.mark.parametrize("team", [1, 2])
 def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
+    """A sweep on all ranks, each alone or in teams of two, leaves the ensemble of one rank and no other files."""
     comm = MPI.COMM_WORLD
 
     result = run_sweep(sweep(f"sweep.ranks={team}"), folder, comm)
@@ -80,6 +81,7 @@ def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
 
 @pytest.mark.parallel([1, 2])
 def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
+    """A sample depends on its seed alone: not on the number of ranks, nor on the order of the seeds."""
     comm = MPI.COMM_WORLD
     table = tomllib.loads(TABLE) | {"contacts": {"sites": [4, 9], "clearance": 2e-4}}
     table |= {"disorder": {"clearance": {"relative": 0.05}}, "sweep": {"disorder": {"seed": {"count": 3}}}}
@@ -148,6 +150,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize(("team", "looks"), [*on_two((1, 1)), (2, 1)])
 def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
+    """A request to stop on one rank ends the sweep on all; the same command then completes it with the same bits."""
     comm = MPI.COMM_WORLD
     plan = sweep(f"sweep.ranks={team}")
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
@@ -181,6 +184,7 @@ def test_every_number_is_drawn_once():
 
 @pytest.mark.parallel([2])
 def test_after_a_request_on_one_rank_no_rank_begins_another_job():
+    """After a request to stop on one rank the pool gives no rank another job, nor the jobs of a later call."""
     comm = MPI.COMM_WORLD
     stop = StopRequest()
     pool = TaskPool(comm, MPI.COMM_SELF, stop)

@@ -32,6 +32,7 @@ def digest(comm, case):
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize("create", [sprung_case, bead_case, grains])
 def test_touching_contacts_have_the_bits_of_one_rank(engine, create):
+    """Motion, energies, impacts and landings of a run on all ranks are those of a run on one rank."""
     comm = MPI.COMM_WORLD
     case = create(engine)
     alone = digest(MPI.COMM_SELF, case) if comm.rank == 0 else None
