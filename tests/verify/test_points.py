@@ -1,4 +1,4 @@
-"""Named points and contact forces: motion and measures against the complex compliance, the law, the matrices."""
+"""Named points and contact forces, compared with the complex compliance, the contact law and the system's matrices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def shaken(engine: str) -> Case:
     table = {
         "lattice": {"cells": 24, "cell": DIATOMIC, "damping": {"mass": 60.0, "stiffness": 2e-5}},
         "drive": {"waveform": "harmonic", "amplitude": FORCE, "frequency": FREQUENCY, "cell": 2},
-        # Free vibrations have decayed by then to about 1e-8.
+        # By the end of the run free vibrations have decayed to about 1e-8.
         "time": {"end": 0.6, "engine": engine},
         "output": {"fields": [], "points": [BASE, TIP], "transmission": [["base", "tip"]]},
     }
@@ -50,14 +50,14 @@ def steady_run(request):
 
 
 def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
-    """In the steady state (K + i w C - w^2 M) U = F: amplitudes of all three quantities, and the transmission."""
+    """Steady amplitudes and transmission are those of (K + i w C - w^2 M) U = F, w |U| and w^2 |U|."""
     chain = Case.of(steady_run).model().chain
     stiffness = chain.stiffness_matrix().toarray()
     damping = chain.damping_rows(0, chain.cells).toarray()
     force = np.zeros(len(stiffness))
     force[2] = FORCE
     dynamic = stiffness + 1j * FREQUENCY * damping - FREQUENCY**2 * np.diag(chain.masses())
-    # Mass 1 of cell 2, mass 2 of cell 6.
+    # The rows are mass 1 of cell 2 and mass 2 of cell 6.
     expected = np.abs(np.linalg.solve(dynamic, force))[[2, 11]]
 
     measured = analyse(steady_run)
@@ -72,7 +72,7 @@ def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
 
 def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
     """A drift above the tolerance, or a record too short for three windows, gives NaN and a sentence."""
-    # Below rounding: no record meets it.
+    # A tolerance below rounding is met by no record.
     strict = AnalysisTable.model_validate({"steady_tolerance": 1e-14})
     measured = analyse(steady_run, ["motion"], options=strict)
     assert np.isnan(measured["steady_velocity/tip"])
@@ -80,12 +80,12 @@ def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
     assert 1e-14 < measured["steady_drift/tip"] < 1e-5
     assert "more than 1e-14" in json.loads(measured.attrs["warnings"])[-1]
 
-    # The ramp takes 10 periods, and three windows of 10 follow: 40 periods are 0.279 s.
+    # The ramp takes 10 periods, and three windows of 10 periods follow: 40 periods are 0.279 s, or 1396 samples.
     short = analyse(steady_run.isel(time=slice(0, 1350)), ["motion"])
     assert np.isnan(short["steady_velocity/tip"])
     assert np.isnan(short["steady_drift/tip"])
     long = analyse(steady_run.isel(time=slice(0, 1450)), ["motion"])
-    # Free vibrations after the ramp are still there in the first window.
+    # The first window still contains free vibrations that the ramp excited.
     assert 0.01 < long["steady_drift/tip"] < 0.1
     assert np.isnan(long["steady_velocity/tip"])
     # Shorter windows fit into the same record.
@@ -96,7 +96,7 @@ def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
 
 
 def test_peak_and_rms_are_those_of_the_samples(steady_run):
-    """Of the samples; the rms of the steady part alone is the amplitude over the root of two."""
+    """Peak and rms are those of all samples; the rms of the steady part alone is the amplitude over sqrt(2)."""
     measured = analyse(steady_run, ["motion"])
     velocity = steady_run["points/velocity"].sel(point="tip").values
 
@@ -107,14 +107,17 @@ def test_peak_and_rms_are_those_of_the_samples(steady_run):
 
 
 def test_transmission_by_part_is_that_of_each_frequency():
-    """Cosines of the transform itself fall into one part each; a part without the source has no value."""
+    """Transmission by part is the ratio of receiver and source in each part of the spectrum, NaN without a source.
+
+    Cosines of the cosine transform itself fall into one part each.
+    """
     count = 400
-    # At the middles of samples, where the cosine transform has its nodes.
+    # The cosine transform has its nodes at the middles of samples.
     phase = np.pi * (np.arange(count) + 0.5) / count
     interval = 1e-3
     frequencies = np.pi * np.array([20, 60]) / (count * interval)
     source = np.cos(20 * phase) + 3 * np.cos(60 * phase)
-    # Half of the one tone, twice of the other in antiphase.
+    # The receiver has half of the one tone, and twice the other in antiphase.
     receiver = 0.5 * np.cos(20 * phase) - 6 * np.cos(60 * phase)
     edges = [0.0, 0.5 * frequencies.sum(), 2 * frequencies[1], np.inf]
 
@@ -122,7 +125,7 @@ def test_transmission_by_part_is_that_of_each_frequency():
 
     assert parts[:2] == pytest.approx([0.5, 2.0], rel=1e-12)
     assert np.isnan(parts[2])
-    # A tone that is cut where it is fast is in all parts; where it fades out, what is weak there is seen.
+    # A tone that is cut off while it moves leaks into all parts. Where it fades out instead, weak tones are resolved.
     tone = np.cos(20.37 * phase)  # without a kink at its beginning
     weak = 0.01 * np.cos(60 * phase)
     cut = histories.transmission_by_part(tone + weak, tone + 2 * weak, interval, edges)
@@ -130,11 +133,11 @@ def test_transmission_by_part_is_that_of_each_frequency():
     assert cut[1] < 1.5
     assert faded[:2] == pytest.approx([1.0, 2.0], rel=0.02)
 
-    # The parts' mean squares add up to that of the record.
+    # The transmission of the whole is the ratio of root mean squares, which sum over the tones.
     assert histories.transmission(source, receiver) ** 2 == pytest.approx((0.25 + 4 * 9) / 10, rel=1e-12)
 
 
-# Every mass of cells with and without a site, at an end, of a driven mass.
+# Points at masses of cells with and without a site, at both ends, and at the driven mass.
 PLACES = [(1, 1), (6, 1), (6, 2), (6, 3), (6, 4), (12, 2), (13, 3), (24, 4)]
 POINTS = [{"name": f"c{cell}m{mass}", "cell": cell, "mass": mass} for cell, mass in PLACES]
 COLUMNS = [4 * (cell - 1) + mass - 1 for cell, mass in PLACES]
@@ -144,7 +147,7 @@ LAWS = {"law": "hertz", "sites": [6, 12, 13], "restitution": 0.7}
 
 @pytest.fixture(scope="module", params=["ts", "propagator"])
 def impacts(request):
-    """A short run with impacts at three sites, ten samples a contact or more, with all fields."""
+    """A short run by either engine with impacts at three sites, ten samples or more in each, and all fields."""
     case = small_case(
         lattice={"damping": {"mass": 5.0, "stiffness": 1e-6}},
         contacts=LAWS,
@@ -157,7 +160,7 @@ def impacts(request):
 
 
 def test_the_force_is_the_law_at_the_samples(impacts):
-    """F = side k x^n (1 + c w'/w'_minus) within episodes, 0 outside; its largest sample is not above the log's."""
+    """The force is side k x^n (1 + c w'/w'_minus) within episodes and 0 outside; the log has the largest one."""
     model = Case.of(impacts).model()
     law = model.contact
     time = impacts["time"].values
@@ -171,7 +174,7 @@ def test_the_force_is_the_law_at_the_samples(impacts):
     log = {name: impacts[f"impacts/{name}"].values for name in ("site", "side", "onset", "separation", "force")}
     log["approach"] = impacts["impacts/approach_velocity"].values
     for k, site in enumerate(log["site"] - 1):
-        # Negated, since a contact that has not ended has NaN, which is not above any time.
+        # The comparison is negated for contacts that have not ended, whose separation is NaN.
         inside = (time >= log["onset"][k]) & ~(time > log["separation"][k])
         side = log["side"][k]
         x = side * motion["displacement"][inside, site] - model.chain.clearances[site]
@@ -180,23 +183,23 @@ def test_the_force_is_the_law_at_the_samples(impacts):
 
     largest = log["force"].max()
     assert np.abs(force - expected).max() < 1e-8 * largest
-    # A force of zero would agree with a law that is never evaluated.
+    # The comparison would hold trivially if the law were never evaluated.
     assert np.count_nonzero(force) > 100
-    # Samples miss the largest force of an impact, by little where they are this fine.
+    # The largest sample is a little below the largest force of an impact, as samples are this fine.
     sampled = np.abs(force).max()
     assert 0.95 * largest < sampled <= largest * (1 + 1e-9)
     assert float(analyse(impacts, ["motion"])["largest_force"]) == largest
 
 
 def test_the_acceleration_is_that_of_the_equation_of_motion(impacts):
-    """M a = drive - K u - C v + contacts with the assembled matrices, at every point and sample."""
+    """Accelerations satisfy M a = drive - K u - C v + contacts with assembled matrices, at every point and sample."""
     model = Case.of(impacts).model()
     chain = model.chain
     samples = impacts.sizes["time"]
     u = impacts["displacement"].values.reshape(samples, -1)
     v = impacts["velocity"].values.reshape(samples, -1)
     total = -(chain.stiffness_matrix() @ u.T).T - (chain.damping_rows(0, chain.cells) @ v.T).T
-    # By a formula of this test's own.
+    # The drive's force is computed by a formula of this test's own.
     total[:, 0] += [_burst(model.drive, t) for t in impacts["time"].values]
     for column, site in enumerate(chain.sites):
         force = impacts["sites/force"].values[:, column]
@@ -210,7 +213,7 @@ def test_the_acceleration_is_that_of_the_equation_of_motion(impacts):
 
 
 def _burst(drive, t: float) -> float:
-    """Eq. (3) of the paper."""
+    """The force in N of the tone burst at time ``t`` in s, by eq. (3) of the paper."""
     if not 0 < t < drive.duration:
         return 0.0
     phase = drive.frequency * t
@@ -221,7 +224,7 @@ CUBIC_SPRINGS = [
     {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True, "quadratic": -1e7, "cubic": 1e10},
     {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 1e9},
 ]
-# Springs that are not linear, on a ring; beads that are pressed together and never part.
+# RING has nonlinear springs. BEADS are pressed together and never part.
 RING = {
     "lattice": {"cell": DIATOMIC | {"springs": CUBIC_SPRINGS}, "cells": 9, "ends": "periodic"},
     "drive": {"amplitude": 20.0, "cycles": 4, "frequency": 500.0, "cell": 9},
@@ -249,13 +252,13 @@ BEADS = {
 
 @pytest.mark.parametrize("table", [RING, BEADS], ids=["ring", "beads"])
 def test_velocities_change_by_the_accelerations(table):
-    """Simpson's rule of the acceleration gives the change of the velocity, with what forces are not in matrices."""
+    """The integral of the acceleration by Simpson's rule is the change of velocity, also with nonlinear forces."""
     run = run_of(Case.from_table(table))
     a = run["points/acceleration"].values
     v = run["points/velocity"].values
     dt = float(run["time"][1])
 
-    # Of fourth order: at these intervals 1e-6 of the velocity is left.
+    # The error of Simpson's rule, of fourth order, is 1e-6 of the velocity at these intervals.
     change = dt / 3 * (a[:-2] + 4 * a[1:-1] + a[2:])
     # Every point moves.
     assert np.abs(a).max(axis=0).min() > 0
@@ -263,10 +266,10 @@ def test_velocities_change_by_the_accelerations(table):
 
 
 def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypatch):
-    """A window and strides leave the points' bits; points leave those of all else; a stopped run has the same."""
+    """Records of points do not change with a window and strides, nor other records with points, nor any by a stop."""
     time = {"end": 0.03, "engine": "propagator"}
     whole = small_case(time=time, output=IMPACTS["output"])
-    # Points out of the window and between its cells are recorded all the same.
+    # Points outside the window and between its cells are recorded as well.
     thin = small_case(time=time, output=IMPACTS["output"] | {"window": [3, 15], "every": 3, "stride": 4})
     plain = small_case(time=time)
     for name, case in (("whole", whole), ("thin", thin), ("plain", plain)):
@@ -281,7 +284,7 @@ def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypa
     }.items()
 
     assert np.count_nonzero(runs["whole"]["sites/force"]) > 0
-    # Several chunks, so that the run is stopped between two of them.
+    # With several chunks the run can be stopped between two of them.
     monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 40)
     assert simulate(whole, tmp_path / "stopped", stop=StopAt(2)).resumable
     assert simulate(whole, tmp_path / "stopped").complete
@@ -289,7 +292,7 @@ def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypa
 
 
 def test_export_writes_histories_forces_and_numbers(tmp_path):
-    """CSV with a column for each point and site, every digit, and a table of all numbers of the run."""
+    """Exported CSV files have a column for each point and site with every digit, and a table of all measures."""
     case = small_case(
         time={"end": 0.02, "engine": "propagator"}, output=IMPACTS["output"] | {"transmission": [["c1m1", "c6m2"]]}
     )

@@ -1,4 +1,4 @@
-"""Sites composed from the answer of one: limits, energy, order, first contact, resuming, bad input."""
+"""Predictions composed of the response of single sites: limits, energy, first contact, resuming and bad input."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
 
-# Two ramps that meet: its spectrum is smooth and lies within the band.
+# The two ramps of this chirp meet, so that its spectrum is smooth and lies within the band.
 CHIRP = {"waveform": "chirp", "bandwidth": 300.0, "duration": 0.09, "ramp": 0.045}
 
 
 def pulse_case(drive: dict[str, Any], **sections: dict[str, Any]) -> PredictCase:
-    """The small case with a ``drive`` of another waveform in the place of the burst, at the same frequency."""
+    """The small case with another waveform than a burst, at the same frequency; ``drive`` updates [drive]."""
     wave = {key: value for key, value in PREDICTION["drive"].items() if key != "cycles"}
     return PredictCase.from_table(with_sections(PREDICTION | {"drive": wave | drive}, sections))
 
@@ -40,13 +40,13 @@ class Prediction(NamedTuple):
     data: xr.Dataset
 
     def records(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """The record of the linear run, and those of one site alone; tests may change them."""
+        """New copies of the record of the linear run, and of those of one site alone."""
         records = [record for record, _ in read_records(self.folder / "prediction-runs.jsonl", pytest.fail)]
         linear = next(record for record in records if record["kind"] == LINEAR)
         return linear, [record for record in records if record["kind"] == SITE]
 
     def site(self) -> SiteResponse:
-        """What one site does to the waves that meet it."""
+        """The response of one site to the waves that meet it, by the records."""
         _, answers = self.records()
         frequency = self.case.model().drive.frequency
         [kind] = self.case.kinds.kinds
@@ -56,14 +56,14 @@ class Prediction(NamedTuple):
 
 @pytest.fixture(scope="module")
 def prediction(tmp_path_factory) -> Prediction:
-    """A small prediction, for which all runs were simulated."""
+    """A small prediction together with the simulations that it is compared with."""
     folder = tmp_path_factory.mktemp("prediction")
     case = prediction_case()
     return Prediction(folder, case, predict(case, folder))
 
 
 def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[str, Any]]) -> xr.Dataset:
-    """The prediction of a case from these records, without simulations to compare with."""
+    """The prediction of a case from records of a linear run and of one site, without simulations to compare with."""
     return composed(case, Records(linear, [answers], [], answers[0]["largest"]))
 
 
@@ -72,10 +72,10 @@ def test_energy_is_whole_and_no_fraction_is_negative(prediction):
     data = prediction.data
 
     predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
-    # What is neither in a band nor dissipated would be missing from the sum.
+    # Predicted energy is in bands or dissipated, and nowhere else.
     np.testing.assert_allclose(predicted, 1, atol=1e-12)
     assert float(data["predicted/bands"].min()) >= 0
-    # At the end of a simulation the contacts hold a little.
+    # A little energy is in the contacts at the end of a simulation.
     simulated = data["simulated/bands"].sum("band") + data["simulated/dissipated"]
     np.testing.assert_allclose(simulated, 1, atol=5e-3)
 
@@ -90,7 +90,7 @@ def test_below_the_onset_the_run_is_linear(prediction):
 
 
 def test_the_small_prediction_is_near_the_simulation(prediction):
-    """Nothing is fitted: upper bands are met within 0.15 decades, what is dissipated within 0.05 of the energy."""
+    """The prediction, which fits nothing, errs by less than 0.15 decades in upper bands and 0.05 in the loss."""
     data = prediction.data
 
     assert data.attrs["rms_upper"] < 0.15
@@ -102,10 +102,10 @@ def test_the_small_prediction_is_near_the_simulation(prediction):
 @pytest.mark.parametrize(("factor", "touches"), [(0.9999, False), (1.0001, True)])
 def test_the_first_contact_is_exact(prediction, factor, touches):
     table = prediction.case.model_dump(by_alias=True, exclude_none=True)
-    # A case has no sections of other verbs.
+    # The table of a run has no sections of other verbs.
     del table["law"]
     del table["predict"]
-    # 1e-4 below and above the predicted onset.
+    # The amplitude is 1e-4 below or above the predicted onset.
     table["drive"]["amplitude"] = factor * prediction.data.attrs["onset_amplitude"]
 
     _, result = simulated(Case.from_table(table))
@@ -114,30 +114,30 @@ def test_the_first_contact_is_exact(prediction, factor, touches):
 
 
 def test_one_site_alone_is_what_its_run_gave(prediction):
-    """In a lattice from whose ends nothing returns energies are those of the run of one site at the same z."""
+    """The energies composed for a single site are those of its run at the same z, if nothing returns from the ends."""
     _, answers = prediction.records()
     clearance = prediction.case.law.clearance
     site = prediction.site()
     contacts = {"sites": [200], "clearance": [clearance]}
-    # So long that no wave comes back from its ends within the run.
+    # The lattice is so long that no wave comes back from its ends within the run.
     long = prediction_case(lattice={"cells": 400}, contacts=contacts, time={"end": 0.75})
     network = Network(long.model())
 
-    # Points above the onset, over the whole range of z.
+    # The points lie above the onset and cover the whole range of z.
     for record in answers[6::4]:
         amplitude = record["z"] * clearance / np.abs(network.linear).max()
         outcome = network.compose(amplitude, SiteResponses((site,), np.zeros(1, int)))
-        # Totals are sums over samples of powers: lost, then by band.
+        # Totals are sums of powers over samples: the power lost, then those by band.
         lost, *into = np.array(record["totals"]) * prediction.case.model().sample_interval
         assert outcome.dissipated == pytest.approx(lost, rel=0.2)
         assert outcome.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
 
 
 def test_without_loss_nothing_is_lost(prediction):
-    """Records of r = 1 dissipate nothing, and neither does what is composed of them."""
+    """A prediction composed of records without loss has no loss."""
     linear, answers = prediction.records()
     for record in answers:
-        # Row 6 has the powers that are lost.
+        # Row 6 of the sums has the lost powers.
         record["sums"][6] = [0.0] * BINS
         record["totals"][0] = 0.0
 
@@ -149,7 +149,7 @@ def test_without_loss_nothing_is_lost(prediction):
 
 def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
     linear, answers = prediction.records()
-    # The same lattice with its sites in another order.
+    # This lattice is the same, with its sites in another order.
     swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
 
     first = composed_from(prediction.case, linear, answers)
@@ -180,9 +180,9 @@ def test_a_site_that_nothing_reaches_changes_nothing(prediction):
     ids=["two restitutions", "one-sided", "ground", "next cell"],
 )
 def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path):
-    """Nothing is fitted: the bounds are those of the small prediction.
+    """Sites with laws or pairs of their own are predicted within the bounds of the small prediction.
 
-    The loss at one-sided stops is predicted worse, by 0.083 of the work: its bound is twice the other.
+    The loss at one-sided stops errs by 0.083 of the work, so that its bound is twice as large.
     """
     amplitudes = {"amplitudes": [30.0, 120.0]}
     data = predict(prediction_case(contacts={"restitution": 0.7} | contacts, predict=amplitudes), tmp_path)
@@ -193,7 +193,7 @@ def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path)
 
 
 def test_equal_values_in_lists_are_one_kind(prediction):
-    """The same kind, and the same bits of what is composed, as with one value for all sites."""
+    """A list of equal values gives the same kind of site, and the same bits, as one value for all sites."""
     linear, answers = prediction.records()
     restitution = prediction.case.contacts.restitution
     listed = prediction_case(contacts={"each": {"restitution": [restitution] * 2}})
@@ -201,13 +201,13 @@ def test_equal_values_in_lists_are_one_kind(prediction):
 
     data = composed_from(listed, linear, answers)
 
-    # To the bit: a list of equal values is no other lattice.
+    # The bits are equal, since a list of equal values describes the same lattice.
     np.testing.assert_array_equal(data["predicted/bands"], prediction.data["predicted/bands"])
 
 
 def test_contact_goes_on_until_release():
     """Contact begins above z = 1 and ends where z falls below the release, which differs from site to site."""
-    # Up through the onset, down through either release, and up again without reaching the onset.
+    # z rises through the onset, falls through both releases, and rises again without reaching the onset.
     z = np.array([[0.9, 1.1, 0.9, 0.41, 0.39, 0.9]] * 2)
 
     is_in_contact = in_contact(z, np.array([0.4, 0.6]))
@@ -217,7 +217,10 @@ def test_contact_goes_on_until_release():
 
 
 def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
-    """Records hold it, and the response interpolates it over the largest z; without contacts it is the onset."""
+    """A record's release is the z at which its last contact ended, and the response interpolates it over the largest z.
+
+    Without contacts the release is the onset.
+    """
     _, answers = prediction.records()
     assert all(0 < record["release"] < 1 for record in answers[4:])
 
@@ -229,7 +232,7 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
 def test_finished_runs_are_not_repeated(prediction, tmp_path, monkeypatch):
     (tmp_path / "prediction-runs.jsonl").write_bytes((prediction.folder / "prediction-runs.jsonl").read_bytes())
     (tmp_path / "case.toml").write_text(prediction.case.to_toml())
-    # Any run at all fails the test.
+    # The test fails if any run is started.
     monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was started"))
 
     again = predict(prediction.case, tmp_path)
@@ -267,20 +270,20 @@ def test_what_cannot_be_predicted_is_refused_before_any_run(sections, key):
 
 @pytest.mark.slow
 def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
-    """A wall moved by U acts as a force k U on the mass next to it; amplitudes are in m."""
+    """A wall moved by U acts as a force k U on the mass next to it, and its wave is predicted as simulated."""
     moved = prediction_case(
         contacts={"restitution": 0.7}, drive={"end": "left"}, predict={"amplitudes": [5e-4, 2e-3], "points": 16}
     )
     model = moved.model()
     [spring] = model.drives
-    # The same force on the same mass, without the wall.
+    # The same force acts on the same mass, without the wall.
     forced = prediction_case(contacts={"restitution": 0.7}, drive={"cell": 1, "mass": spring.mass + 1})
     np.testing.assert_allclose(Network(model).linear, spring.stiffness * Network(forced.model()).linear, rtol=1e-12)
 
     data = predict(moved, tmp_path)
 
     assert data["amplitude"].attrs["units"] == "m"
-    # The first contact is exact: one amplitude lies below, one above.
+    # One amplitude lies below the predicted onset of contact, one above.
     assert (data["simulated/contact_episodes"].values > 0).tolist() == [False, True]
     assert 5e-4 < data.attrs["onset_amplitude"] < 2e-3
     assert data.attrs["rms_upper"] < 0.15
@@ -288,7 +291,7 @@ def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
 
 
 def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
-    """The envelopes at the sites, at their main frequency, are the motion of a run without contacts."""
+    """Envelopes at the sites, times the oscillation at their main frequency, are the motion of a linear run."""
     case = pulse_case(CHIRP)
     network = Network(case.model())
     run, _ = simulated(case.varied(contacts=NO_SITES, drive={"amplitude": 1.0}))
@@ -296,7 +299,7 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
     time = network.time[network.during]
     for site, envelope in zip(case.model().chain.sites, network.linear, strict=True):
         u = run["displacement"].values[:, site]
-        # The network has times of its own, between the run's samples.
+        # The network's times lie between the samples of the run.
         w = CubicSpline(run["time"].values, u[:, cell.resonator] - u[:, cell.host])(time)
         predicted = (envelope[network.during] * np.exp(1j * network.om * time)).real
         np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
@@ -324,17 +327,17 @@ def test_a_chirp_is_predicted_as_simulated(tmp_path):
 
 @pytest.mark.slow
 def test_a_ring_is_predicted_as_simulated(tmp_path):
-    """Over one passage of the wave; the linear wave is the same wherever on the ring the drive is."""
+    """A ring is predicted over one passage of the wave; the linear wave is the same wherever the drive is."""
     amplitudes = {"amplitudes": [30.0, 120.0]}
     ring = {"lattice": {"ends": "periodic"}, "contacts": {"restitution": 0.7}}
     case = prediction_case(**ring, predict=amplitudes)
-    # On the ring turned by half, the drive sends its wave over the joint.
+    # The ring is turned by half, so that the drive sends its wave over the joint.
     turned = ring | {"contacts": {"restitution": 0.7, "sites": [10, 100], "clearance": [1.8e-3, 2e-3]}}
     beyond = prediction_case(**turned, drive={"cell": 61}, predict=amplitudes)
     np.testing.assert_allclose(
         Network(beyond.model()).linear, Network(case.model()).linear[::-1], rtol=1e-9, atol=1e-12
     )
-    # Until the wave has gone round the ring is a lattice without ends.
+    # Until the wave has gone round, the ring acts as a lattice without ends.
     assert not any("second time" in text for text in case.warnings())
     assert any("second time" in text for text in prediction_case(**ring, time={"end": 1.0}).warnings())
 

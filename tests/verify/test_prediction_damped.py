@@ -1,4 +1,4 @@
-"""Predictions of lattices with dashpots and absorbing ends: what is left of waves, and where the rest goes."""
+"""Predictions of lattices with dashpots and absorbing ends: the energy left in waves, and where the rest goes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ EVEN = np.full((4, BINS), 1 / BINS)
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_elimination_agrees_with_waves_and_with_modes(ends):
-    """Equal cells without dashpots as with Bloch waves, an absorbing end as with damped modes; one contact grounded."""
+    """Compliances by elimination are those of Bloch waves, and with an absorbing end those of damped modes.
+
+    One of the two contacts is with the ground.
+    """
     cell = prediction_case().lattice.unit_cell()
     pairs = (Pair(1, 2), Pair(-1, 2))
     omega = np.linspace(400, 3000, 7) - 4j
@@ -43,7 +46,7 @@ def test_elimination_agrees_with_waves_and_with_modes(ends):
 
 
 def test_rays_fade_at_the_rate_of_dashpots_to_ground():
-    """Dashpots of c m on every mass m take exp(-c t) of the energy, of every band, wherever it was sent."""
+    """Dashpots of c m on every mass m leave exp(-c t) of the energy in every band after a time t."""
     model = prediction_case(lattice={"damping": {"mass": 3.0}}).model()
     time = np.linspace(0, model.end, 9)
 
@@ -56,7 +59,10 @@ def test_rays_fade_at_the_rate_of_dashpots_to_ground():
 
 
 def test_a_wave_is_absorbed_once_it_reaches_the_end():
-    """Half of it goes there at the group velocity; the other half comes later, back from the wall on the other side."""
+    """A wave loses its energy when it reaches the absorbing end at the group velocity.
+
+    Half of the energy goes there directly, the other half after a reflection at the wall on the other side.
+    """
     model = prediction_case(lattice={"absorbing": ABSORBING}, time={"end": 2.0}).model()
     kappa = 1.3
     speed = abs(float(bloch(model.chain.cell, kappa).group_velocity[BAND]))
@@ -73,7 +79,7 @@ def test_a_wave_is_absorbed_once_it_reaches_the_end():
 
 
 def test_absorbing_ends_take_the_whole_linear_wave():
-    """After long, all of the work: the power in the ends follows from compliance alone."""
+    """After a long time absorbing ends have taken all work of a linear wave, by their compliance."""
     case = prediction_case(lattice={"absorbing": ABSORBING}, time={"end": 0.8})
     network = Network(case.model())
     assert network.losses
@@ -92,7 +98,10 @@ def test_absorbing_ends_take_the_whole_linear_wave():
 
 
 def test_third_harmonics_in_the_band_of_the_drive_stay_in_it():
-    """What the driven wave gives to them alone changes no energy of a band that has both, but for weak dashpots."""
+    """Energy that a driven wave gives to its third harmonics in the same band leaves the band's energy as it is.
+
+    The dashpots are weak enough to be neglected.
+    """
     drive = {"band": None, "at": None, "frequency": 150.0, "cycles": 5}
     model = prediction_case(lattice={"damping": {"mass": 1e-6}}, drive=drive).model()
     network = Network(model)
@@ -117,7 +126,7 @@ def test_third_harmonics_in_the_band_of_the_drive_stay_in_it():
 
 @pytest.fixture(scope="module", params=["dashpots", "absorbing end"])
 def damped(request, tmp_path_factory):
-    """A prediction in a lattice with dashpots, or with an absorbing end, its folder, and whether it has an end."""
+    """The data and folder of a prediction with dashpots or with an absorbing end, and whether it has such an end."""
     lattice = {"damping": {"mass": 5.0}} if request.param == "dashpots" else {"absorbing": ABSORBING}
     folder = tmp_path_factory.mktemp("damped")
     case = prediction_case(lattice=lattice, contacts={"restitution": 0.7}, drive={"cycles": 10}, predict=AMPLITUDES)
@@ -126,7 +135,7 @@ def damped(request, tmp_path_factory):
 
 @pytest.mark.slow
 def test_dashpots_and_ends_take_what_they_take_in_the_run(damped):
-    """Nothing is fitted: bounds of bands and contacts are those without dashpots."""
+    """Losses in dashpots, ends and contacts are predicted as simulated, with the bounds of undamped lattices."""
     data, folder, has_end = damped
     for kind in ("predicted", "simulated"):
         total = data[f"{kind}/bands"].sum("band") + data[f"{kind}/dissipated"] + data[f"{kind}/dashpots"]

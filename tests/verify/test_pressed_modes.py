@@ -1,4 +1,4 @@
-"""Normal modes about contacts that are pressed at rest: exact periods, a chain of grains, orbits by SciPy."""
+"""Normal modes with contacts that are pressed at rest: exact periods, a chain of grains, and orbits by SciPy."""
 
 from __future__ import annotations
 
@@ -34,25 +34,26 @@ pytestmark = pytest.mark.parallel(1)
 MASS = 2.0
 SPRING = 3.0
 STOP = 40.0
-# In m, as the clearances: the contact opens where the mass has gone back by so much.
+# The depth in m to which the contact is pressed: it opens where the mass has moved back by as much.
 DEPTH = 0.1
 EXPONENTS = {"bilinear": 1.0, "hertz": 1.5}
 
 
 def potential(u: float, law: str) -> float:
-    """Energy in J of the spring, of a contact that is pressed by ``DEPTH`` at u = 0, and of its load."""
+    """Energy in J at ``u`` in m of the spring, of a contact pressed by ``DEPTH`` at u = 0, and of its static load."""
     n = EXPONENTS[law]
     stored = (max(u + DEPTH, 0.0) ** (n + 1) - DEPTH ** (n + 1)) / (n + 1)
     return SPRING * u**2 / 2 + STOP * (stored - DEPTH**n * u)
 
 
 def exact_period(energy: float, law: str) -> float:
-    """The period in s by quadrature of the potential, in pieces from where the contact opens."""
+    """The period in s at an ``energy`` in J: twice the integral of du/sqrt(2 (E - V(u))/m) between turning points."""
     reach = np.sqrt(2 * energy / SPRING) + 2 * STOP * DEPTH**2  # beyond both ends
     low, high = (brentq(lambda u: potential(u, law) - energy, 0.0, end, xtol=1e-16) for end in (-reach, reach))
 
     def time(begin: float, stop: float) -> float:
-        # u = begin + (stop - begin) sin^2 phi: the root of the speed at both ends leaves the integrand smooth.
+        # At a turning point the speed is a square root of the distance. With u = begin + (stop - begin) sin^2 phi the
+        # integrand is smooth there.
         def slowness(phi: float) -> float:
             u = begin + (stop - begin) * np.sin(phi) ** 2
             # Rounding may leave a negative kinetic energy at the ends.
@@ -61,7 +62,7 @@ def exact_period(energy: float, law: str) -> float:
 
         return quad(slowness, 0, np.pi / 2, epsabs=0, epsrel=1e-9, limit=200)[0]
 
-    # In two pieces, since the force is not smooth where the contact opens.
+    # The integral has two pieces, since the force is not smooth where the contact opens.
     if low < -DEPTH:
         return 2 * (time(low, -DEPTH) + time(-DEPTH, high))
     return 2 * time(low, high)
@@ -75,7 +76,7 @@ def pressed_mass(law: str, side: int = 1) -> System:
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_a_pressed_mass_has_its_exact_period(law):
-    """From the linear motion about rest on, through the opening of the contact, on either side of the mass."""
+    """A mass pressed to a stop on either side has its exact period, from small motions to beyond the opening."""
     slope = EXPONENTS[law] * STOP * DEPTH ** (EXPONENTS[law] - 1)
     opening = potential(-DEPTH, law)
     for side in (1, -1):
@@ -83,7 +84,7 @@ def test_a_pressed_mass_has_its_exact_period(law):
         # For small motions the contact is a spring of its slope at the depth.
         assert system.linear_modes()[0] == pytest.approx(np.sqrt((SPRING + slope) / MASS))
         problem = Shooting(Dop853Flow(system), MAPS["half"])
-        # Far below the energy at which the contact opens: the branch passes through it.
+        # The branch begins far below the energy at which the contact opens, and passes that energy.
         start = linear_start(problem, 0, opening / 100)
         steps = Continuation(problem, start, NnmTable(points=26, largest_step=0.3, first_step=0.1))
 
@@ -94,14 +95,14 @@ def test_a_pressed_mass_has_its_exact_period(law):
             assert point.period == pytest.approx(exact_period(point.energy, law), rel=1e-8)
             assert point.episodes == (point.energy > opening)
             last = point
-        # Well beyond, where the contact is open for most of the period.
+        # The branch ends well beyond, where the contact is open for most of the period.
         assert last.energy > 30 * opening
-        # Grazing once: the energy is that of the potential at the depth.
+        # The branch grazes once, at the potential energy at which the contact opens.
         assert [p.energy for p in opened] == pytest.approx([opening], rel=1e-10)
 
 
 def test_a_bilinear_contact_is_linear_until_it_opens():
-    """No folds of a linear branch: a contact of Hertz has them sought from the beginning on, a linear one has not."""
+    """Special points are looked for from the beginning of a branch with Hertz contacts, not on a linear one."""
     for law in ("hertz", "bilinear"):
         problem = Shooting(Dop853Flow(pressed_mass(law)), MAPS["half"])
         point = linear_start(problem, 0, potential(-DEPTH, law) / 100)
@@ -110,7 +111,7 @@ def test_a_bilinear_contact_is_linear_until_it_opens():
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_harmonic_balance_of_a_pressed_mass_has_its_exact_period(law):
-    """Mean and even harmonics, and the time without contact, are those of the potential."""
+    """Harmonic balance, with mean and even harmonics, has the exact period and opens the contact at its energy."""
     opening = potential(-DEPTH, law)
     _, points = condensed_branch(pressed_mass(law), 0, opening / 4, truncation=1e-6, points=14, largest_step=0.2)
     assert points[-1].energy > opening
@@ -133,7 +134,7 @@ GRAINS: dict[str, Any] = {
         "sites": [1, 1, 2, 3],
         "clearance": 0.0,
         "precompression": PRESSED,
-        # The left wall, two pairs of neighbours, and the right wall: those that approach each other press.
+        # The contacts are those at the left wall, of two pairs of neighbours, and at the right wall.
         "each": {
             "pair": [[0, 1], [1, 1], [1, 1], [0, 1]],
             "next_cell": [False, True, True, False],
@@ -145,14 +146,14 @@ GRAINS: dict[str, Any] = {
 
 
 def grain_forces(u: np.ndarray) -> np.ndarray:
-    """Forces in N on the beads of a chain of grains between walls, which a static force presses together."""
+    """Forces (bead,) in N on a chain of grains between walls, which are pressed together at rest, for ``u`` in m."""
     pressed = np.maximum(PRESSED - np.diff(u, prepend=0.0, append=0.0), 0.0) ** 1.5
     return GRAIN * (pressed[:-1] - pressed[1:])
 
 
 @pytest.fixture(scope="module")
 def grains():
-    """The branch of the second mode of a chain of grains, and its problem."""
+    """The shooting problem of a chain of grains, and the branch of its second mode."""
     case = NnmCase.from_table(GRAINS)
     problem = ShootingMethod(case, MPI.COMM_SELF).shooting
     start = linear_start(problem, 1, problem.system.grazing_energy(1) / 100)
@@ -160,21 +161,21 @@ def grains():
 
 
 def test_grains_have_the_modes_of_a_chain_of_springs(grains):
-    """Pressed grains are springs of the slope of Hertz's force: 2 sqrt(s/m) sin(n pi/(2 N + 2)) between walls."""
+    """Pressed grains are springs of the slope s of Hertz's force: omega_n = 2 sqrt(s/m) sin(n pi/(2 N + 2))."""
     problem, points = grains
     slope = 1.5 * GRAIN * np.sqrt(PRESSED)
     exact = 2 * np.sqrt(slope / BEAD) * np.sin(np.arange(1, BEADS + 1) * np.pi / (2 * BEADS + 2))
     assert problem.system.linear_modes()[0] == pytest.approx(exact, rel=1e-12)
-    # Towards small amplitudes the branch tends to it, by a tenth of the depth to 1 %.
+    # The branch tends to the mode at small amplitudes: at a tenth of the depth its frequency differs by at most 1 %.
     assert 2 * np.pi * points[0].frequency == pytest.approx(exact[1], rel=1e-2)
-    # Hertz's law is nonlinear at any amplitude: an orbit of the linearised chain would have the exact frequency.
+    # Hertz's law is nonlinear at any amplitude, so that the frequency is not exactly that of the linearised chain.
     assert points[0].frequency != pytest.approx(exact[1] / (2 * np.pi), rel=1e-5)
 
 
 def test_orbits_of_grains_return_by_scipy(grains):
-    """Before contacts open and after, an orbit comes back after its period by equations of its own."""
+    """Orbits return after their period in SciPy's integration of equations written here, before and after opening."""
     problem, points = grains
-    # Otherwise no contact would have opened, and half of the test be missing.
+    # Contacts have opened on the last orbit.
     assert points[-1].episodes >= 2
     for point in (points[4], points[-1]):
         start = np.append(point.x, 0 * point.x)
@@ -183,13 +184,13 @@ def test_orbits_of_grains_return_by_scipy(grains):
             (0.0, point.period),
             start,
             method="DOP853",
-            # An orbit that is unstable magnifies the integration's error within the period.
+            # An unstable orbit magnifies the errors of the integration within the period.
             rtol=1e-11,
             atol=1e-15,
         )
         end = motion.y[:, -1]
         assert np.abs(end[:BEADS] - point.x).max() < 1e-6 * np.abs(point.x).max()
-        # It starts from rest, and must be at rest again.
+        # The orbit starts from rest, and must be at rest again.
         kinetic = BEAD * end[BEADS:] @ end[BEADS:] / 2
         assert kinetic < 1e-10 * point.energy
     u, v = sample_orbit(problem, points[-1])
@@ -198,13 +199,13 @@ def test_orbits_of_grains_return_by_scipy(grains):
 
 
 def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
-    """Without any spring but the contacts, harmonic balance meets the orbits of shooting."""
+    """Harmonic balance in the contacts finds the orbits of shooting, in a chain without any other springs."""
     problem, _ = grains
     case = NnmCase.from_table(GRAINS | {"nnm": GRAINS["nnm"] | {"method": "condensed", "truncation": 1e-6}})
     condensed = Condensed.from_case(case)
     system = problem.system
     omega, shapes = system.linear_modes()
-    # Of 0.8 of the energy at which a contact opens: the next points pass it.
+    # The branch begins at 0.8 of the energy at which a contact opens, and its next points pass that energy.
     amplitude = np.sqrt(2 * 0.8 * system.grazing_energy(1)) / omega[1]
     start = condensed.motions.from_mode(system.contact_rows @ shapes[:, 1] * amplitude, float(omega[1]))
     point = [start, *Continuation(condensed.motions, start, case.nnm.model_copy(update={"points": 6}))][-1]
@@ -218,7 +219,10 @@ def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
 
 
 def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
-    """Its highest mode has omega = 2 sqrt(k/m) with k = (3/2) A d^(1/2), and neighbours move against each other."""
+    """The highest mode of a ring of grains has omega = 2 sqrt(k/m) with k = (3/2) A d^(1/2), neighbours in antiphase.
+
+    The elongations of a ring's contacts add up to zero, so that they are no independent coordinates.
+    """
     stiffness = 10.0
     depth = 0.01
     table = {
@@ -247,7 +251,7 @@ def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
 
 
 def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
-    """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u``."""
+    """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u`` (dof,) in m."""
     frame = problem.frame_at("relative", u, period, np.empty(0))
     # The amplitude is held, and the period is free.
     row = np.append(u / np.linalg.norm(u), 0.0)
@@ -269,12 +273,12 @@ SITES: dict[str, Any] = {
     },
     "nnm": {"system": "chain", "shooting": "krylov", "modes": [28], "tolerance": 1e-12},
 }
-# A frequency between the bands and the linear mode of a pressed site: that of a contact that opens.
+# The frequency in rad/s of a breather whose contact opens, between the bands and the linear mode of a pressed site.
 OPENING = 8000.0
 
 
 def test_the_state_at_rest_is_that_of_a_run():
-    """Stiffness, load and energy of small and large motions are those of runs."""
+    """At rest the stiffness of pressed contacts is that of a run, and forces and energy are zero."""
     nnm = System.from_case(NnmCase.from_table(SITES))
     time = {"end": 0.01, "sample_interval": 1e-4}
     drive = {"amplitude": 1.0, "frequency": 1000.0, "cycles": 3, "cell": 4}
@@ -287,7 +291,7 @@ def test_the_state_at_rest_is_that_of_a_run():
         row = np.zeros(nnm.dofs)
         row[[joint.host, joint.resonator]] = -1.0, 1.0
         rest -= joint.stiffness * np.outer(row, row)
-    # To the bit: both come from the same law at the same depth.
+    # The bits are equal: both stiffnesses come from the same law at the same depth.
     assert np.abs(rest).max() == 0
     assert np.all(nnm.forces(np.zeros(nnm.dofs)) == 0)
     assert nnm.energy(np.zeros(nnm.dofs), np.zeros(nnm.dofs)) == 0
@@ -295,7 +299,7 @@ def test_the_state_at_rest_is_that_of_a_run():
 
 @pytest.fixture(scope="module")
 def opening():
-    """The breather of the first site whose contact opens, by Bloch waves, and the dense system of its lattice."""
+    """The condensed problem, the breather of the first site, whose contact opens, and the lattice's dense system."""
     nnm = {"system": "condensed", "start_frequency": [OPENING], "truncation": 1e-6, "tolerance": 1e-11}
     case = NnmCase.from_table(SITES | {"nnm": nnm})
     condensed = Condensed.from_case(case)
@@ -304,7 +308,7 @@ def opening():
 
 
 def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
-    """By waves, by all modes with a spring in the place of the contact, and by shooting: one motion."""
+    """A breather by Bloch waves is the one by all modes of the lattice, and returns after its period in the flow."""
     condensed, point, system = opening
     assert point.episodes == 1
     by_modes = condensed_system(system, condensed.motions.control).in_gap(OPENING, np.array([1.0, 0.0]))
@@ -318,7 +322,7 @@ def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
 
 
 def test_shooting_without_matrices_finds_the_orbit_of_pressed_sites(opening):
-    """Variations pass the opening of a contact: the lattice is shot on all ranks as with dense matrices."""
+    """Shooting without matrices finds the orbit of dense shooting; its variations pass the opening of a contact."""
     condensed, point, system = opening
     lattice = LatticeMethod(NnmCase.from_table(SITES), MPI.COMM_SELF).lattice
     u = np.concatenate(list(state_of(condensed.motions, point, 2).values()))
@@ -333,17 +337,17 @@ def test_shooting_without_matrices_finds_the_orbit_of_pressed_sites(opening):
 
     flow = Dop853Flow(system)
     start = np.append(orbit.x, 0 * orbit.x)
-    # Velocities vary by the frequency more than displacements.
+    # Changes of velocities are larger by the frequency than those of displacements.
     change = np.random.default_rng(1).standard_normal(len(start)) * np.repeat([1.0, OPENING], len(u))
     moved = lattice.flow.gather(lattice.arc(orbit.x, orbit.period).move(lattice.flow.scatter(change[None])))[0]
     expected = flow.arc(start, orbit.period / 2, orbit.period).sensitivity @ change
-    # Displacements and velocities apart, since their sizes differ by a factor of 8,000.
+    # Displacements and velocities are compared separately, since their sizes differ by a factor of 8,000.
     for half in (slice(0, len(u)), slice(len(u), None)):
         assert np.abs(moved - expected)[half].max() < 1e-6 * np.abs(expected[half]).max()
 
 
 def test_a_stop_that_touches_among_pressed_ones_is_refused():
-    """About a contact that is open or pressed there are linear motions, about one that touches there are none."""
+    """A contact that just touches at rest is refused, as no motion about it is linear; others are accepted."""
 
     def with_clearances(clearances: list[float]) -> dict[str, Any]:
         each = {"precompression": [1e-4, 0.0]}

@@ -1,4 +1,4 @@
-"""The propagator against the time stepper, exact solutions and itself after a stop."""
+"""The propagator, compared with the time stepper, with exact solutions, and with itself after a stop."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from vipetsc.lattice.chain import Chain
 
 
 def with_engine(case: Case, engine: str, **time) -> Case:
-    """The same case with another engine; ``time`` updates its section."""
+    """The same case with an ``engine``; ``time`` updates the table [time]."""
     return case.model_copy(update={"time": case.time.model_copy(update={"engine": engine} | time)})
 
 
 def relative(difference: np.ndarray, whole: np.ndarray) -> float:
-    """Euclidean norm of a ``difference`` over that of the ``whole``."""
+    """The Euclidean norm of a ``difference``, divided by that of the ``whole``."""
     return float(np.linalg.norm(difference) / np.linalg.norm(whole))
 
 
 def response_to_tone(omega: np.ndarray, tone: float, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """x(t) and x'(t) of x'' + omega^2 x = sin(tone t) from rest; omega = 0 is a rigid motion."""
+    """The solution x(t), x'(t) of x'' + omega^2 x = sin(tone t) from rest for each ``omega``; 0 is a rigid motion."""
     x = np.zeros_like(omega)
     v = np.zeros_like(omega)
     moving = omega > 0
@@ -45,19 +45,19 @@ def response_to_tone(omega: np.ndarray, tone: float, t: float) -> tuple[np.ndarr
 
 
 def exact_linear(case: Case) -> np.ndarray:
-    """Velocities (time, cell, dof) by the modes of the whole lattice and the drive's three sinusoids."""
+    """Velocities (time, cell, dof) in m/s by the modes of the whole lattice and the drive's three sinusoids."""
     model = case.model()
     drive = model.drive
     root = 1 / np.sqrt(model.chain.masses())
     squared, modes = np.linalg.eigh(model.chain.stiffness_matrix().toarray() * root[:, None] * root)
     omega = np.sqrt(np.maximum(squared, 0))
-    # Rounding leaves a rigid motion a frequency, which would be divided by.
+    # Rounding gives a rigid motion a small frequency, by which the solution would be divided.
     omega[omega < 1e-6 * omega.max()] = 0.0
     driven_dof = model.drive_cell * model.chain.cell.dofs + model.drive_mass
     # The force's projection on each mode.
     push = modes[driven_dof] * root[driven_dof] * drive.window_amplitude
 
-    # [1 - cos(Om t/Nc)] sin(Om t) is a tone and two of half its size at either side of it.
+    # [1 - cos(Om t/Nc)] sin(Om t) is a tone of frequency Om less half of each of two tones at Om (1 +- 1/Nc).
     tones = [(1.0, drive.frequency)]
     for sign in (1, -1):
         tones.append((-0.5, drive.frequency * (1 + sign / drive.cycles)))
@@ -66,7 +66,7 @@ def exact_linear(case: Case) -> np.ndarray:
         """Displacements and velocities (2, mode) while the drive acts."""
         return sum(weight * push * np.array(response_to_tone(omega, tone, t)) for weight, tone in tones)
 
-    # After the drive every mode swings freely from here.
+    # Every mode swings freely from its state at the end of the drive.
     x_end, v_end = driven(drive.duration)
     velocities = []
     for t in np.arange(model.samples) * model.sample_interval:
@@ -99,25 +99,25 @@ def test_a_linear_run_is_the_modal_solution(ends, lattice, drive, time):
 
     run, result = simulated(case)
 
-    # Eigenvalues of 200 masses are exact to about this much.
+    # The eigenvalues of 200 masses have errors of about this size.
     assert relative(run["velocity"].values - exact, exact) < 1e-11
     assert result.statistics["engine"] == "propagator"
-    # The bound of the terms that were dropped: not zero, since something was.
+    # The truncation is a bound on the dropped terms, which is not zero.
     assert 0 < result.statistics["truncation"] < 1e-14
     assert result.statistics["ledger_error"] < 1e-12
 
 
 def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> dict:
-    """Both engines give the same run, to a relative ``velocity`` and to ``onset`` seconds.
+    """Assert that both engines give the same run, up to a relative ``velocity`` and an ``onset`` in s.
 
     Returns the propagator's statistics.
     """
-    # Far below the default, so that the difference is the propagator's error.
+    # The stepper's tolerance is far below the default, so that the difference is the propagator's error.
     theirs, stepped = simulated(with_engine(case, "ts", rtol=1e-12))
     ours, result = simulated(with_engine(case, "propagator"))
 
     assert result.statistics["engine"] == "propagator"
-    # Counts first: with a contact more or less, arrays could not be compared.
+    # Counts come first, since arrays of different numbers of contacts cannot be compared.
     for name in ("episodes", "switches", "floored", "clipped"):
         assert result.statistics[name] == stepped.statistics[name], name
 
@@ -128,7 +128,7 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
     for name in ("force", "loss", "indentation", "approach_velocity"):
         values = theirs[f"impacts/{name}"].values
         largest = np.abs(values).max()
-        # Of grazing contacts all are small, and relative errors large.
+        # Grazing contacts have small values with large relative errors.
         np.testing.assert_allclose(ours[f"impacts/{name}"], values, rtol=1e-4, atol=1e-6 * largest)
 
     exact = theirs["velocity"].values
@@ -164,7 +164,7 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
 def test_agrees_with_the_time_stepper(lattice, contacts, drive, time):
     case = small_case(lattice=lattice, contacts=contacts, drive=drive, time=time)
 
-    # Otherwise two linear runs were compared.
+    # The runs have contacts, and are not linear.
     assert assert_engines_agree(case)["episodes"] > 5
 
 
@@ -185,7 +185,10 @@ DASHPOTS = {"mass": 10.0, "stiffness": 5e-6}
     ],
 )
 def test_agrees_on_contacts_of_any_pair(lattice, contacts):
-    """Contacts join cells, also across a ring's joint, or ground; some are pressed, or have unequal stops."""
+    """Both engines agree on contacts within a cell, between cells, across a ring's joint and with the ground.
+
+    Some contacts are pressed at rest or have unequal stops.
+    """
     case = small_case(lattice=lattice, contacts=contacts)
 
     assert assert_engines_agree(case, velocity=1e-8)["episodes"] >= 3
@@ -206,7 +209,7 @@ def test_agrees_on_other_cells():
         "time": {"end": 0.1},
     }
 
-    # More impacts than in the small case magnify differences further.
+    # These runs have more impacts than the small case, which magnify differences further.
     for table in (diatomic, own):
         assert assert_engines_agree(Case.from_table(table), velocity=1e-6, onset=1e-8)["episodes"] > 20
 
@@ -224,7 +227,7 @@ def test_the_builtin_run_takes_the_steps_it_needs():
     assert statistics["episodes"] == 181  # SPEC section 5
     assert statistics["steps"] == statistics["samples"] - 1
     assert statistics["bandwidth"] == 2
-    # 6064: without nodes of their own for onset and separation the error needs more.
+    # The run needs 6064 substeps. It would need more without special nodes for substeps at onsets and separations.
     assert statistics["substeps"] < 6200
 
 
@@ -265,9 +268,9 @@ def test_auto_takes_it_where_it_suits():
     ("looks", "contacts", "damping"), [(0, {}, {}), (2, {}, {}), (4, {}, {"mass": 10.0}), (3, PRESSED, {})]
 )
 def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts, damping):
-    # Blocks of 49 samples of 24 cells: the run of 251 samples can stop between six of them.
+    # The run of 251 samples has six blocks of at most 49 samples, and can stop between them.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
-    # At the driven end, alone, and as neighbours, whose contacts are solved together.
+    # One site is at the driven end, one stands alone, and two are neighbours, whose contacts are solved together.
     sites = {"sites": [1, 6, 12, 13]}
     case = small_case(time={"engine": "propagator"}, contacts=sites | contacts, lattice={"damping": damping or None})
     straight = simulate(case, folder / "straight")
@@ -284,7 +287,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, cont
 @settings(max_examples=60)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=12), st.floats(0.1, 1.0), st.floats(0.05, 2.0))
 def test_no_onset_is_missed(coefficients, length, clearance):
-    """Before the first onset of a polynomial, or on all of the step if there is none, |w| is below the clearance."""
+    """Before the first onset that is found for a polynomial w, or in the whole step, |w| is below the clearance."""
     jet = np.array(coefficients)
     s = np.linspace(0, length, 4001)
     w = np.abs(np.polynomial.polynomial.polyval(s, jet))
@@ -293,7 +296,7 @@ def test_no_onset_is_missed(coefficients, length, clearance):
 
     onset = first_onset(jet, create_contacts(Contact("hertz", 1.0), [clearance])[0], length)
 
-    # Onsets are located to rounding of the polynomial.
+    # Onsets are located up to rounding errors of the polynomial.
     limit = clearance * (1 + 1e-9)
     if onset > length:
         assert w.max() <= limit
@@ -331,7 +334,7 @@ def test_rows_near_an_end_turn_into_the_stencil(interval):
 
 
 def test_rows_of_a_few_cells_are_kept():
-    """They are those of a batch of many cells to the bit, asked for once or twice, and nobody can write to them."""
+    """Rows of single cells are those of a batch, to the bit; they are kept for a second request, and are read-only."""
     series = StepSeries(small_case().model().chain, 5e-4, 1e-14)
     cells = list(range(series.chain.cells))
     assert len(cells) > KEPT
@@ -348,8 +351,8 @@ def test_rows_of_a_few_cells_are_kept():
 
 @st.composite
 def cases(draw) -> Case:
-    """Small lattices of random cells, ends, sites, drives and sample intervals."""
-    # Few masses and cells: an example takes a second by the other engine.
+    """Cases of small lattices with random cells, ends, sites, drives and sample intervals."""
+    # There are few masses and cells, as an example takes a second by ``ts``.
     dofs = draw(st.integers(2, 3))
     masses = [draw(st.floats(0.002, 0.02)) for _ in range(dofs)]
     stiffness = st.floats(2e3, 3e4)
@@ -402,7 +405,7 @@ def test_both_engines_agree_on_random_lattices(case):
         assert result.statistics["engine_note"]
         return
 
-    # Impacts magnify differences: agreement is asked for up to the fifth.
+    # Impacts magnify differences, so that runs are compared up to the fifth impact only.
     onsets = theirs["impacts/onset"].values
     few = min(5, len(onsets), len(ours["impacts/onset"]))
     last = onsets[few] if len(onsets) > few else np.inf

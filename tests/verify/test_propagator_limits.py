@@ -1,4 +1,4 @@
-"""The engines at their limits: no contacts, contacts too stiff to follow, ten thousand sites."""
+"""The engines at their limits: without contacts, with contacts too stiff to follow, and with ten thousand sites."""
 
 import re
 
@@ -41,7 +41,7 @@ def test_contacts_that_cannot_be_followed_end_the_run():
 
     stalled = engine.fill(unrecorded_samples(model, layout, goal=model.samples - 1)).stalled
     assert re.match(r"the contacts of sites 1 at 0.0\d+ s", stalled)
-    # The state is the last one before.
+    # The engine's state is that of the last sample before the stall.
     assert engine.time == engine.steps * model.sample_interval
     time_of_stall = float(stalled.split()[-2])
     assert 0 < time_of_stall - engine.time < model.sample_interval
@@ -49,7 +49,7 @@ def test_contacts_that_cannot_be_followed_end_the_run():
 
 
 def test_the_last_sample_before_a_stall_has_its_own_energies():
-    """The step in which a rank alone stalls begins on a sample: what its forces did up to the stall is not in it."""
+    """The energies of the last sample before a stall balance: they leave out the work of forces in the stalled step."""
     case = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}, time={"engine": "propagator"})
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)

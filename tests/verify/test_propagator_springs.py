@@ -1,4 +1,4 @@
-"""Nonlinear springs at few places in the propagator: all kinds of lattices against `ts`, the ledger, stops and goes."""
+"""Lattices with a few nonlinear springs in the propagator: agreement with ``ts``, the energy ledger, resumed runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vipetsc.io.store import RunMemory
 
 pytestmark = pytest.mark.parallel(1)
 
-# Of a ring the last cell's spring goes on to the first; of fixed ends it is held by the wall.
+# The spring of the last cell, 24, leads to the first cell on a ring, and to the wall of a fixed end.
 SPRINGS: dict[str, Any] = {
     "springs[1].cubic": {"cells": [11, 24], "value": 3e11},
     "springs[4].quadratic": {"cells": [5, 13], "value": 4e4},
@@ -35,7 +35,7 @@ def sprung(lattice: dict[str, Any] | None = None, **sections: Any) -> Case:
 
 
 def motion(case: Case, engine: str) -> np.ndarray:
-    """Displacements by an ``engine``, with tolerances of 1e-11."""
+    """Displacements (time, cell, dof) in m by an ``engine`` at a tolerance of 1e-11; asserts that the ledger closes."""
     run, result = simulated(case.varied(time={"engine": engine, "rtol": 1e-11}))
     assert result.statistics["engine"] == engine
     assert result.statistics["ledger_error"] < 1e-10
@@ -43,7 +43,7 @@ def motion(case: Case, engine: str) -> np.ndarray:
 
 
 def difference(case: Case) -> float:
-    """That of the two engines, over the largest displacement."""
+    """The largest difference between the displacements by the two engines, divided by the largest displacement."""
     exact = motion(case, "propagator")
     return float(np.abs(exact - motion(case, "ts")).max() / np.abs(exact).max())
 
@@ -59,7 +59,10 @@ def test_both_engines_agree(ends):
 
 @pytest.mark.parametrize("quadratic", [0.0, 2e6])
 def test_the_left_wall_has_the_spring_of_the_reference_cell(quadratic):
-    """It alone is nonlinear if all cells have others: behind the first mass, with the sign of its own elongation."""
+    """The spring to the left wall is that of the reference cell, nonlinear even if profiles make all others linear.
+
+    Its force has the sign of its own elongation, which a displacement of the first mass lengthens.
+    """
     springs = [
         {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True, "cubic": 1e10, "quadratic": quadratic},
         {"start": 1, "end": 2, "stiffness": 5e3},
@@ -74,7 +77,7 @@ def test_the_left_wall_has_the_spring_of_the_reference_cell(quadratic):
 
 
 def test_both_engines_agree_in_unlike_cells_with_dashpots_and_stops():
-    """The ledger closes to 1e-10, in ``motion``, by losses that follow from dashpots alone."""
+    """Engines agree in cells that differ, with nonlinear springs, dashpots and stops, and their ledgers close."""
     lattice = {
         "profiles": SPRINGS | {"masses[2]": {"first": 2e-3, "last": 3e-3}},
         "damping": {"mass": 30.0, "stiffness": 1e-6},
@@ -87,7 +90,10 @@ def test_both_engines_agree_in_unlike_cells_with_dashpots_and_stops():
 
 
 def test_a_spring_that_is_hardly_stretched_is_linear():
-    """To the last bit: its force is rounding, and no time is spent on it."""
+    """A nonlinear spring with a tiny elongation gives the bits of a linear one, without additional substeps.
+
+    The nonlinear part of its force is below rounding.
+    """
     weak = {"drive": {"amplitude": 1e-8}}
     nonlinear, result = simulated(
         sprung(lattice={"profiles": {"springs[1].cubic": SPRINGS["springs[1].cubic"]}}, **weak)
@@ -108,7 +114,7 @@ def test_a_run_goes_on_after_a_stop(folder):
 
 
 def test_a_spring_that_tears_off_stalls_the_run():
-    """Beyond z = -k/q a quadratic spring pushes on: the motion ends in finite time, and the sentence says where."""
+    """A quadratic spring k z + q z^2 compressed beyond z = -k/q runs away in finite time; the sentence says where."""
     torn = sprung(
         lattice={"profiles": {"springs[4].quadratic": {"cells": [2], "value": 2e7}}}, drive={"amplitude": 200.0}
     )
@@ -118,7 +124,7 @@ def test_a_spring_that_tears_off_stalls_the_run():
 
 
 def test_elongations_are_degrees_of_freedom_behind_the_sites():
-    """Groups have the sites first, then the springs, then the drive."""
+    """Elongations of nonlinear springs are numbered after the sites and before the drive."""
     model = sprung(contacts={"sites": [12]}).model()
     dofs = contact_dofs(model)
     assert dofs["cell"].tolist() == [11, 4, 10, 12, 23, 0]
@@ -127,18 +133,18 @@ def test_elongations_are_degrees_of_freedom_behind_the_sites():
     assert dofs["form"][4].tolist() == [[0, 0, 0, -1], [0, 0, 0, 0]]
     groups = group_dofs(model, 2)
     assert np.split(groups.numbers, groups.first[1:-1])[-2].tolist() == [0, 2, 3]
-    # z with |c| z^2 = 2^-53 k, below which the force is rounding of k z.
+    # Below the elongation z with |c| z^2 = 2^-53 k the cubic force is less than the rounding error of k z.
     assert dofs["clearance"][2] == pytest.approx(np.sqrt(2.0**-53 * 2e4 / 3e11))
 
 
 def test_many_springs_go_to_ts():
-    """One spring in a long lattice pays, springs in every cell do not, and the message says so."""
+    """A lattice with nonlinear springs in every cell is run by ``ts``, with the reason; one with few is not."""
     everywhere = sprung(lattice={"profiles": {"springs[1].cubic": [3e11] * 24}}).model()
     reason = refusal(everywhere)
     assert reason is not None
     assert "24 nonlinear springs" in reason
     assert "times as much as ts" in reason
-    # The springs are too many whatever the step: none is looked for.
+    # The springs are too many for any step, so that no step is computed.
     step_series.cache_clear()
     long = sprung(lattice={"cells": 2000, "profiles": {"springs[1].cubic": [3e11] * 2000}})
     chosen = choose_engine(long, long.model())

@@ -1,4 +1,4 @@
-"""Date, host and sources of a result stand in every file, and are never compared."""
+"""Every result file names its date, host and sources, which comparisons of results ignore."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_pr
     in_process("bands", "--out", tmp_path / "bands")
     assert json.loads((tmp_path / "bands/bands.json").read_text()).keys() >= WANTED
 
-    # Another time, place and revision, the same bits.
+    # Another date, host and revision leave the bits of the results.
     monkeypatch.setattr(io_folder, "revision", lambda: "other")
     monkeypatch.setattr(platform, "node", lambda: "elsewhere")
     simulate(small_case(**SHORT), tmp_path / "again")

@@ -34,7 +34,7 @@ def test_out_of_phase_branch(name, request):
     branch = request.getfixturevalue(name)
     points = branch.points
 
-    # Steps grow with the energy: thirteen decades take few points.
+    # Steps grow with the energy, so that thirteen decades take few points.
     assert len(points) <= 400
     assert points[-1].energy >= 1e9
     assert max(point.residual for point in points) <= 1e-12
@@ -141,7 +141,7 @@ def test_in_phase_through_every_odd_tongue_towards_the_limit(in_phase):
 
 
 def test_both_directions_give_the_same_curve():
-    """Down from above grazing the branch returns through both folds to the linear mode, which the monitor reports."""
+    """A branch followed down from above grazing passes both folds and returns to the linear mode, as is reported."""
     branch = follow(reduced_model(), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.5])
     top = branch.points[-1]
     down = Continuation(branch.problem, top, NnmTable(points=2000, energy=[1e-3, 1.0]), step=1e-3)

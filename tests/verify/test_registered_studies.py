@@ -1,7 +1,7 @@
-"""Studies with copies of Hertz's law and of the paper's factor, which a module registers: the results of the originals.
+"""Studies with registered copies of Hertz's law and of the paper's dissipation factor have the originals' results.
 
-Both cases name the module, so that a search may have its measure as the objective; only the names of law and factor
-differ.
+The cases with the originals name the module as well, so that a search may use its measure as the objective. Only the
+names of law and factor differ.
 """
 
 from __future__ import annotations
@@ -60,25 +60,25 @@ SEARCH = {"objective": [{"measure": "lost_fraction", "goal": "minimise"}]}
 
 
 def law(folder: Path, **sections: dict[str, Any]) -> Path:
-    """The scattering law of one site."""
+    """Compute the scattering law of one site; returns its file."""
     make_law(law_case(**sections), folder, MPI.COMM_SELF)
     return folder / "law.h5"
 
 
 def prediction(folder: Path, **sections: dict[str, Any]) -> Path:
-    """A prediction at one amplitude, without simulations to compare with."""
+    """Compute a prediction at one amplitude, without simulations to compare with; returns its file."""
     predict(prediction_case(predict={"points": 16, "amplitudes": [600.0], "simulate": False}, **sections), folder)
     return folder / "prediction.h5"
 
 
 def search(folder: Path, **sections: dict[str, Any]) -> Path:
-    """A search for clearances of two sites."""
+    """Search for the clearances of two sites; returns the search's file."""
     run_search(OptimiseCase.from_table(search_table(16, [4, 9], optimise=SEARCH, **sections)), folder, MPI.COMM_SELF)
     return folder / "optimum.h5"
 
 
 def results(study: Callable[..., Path], folder: Path) -> list[Path]:
-    """The files of a ``study`` with the shipped and with the registered law."""
+    """The two files of a ``study``, with the shipped and with the registered law."""
     (folder / "copies.py").write_text(COPIES)
     files = []
     for name, (elastic, factor) in LAWS.items():
@@ -89,7 +89,7 @@ def results(study: Callable[..., Path], folder: Path) -> list[Path]:
 
 
 def assert_same_to_rounding(shipped: Path, registered: Path) -> None:
-    """All numbers of two files agree to rounding, which the differences of later contacts magnify."""
+    """Assert that all numbers of two files agree to rounding, which later contacts magnify to at most 1e-9."""
     first = datasets(shipped)
     second = datasets(registered)
     assert first.keys() == second.keys()
@@ -101,7 +101,7 @@ def assert_same_to_rounding(shipped: Path, registered: Path) -> None:
 
 @pytest.mark.parametrize("study", [law, prediction])
 def test_a_registered_law_has_the_response_of_the_shipped_one(study, tmp_path):
-    """The scattering law of one site, and several sites composed from it, lose energy as with the originals."""
+    """The scattering law of one site, and a prediction, are the same with registered copies as with the originals."""
     shipped, registered = results(study, tmp_path)
     assert_same_to_rounding(shipped, registered)
     lost = datasets(registered)["dissipated" if study is law else "predicted/dissipated"]
@@ -109,7 +109,10 @@ def test_a_registered_law_has_the_response_of_the_shipped_one(study, tmp_path):
 
 
 def test_a_search_has_a_registered_measure_as_its_objective(tmp_path):
-    """The objective is the energy that the search itself measures as dissipated, and the CSV of the designs has it."""
+    """A registered measure of the lost fraction has the value that the search itself measures as dissipated.
+
+    The CSV file of the designs has a column for it.
+    """
     shipped, registered = results(search, tmp_path)
     assert_same_to_rounding(shipped, registered)
 

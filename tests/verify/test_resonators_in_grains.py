@@ -1,7 +1,7 @@
 """Chains of grains with a resonator on a spring inside each: springs within cells, contacts alone between them.
 
-Such chains are granular metamaterials with masses in masses; see K. Vorotnikov et al., arXiv:1709.08629 (2017), and of
-pressed ones L. Liu et al., arXiv:1603.06033 (2016).
+Such chains are granular metamaterials with masses in masses; see K. Vorotnikov et al., arXiv:1709.08629 (2017), and for
+pressed chains L. Liu et al., arXiv:1603.06033 (2016).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def grains(
     contacts: dict[str, Any] | None = None,
     **sections: dict[str, Any],
 ) -> Case:
-    """Grains of which the first is struck, by default with resonators and with contacts that touch."""
+    """The case of a row of grains of which the first is struck, by default with resonators and touching contacts."""
     joined = {"law": "hertz", "stiffness": HERTZ, "next_cell": True, "pair": [1, 1], "side": "minus", "clearance": 0.0}
     table: dict[str, Any] = {
         "lattice": {
@@ -49,9 +49,9 @@ def grains(
 
 
 def run_of(case: Case) -> xr.Dataset:
-    """The run of a case by the engine that it names, whose energies balance and whose momentum stays."""
+    """The run of a case by the engine that it names; asserts that energies balance and that the momentum stays."""
     run, result = simulated(case)
-    # A refused engine would be replaced by the other one, and be compared with itself.
+    # An engine that refuses a case is replaced by the other one, which would be compared with itself.
     assert result.statistics["engine"] == case.time.engine
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
     assert np.abs(run["energy/work"] - stored).max() < 1e-8 * run["energy/work"].max()
@@ -62,7 +62,7 @@ def run_of(case: Case) -> xr.Dataset:
 
 
 def integrated(case: Case, times: np.ndarray, clearance: float) -> np.ndarray:
-    """Displacements and velocities (time, 2, cell, dof) of ``case`` by SciPy's DOP853, equation by equation."""
+    """Displacements and velocities (time, 2, cell, dof) of ``case`` by SciPy, from equations that are written here."""
     cells = case.lattice.cells
 
     def rate(_: float, state: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ def integrated(case: Case, times: np.ndarray, clearance: float) -> np.ndarray:
 
     start = np.zeros((2, cells, 2))
     start[1, 0, 0] = STRUCK
-    # Steps that are short beside a contact see every one of them.
+    # Steps are much shorter than a contact, so that none is passed over.
     longest = times[1] / 4
     span = (0, times[-1])
     solution = solve_ivp(rate, span, start.ravel(), "DOP853", times, rtol=1e-12, atol=1e-18, max_step=longest)
@@ -84,7 +84,7 @@ def integrated(case: Case, times: np.ndarray, clearance: float) -> np.ndarray:
 
 
 def difference(run: xr.Dataset, expected: np.ndarray) -> float:
-    """The largest difference of a run from ``expected`` (time, 2, cell, dof), over the largest motion of its kind."""
+    """The largest relative error of displacements and of velocities against ``expected`` (time, 2, cell, dof)."""
     worst = 0.0
     for number, name in enumerate(("displacement", "velocity")):
         error = np.abs(run[name].values - expected[:, number]).max()
@@ -92,11 +92,14 @@ def difference(run: xr.Dataset, expected: np.ndarray) -> float:
     return worst
 
 
-# A step of the propagator couples more than two cells.
+# The propagator needs more than two cells, since its step couples more.
 @pytest.mark.parametrize(("engine", "cells"), [("ts", 2), ("ts", 6), ("propagator", 6)])
 @pytest.mark.parametrize("clearance", [0.0, 2e-6])
 def test_a_struck_chain_is_that_of_an_independent_solver(engine, clearance, cells):
-    """Grains that touch are held together, and those at a distance have impacts: two ways of the engines."""
+    """A struck chain moves as by SciPy, with grains that touch at rest and with grains at a distance.
+
+    The engines treat the two differently: contacts that touch at rest are kept, the others are impacts.
+    """
     case = grains(engine, cells, contacts={"clearance": clearance})
     run = run_of(case)
     expected = integrated(case, run["time"].values, clearance)
@@ -122,7 +125,7 @@ FINE = {"end": 2e-4, "sample_interval": 4e-7}
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_on_stiff_springs_resonators_are_part_of_their_grains(engine):
-    """The motion is that of grains with the mass of both; what differs falls as one over the stiffness."""
+    """On stiff springs grains and resonators move as grains of both masses, up to errors of one over the stiffness."""
     first = {"cell": 1, "velocity": STRUCK}
     both = first | {"kind": "velocity", "more": [first | {"mass": 2}]}
     plain = grains(engine, cell={"masses": [GRAIN + RESONATOR], "springs": []}, time=FINE)
@@ -149,13 +152,14 @@ def test_light_resonators_do_not_matter(engine):
 @pytest.mark.parametrize("branch", [0, 1])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_a_pressed_ring_has_the_dispersion_of_masses_in_masses(tmp_path, engine, branch):
-    """4 k sin^2(kappa/2) = m(omega) omega^2 with the mass m1 + m2 w^2/(w^2 - omega^2) of a grain, w^2 = k2/m2.
+    """Waves of a pressed ring have 4 k sin^2(kappa/2) = m omega^2 with m = m1 + m2 w^2/(w^2 - omega^2), w^2 = k2/m2.
 
-    k is the slope of Hertz's law at rest. Below and above the resonators' frequency each wavenumber has one frequency.
+    The stiffness k is the slope of Hertz's law at rest. Each wavenumber has one frequency below that of the resonators
+    and one above.
     """
     n = 12
     depth = 1e-5
-    # So small that the contacts are linear to 1e-6.
+    # The amplitude is so small that the contacts are linear to 1e-6.
     amplitude = 1e-11
     kappa = 2 * np.pi * 2 / n
     k = 1.5 * HERTZ * depth**0.5

@@ -1,4 +1,4 @@
-"""Families of frequency responses over keys of the case: their members, files, legends and refusals."""
+"""Families of frequency responses over keys of a case: members, files, legends and refusals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MASS = "lattice.cell.masses[1]"
 
 
 def family_case(family: dict[str, Any], drive: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
-    """Two masses with a family of curves, perhaps with another ``drive``."""
+    """The case of two masses with a ``family`` of curves, and with another ``drive`` if one is given."""
     options = TWO_MASSES["nfrc"] | SHORT | nfrc | {"family": family}
     return NfrcCase.from_table(TWO_MASSES | {"drive": drive or TWO_MASSES["drive"], "nfrc": options})
 
@@ -90,7 +90,7 @@ def test_a_folder_with_one_curve_has_no_common_picture(family, tmp_path):
 
 
 def test_curves_of_several_folders_have_a_common_picture(family, tmp_path):
-    """One curve in each: what is drawn is not reported as missing."""
+    """Folders with one curve each have a common picture, which is not reported as missing."""
     folder, _ = family
     folders = []
     for path in sorted(folder.glob("branch-*.h5"))[:2]:
@@ -108,7 +108,7 @@ def test_a_family_is_read_back_and_goes_on(family):
     assert [curve.name for curve in again.every_curve()] == [curve.name for curve in curves]
     assert again.physics() == case.physics()
     more = family_case({"contacts": {"clearance": [0.8, 0.7]}, MASS: [1.0, 1.1]}, points=5)
-    # The number of points is no physics: a folder may be continued with more.
+    # The number of points does not belong to the physics: a folder may be continued with more.
     assert more.physics() == case.physics()
     assert other_physics() != case.physics()
 
@@ -117,12 +117,12 @@ def test_a_family_is_read_back_and_goes_on(family):
 
 
 def other_physics() -> NfrcCase:
-    """A family with another value."""
+    """The physics of a family with another value."""
     return family_case({"contacts": {"clearance": [0.8, 0.6]}, MASS: [1.0, 1.1]}).physics()
 
 
 def test_what_follows_from_a_key_is_that_of_each_member():
-    """Stops on one side or on both decide about even harmonics, a loss about the dashpots."""
+    """Options that follow from a key follow from each member's value: symmetry from sides, dashpots from a loss."""
     sides = family_case({"contacts": {"side": ["plus", "both"]}})
     assert [curve.case.nfrc.symmetric for curve in sides.every_curve()] == [False, True]
     assert [curve.name for curve in sides.every_curve()] == ["side-plus-r1-0.2", "side-both-r1-0.2"]
@@ -159,7 +159,7 @@ def test_a_path_leads_to_an_entry_of_a_list():
     assert put(table, "cell.springs[1].stiffness", 5.0) == []
     assert put(table, "profiles.masses[1]", [1.0]) == []
     assert table["cell"] == {"masses": [1.0, 4.0], "springs": [{"stiffness": 5.0}]}
-    # A profile has such a name itself.
+    # The name of a profile has brackets itself.
     assert table["profiles"] == {"masses[1]": [1.0]}
     assert [str(problem) for problem in put(table, "cell.springs[3].stiffness", 1.0)] == [
         "cell.springs[3].stiffness = 1.0: cell.springs[3] does not exist"

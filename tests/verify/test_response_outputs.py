@@ -1,4 +1,4 @@
-"""Motion of named masses and forces along frequency responses, against time integration; their files and pictures."""
+"""Motion of named masses and forces along frequency responses, against time integration; files and pictures of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
-# Samples of a period, over which the trapezoidal rule's transform is exact for all harmonics that matter.
+# The number of samples in a period. Transforms by the trapezoidal rule are exact for all harmonics that matter.
 SAMPLES = 1024
 
 
@@ -41,9 +41,10 @@ def curve(tmp_path_factory) -> Path:
 
 
 def test_outputs_are_those_of_the_motion_by_time_integration():
-    """A period of SciPy's from a state in contact: peaks, first harmonics, phases, forces of the stop and the walls."""
+    """Peaks, first harmonics, phases and forces at stop and walls are those of a period that SciPy integrates."""
     frequency = 1.25
-    # So many that the truncation is below the tolerances, but for accelerations, whose harmonics fall most slowly.
+    # With 121 harmonics the truncation is below the tolerances. The tolerance of accelerations, whose harmonics fall
+    # most slowly, is larger.
     options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [frequency], "harmonics": 121}
     states = SteadyStates(NfrcCase.from_table(TWO_MASSES | {"nfrc": options, "output": OUTPUT}), 1.0, frequency)
     state = first_state(states)
@@ -57,7 +58,7 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
     rate = rate_of(states, frequency, 0.2)
     begin = np.concatenate([u.ravel(), v.ravel()])
     y = solve_ivp(rate, (0, period), begin, "DOP853", t_eval=times, rtol=1e-10, atol=1e-12, max_step=period / 100).y
-    # From the equations: differences of sampled velocities would be less exact than what they check.
+    # The accelerations follow from the equations; differences of sampled velocities would be too inexact.
     acceleration = np.array([rate(t, column)[2:] for t, column in zip(times, y.T, strict=True)]).T
 
     for name, history in (("displacement", y[:2]), ("velocity", y[2:]), ("acceleration", acceleration)):
@@ -68,7 +69,7 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
     lag = -np.degrees(np.angle(np.fft.rfft(y[:2])[:, 1])) % 360
     np.testing.assert_allclose(outputs["lag"], lag, atol=0.01)
 
-    # The rig's stop: 20 N/m beyond 0.8 m.
+    # The rig's stop has 20 N/m beyond 0.8 m.
     force = 20.0 * np.maximum(y[0] - 0.8, 0)
     assert outputs["largest_force"] == pytest.approx(force.max(), rel=1e-4)
     assert outputs["first_force"] == pytest.approx(np.abs(np.fft.rfft(force)[1]) / (SAMPLES / 2), rel=1e-3)
@@ -79,7 +80,7 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
 
 
 def test_walls_hold_the_masses_that_are_tied_to_them():
-    """In a cell of two masses the left wall holds the second one, the right wall the first one; no contact is met."""
+    """A wall's force is that of the spring tied to it, from a second mass at the left and a first one at the right."""
     springs = [
         {"start": 1, "end": 2, "stiffness": 1.5, "next_cell": True, "damping": 0.05},
         {"start": 1, "end": 2, "stiffness": 0.7},
@@ -99,13 +100,13 @@ def test_walls_hold_the_masses_that_are_tied_to_them():
     dynamic = chain.stiffness_matrix().toarray() + 0.9j * chain.damping_rows(0, 3).toarray()
     u = np.linalg.solve(dynamic - 0.81 * np.diag(chain.masses()), 0.2 * np.eye(6)[2])
     assert outputs["first_displacement"] == pytest.approx(abs(u[3]), rel=1e-9)
-    # Spring and dashpot at the wall, at 0.9 rad/s.
+    # The force at the wall is that of its spring and dashpot at 0.9 rad/s.
     expected = abs(1.5 + 0.9j * 0.05) * np.abs([u[1], u[4]])
     np.testing.assert_allclose(outputs["first_wall_force"], expected, rtol=1e-9)
 
 
 def test_a_lossy_stop_has_the_same_force_on_either_side():
-    """With the stop on the other side the motion is the mirror image, half a period later."""
+    """A lossy stop on the other side has the same largest force: the motion is mirrored, half a period later."""
     options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [1.25], "harmonics": 31}
     forces = []
     for side in ("plus", "minus"):
@@ -113,13 +114,16 @@ def test_a_lossy_stop_has_the_same_force_on_either_side():
         case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": options, "output": OUTPUT})
         states = SteadyStates(case, 0.6, 1.25)
         forces.append(states.measured(first_state(states).xi).outputs["largest_force"][0])
-    # Zero on both sides would agree as well.
+    # The comparison would hold trivially if both forces were zero.
     assert forces[0] > 1
     assert forces[1] == pytest.approx(forces[0], rel=1e-8)
 
 
 def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
-    """Below contact the wave passes: host and resonator of the site differ by its amplitude, other cells by phase."""
+    """Below contact named masses of an infinite lattice move as the Bloch wave does.
+
+    At the site resonator and host differ by the wave's amplitude; masses of other cells differ by its phase.
+    """
     case = nfrc_case(harmonics=3, range=[0.9, 0.95])
     names = [("host", 10, 1), ("resonator", 10, 2), ("later", 14, 2)]
     points = [{"name": name, "cell": cell, "mass": mass} for name, cell, mass in names]
@@ -141,7 +145,7 @@ def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
 
 
 def test_files_name_the_masses(curve):
-    """Table, ``vipetsc.open``, export and picture have the outputs under the names of the case."""
+    """The table, ``vipetsc.open``, the export and the picture have the outputs under the case's names of points."""
     (path,) = curve.glob("branch-*.h5")
     with vipetsc.open(path) as data:
         assert set(data["location"].values) == {"near", "far"}
@@ -163,7 +167,7 @@ def test_files_name_the_masses(curve):
 def test_a_curve_with_outputs_goes_on_to_the_same_bits(curve, tmp_path):
     (path,) = curve.glob("branch-*.h5")
     case = NfrcCase.from_toml(read_branch(path).case)
-    # Half of the curve, which the same command then continues.
+    # The curve is followed halfway, and the same command then continues it.
     few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 3})})
     follow_all(few, tmp_path, MPI.COMM_SELF)
     table = (tmp_path / path.name).with_suffix(".csv")

@@ -1,4 +1,4 @@
-"""Responses over a key of the case: the same states as over the frequency, their stability, ends and refusals."""
+"""Responses over a key of the case: states as over the frequency, stability, ends of curves and refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FREQUENCY = 1.5  # rad/s
 
 
 def over(key: str, low: float, high: float, table: dict[str, Any] = TWO_MASSES, **nfrc: Any) -> NfrcCase:
-    """The two masses with curves over a ``key``, at 1.5 rad/s and 0.2 m of the wall."""
+    """The case of two masses with curves over a ``key``, at 1.5 rad/s and an amplitude of 0.2 m of the wall."""
     options = {"source": "force", "over": key, "range": [low, high], "fixed": [0.2], "harmonics": 11} | nfrc
     drive = table["drive"] | {"frequency": FREQUENCY}
     return NfrcCase.from_table(table | {"drive": drive, "nfrc": options})
@@ -41,7 +41,7 @@ def equations(case: NfrcCase):
 
 @pytest.fixture(scope="module")
 def clearances(tmp_path_factory):
-    """A folder with the curve over the clearance, on which two folds and a period doubling lie."""
+    """The case, the folder and the curve over the clearance, on which two folds and a period doubling lie."""
     folder = tmp_path_factory.mktemp("clearances")
     case = over("contacts.clearance", 0.1, 1.0, harmonics=31, largest_step=1.0)
     (curve,) = follow_all(case, folder, MPI.COMM_SELF)
@@ -54,7 +54,7 @@ def clearances(tmp_path_factory):
     [("contacts.clearance", 0.1, 0.12), ("lattice.cell.masses[1]", 0.98, 1.0), ("lattice.damping.mass", 0.05, 0.06)],
 )
 def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, tmp_path):
-    """Both curves end where the key has its upper value and the frequency is 1.5 rad/s."""
+    """A curve over a key and one over the frequency end in the same state, at the key's upper value and 1.5 rad/s."""
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
     steps = {"first_step": 0.2, "largest_step": 1.0, "harmonics": 11}
     (by_key,) = follow_all(over(key, low, high, table, **steps), tmp_path, MPI.COMM_SELF)
@@ -66,7 +66,7 @@ def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, t
     (by_frequency,) = follow_all(NfrcCase.from_table(changed | {"nfrc": options}), tmp_path, MPI.COMM_SELF)
     ends = [curve.points[-1].measured for curve in (by_key, by_frequency)]
     assert ends[0].episodes > 0
-    # To the bit: a curve ends on its range.
+    # The frequencies are equal to the bit, since a curve ends exactly on its range.
     assert ends[0].frequency == ends[1].frequency == FREQUENCY
     np.testing.assert_allclose(ends[0].harmonics, ends[1].harmonics, atol=1e-10)
     assert ends[0].unstable == ends[1].unstable
@@ -74,7 +74,10 @@ def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, t
 
 @pytest.mark.slow
 def test_newtons_method_converges_quadratically():
-    """The column by differences costs no order: from a guess off by 1e-2 three steps lead to rounding."""
+    """Newton's method converges quadratically although the column of the key is a difference.
+
+    From a guess that is off by 1e-2 it needs three steps.
+    """
     for key, low, high in (("contacts.clearance", 0.1, 0.2), ("lattice.cell.masses[1]", 0.9, 1.0)):
         table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
         states = equations(over(key, low, high, table))
@@ -82,16 +85,16 @@ def test_newtons_method_converges_quadratically():
         frame = states.frame(start)
         attempt = frame.correct(start.xi + 0.05 * start.tangent + 1e-2 * np.sin(np.arange(len(start.xi))), 0.05)
         assert attempt.converged
-        # From where the quadratic terms are the largest ones.
+        # The first residuals, in which quadratic terms are not yet the largest, are left out.
         first, second, third, *_ = (residual for residual in attempt.history if residual < 0.1)
-        # The second term is the error of the column by differences.
+        # The linear term is the error of the column by differences.
         assert second < 30 * first**2 + 1e-9 * first
         assert third < 30 * second**2 + 1e-9 * second
 
 
 @pytest.mark.slow
 def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(clearances):
-    """SciPy's time integration of the lattice with the clearance of each state agrees, folds included."""
+    """States return after a period by SciPy with their own clearance, and are stable as its multipliers say."""
     case, _, curve = clearances
     states = equations(case)
     touching = [point for point in curve.points if point.measured.episodes and point.kind == "regular"]
@@ -109,12 +112,12 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
         grows = np.abs(period.multipliers) > 1.001
         assert point.measured.unstable == np.count_nonzero(grows)
         unstable.add(point.measured.unstable)
-    # Otherwise only stable states were tried.
+    # Both stable and unstable states are among them.
     assert len(unstable) > 1
     folds = parameter_values(curve)[curve.is_kind("fold")]
     values = parameter_values(curve)
     assert len(folds) == 2
-    # Between the folds there are three states.
+    # There are three states at a clearance between the folds.
     assert np.sum(np.diff(np.sign(values - folds.mean())) != 0) == 3
 
 
@@ -127,7 +130,7 @@ def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp
     assert curve.ending == f"reached the end of nfrc.range, {high:g}"
     assert parameter_values(curve)[[0, -1]].tolist() == [low, high]
 
-    # At its upper end nothing dissipates: the state there is that of the elastic contact.
+    # At a restitution of 1 the state is that of the elastic contact.
     if key == "contacts.restitution":
         alone = NfrcCase.from_table(
             table

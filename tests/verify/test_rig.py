@@ -1,4 +1,4 @@
-"""Frequency responses of what stands on a table: dashpots, stops on one side, sites that differ, a wall that moves."""
+"""Frequency responses of laboratory rigs: with dashpots, one-sided stops, sites that differ, and a wall that moves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
-# Ten cells whose masses and springs scatter, with dashpots to the ground and sites that differ in all they can.
+# Ten cells whose masses and springs scatter, with dashpots to the ground and three sites without a common property.
 TEN_CELLS: dict[str, Any] = {
     "name": "ten",
     "lattice": {
@@ -57,13 +57,15 @@ TEN_CELLS["contacts"]["each"] = {
 
 @pytest.fixture(scope="module")
 def two_masses(tmp_path_factory):
-    # Over the first resonance, with its two folds and its pair of multipliers that grows.
+    """The steady states of the rig of two masses, and the points of its curve."""
+    # The range contains the first resonance, with two folds and a pair of multipliers that exceeds 1.
     first = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"range": [1.0, 1.5]}}
     return followed(NfrcCase.from_table(first), tmp_path_factory.mktemp("rig") / "two")
 
 
 @pytest.fixture(scope="module")
 def ten_cells(tmp_path_factory):
+    """The steady states of ten cells that differ, and the points of their curve."""
     return followed(NfrcCase.from_table(TEN_CELLS), tmp_path_factory.mktemp("rig") / "ten")
 
 
@@ -91,7 +93,7 @@ def test_what_has_no_response_is_refused_with_its_reason(section, values, key, r
 
 
 def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
-    """A cell of two masses, with dashpots to the ground."""
+    """A cell of two masses with dashpots parallel to its springs, and ``grounding`` dashpots (N s/m) to the ground."""
     springs = (Spring(0, 0, 1.0, next_cell=True, damping=0.1), Spring(0, 1, 0.5, damping=0.02))
     return UnitCell((1.0, 0.3), springs, host=0, resonator=1, grounding=grounding)
 
@@ -99,7 +101,7 @@ def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("grounding", [(), (0.05, 0.2)])
 def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, grounding):
-    """Also where the lattice moves as a rigid body, held by dashpots or by nothing."""
+    """The compliance as a sum over poles is the inverse of K + i omega C - omega^2 M, also with rigid motions."""
     pairs = (Pair(0, 1), Pair(0, 0, next_cell=True))
     chain = Chain(rounded_cell(grounding), 5, ends, sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
     compliance = ModalCompliance(chain, ((0, 0),))
@@ -118,7 +120,7 @@ def test_without_dashpots_it_is_that_of_bloch_waves():
     omega = np.array([0.0, 0.31, 1.27, 2.9])
     modal = ModalCompliance(chain, ((0, 0),)).response(omega)
     waves = WaveCompliance(chain, points=((0, 0),)).response(omega)
-    # At rest a force on one mass carries the free lattice away.
+    # The last column, of a force on one mass, is left out at rest: that force moves a free lattice without bound.
     np.testing.assert_allclose(modal[:, :, :2], waves[:, :, :2], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(modal[1:], waves[1:], rtol=1e-8, atol=1e-10)
     assert np.isrealobj(modal)
@@ -127,7 +129,7 @@ def test_without_dashpots_it_is_that_of_bloch_waves():
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", ["two_masses", "ten_cells"])
 def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(rig, request):
-    """A state comes back after a period of time integration, and Hill's method counts its multipliers beyond 1."""
+    """A state returns after a period of time integration, and Hill's method counts its multipliers beyond 1."""
     states, points = request.getfixturevalue(rig)
     cells = np.arange(states.case.lattice.cells)
     touching = [point for point in points if point.measured.episodes]
@@ -138,20 +140,23 @@ def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(ri
     for point in chosen:
         u, v = motion_at(states, point.xi, cells)
         state = np.concatenate([u.ravel(), v.ravel()])
-        # Of ten cells a map has 40 columns: two states have to do.
+        # The map of ten cells has 40 columns, so that multipliers are computed for two states only.
         if rig == "two_masses" or point in chosen[::4]:
             end, values = period_map(states, point, state)
             assert point.measured.unstable == np.count_nonzero(np.abs(values) > 1.001)
             unstable.add(point.measured.unstable)
         else:
             end = after_a_period(states, point, state)
-        # Contacts are bilinear: harmonics that are left out fall with the third power of their number.
+        # Forces of bilinear contacts have kinks, so that the error falls as a power of the number of harmonics.
         assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
     assert rig == "ten_cells" or len(unstable) > 1
 
 
 def test_errors_fall_as_harmonics_are_added(two_masses):
-    """With four times the harmonics the period's map misses by 1/16 or less: forces have kinks, z has not."""
+    """With four times the harmonics a state returns after a period with at most 1/16 of the error.
+
+    Contact forces have kinks and harmonics that fall as k^-2, so that those of the velocity fall as k^-3.
+    """
     states, points = two_masses
     few = max(points, key=lambda point: point.measured.largest[0])
     errors = []
@@ -182,7 +187,7 @@ def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
 
 @pytest.mark.slow
 def test_a_lossy_run_settles_into_the_response():
-    """A run with restitution 0.6 from rest comes to the amplitudes of the response at its frequency."""
+    """A run from rest with restitution 0.6 settles to the amplitudes of the response at its frequency."""
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"restitution": 0.6}}
     frequency = 1.25
     period = 2 * np.pi / frequency
@@ -206,8 +211,8 @@ def test_a_lossy_run_settles_into_the_response():
     assert measured.unstable == 0
     np.testing.assert_allclose(np.abs(measured.harmonics[0, 1:4]), np.abs(settled[1:4]), rtol=2e-4)
 
-    # What is recorded of named masses and of the lossy contact in the last period has the same peaks.
-    # A peak lies between samples, of which there are 64 in a period.
+    # The records of named masses and of the lossy contact in the last period have the same peaks, up to the errors of
+    # 64 samples in a period.
     for quantity, error in (("displacement", 2e-3), ("velocity", 4e-3), ("acceleration", 4e-2)):
         recorded = np.abs(run[f"points/{quantity}"].values[-64:]).max(axis=0)
         np.testing.assert_allclose(measured.outputs[f"peak_{quantity}"], recorded, rtol=error)
@@ -217,7 +222,7 @@ def test_a_lossy_run_settles_into_the_response():
 
 
 def test_curves_of_a_case_have_one_compliance():
-    """The modes of a lattice are computed once, and not anew for each curve."""
+    """All curves of a case use one compliance, so that the modes of the lattice are computed once."""
     nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.1, 0.2], "restitutions": [1.0, 0.7]}
     method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), MPI.COMM_SELF)
     assert len({id(method.problem(job).compliance) for job in range(4)}) == 1
@@ -232,7 +237,7 @@ def test_a_pressed_contact_is_refused_a_loss():
 
 
 def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
-    """Of a small motion it is a spring: the response is that of the lattice with the contact's stiffness added."""
+    """For small motions a pressed contact is a spring: the response is that of the lattice with its stiffness added."""
     contacts = TWO_MASSES["contacts"] | {"clearance": 0.0, "precompression": 0.3}
     nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.01], "range": [0.8, 0.9]}
     case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": nfrc})
@@ -244,6 +249,6 @@ def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
     stiffness = np.array([[3.0 + 20.0, -1.5], [-1.5, 3.0]])
     dynamic = stiffness + 0.8j * 0.06 * np.eye(2) - 0.8**2 * np.eye(2)
     assert point.closed[0] == 1.0
-    # The static load balances the contact's force at rest: the mean displacement is none.
+    # The static load balances the contact's force at rest, so that the mean displacement is zero.
     assert abs(point.harmonics[0, 0]) < 1e-12
     np.testing.assert_allclose(point.harmonics[0, 1], np.linalg.solve(dynamic, [0.01 * 1.5, 0.0])[0], rtol=1e-8)

@@ -1,4 +1,4 @@
-"""Frequency responses to several drives of one frequency: linear superposition, time integration, what is refused."""
+"""Frequency responses to several drives of one frequency: superposition, time integration and refusals."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.response.swept import _sweep
 
 FORCE = {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1}
-# A negative amplitude acts in antiphase: signs must survive.
+# A negative amplitude acts in antiphase.
 BEYOND = {"waveform": "harmonic", "amplitude": -0.6, "frequency": 1.0, "cell": 2}
 LEFT = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"}
 RIGHT = LEFT | {"end": "right", "amplitude": 0.25}
 
 
 def rig(*drives: dict[str, Any], **nfrc: Any) -> NfrcCase:
-    """The rig of two masses with these drives, at the amplitude of the first one."""
+    """The case of two masses with ``drives``; its curve is at the amplitude of the first one."""
     first, *more = drives
-    # Curves have a positive amplitude, whose sign is a phase of the drive.
+    # The amplitude of a curve is positive; the sign of the drive's is a phase.
     table = with_sections(TWO_MASSES, {"nfrc": {"fixed": [abs(first["amplitude"])]} | nfrc})
     return NfrcCase.from_table(table | {"drive": first | ({"more": more} if more else {}), "output": OUTPUT})
 
@@ -40,19 +40,19 @@ def states_of(case: NfrcCase) -> SteadyStates:
 
 
 def phasors(outputs: dict[str, np.ndarray]) -> np.ndarray:
-    """First harmonics of the displacements of both masses, and of the forces on both walls."""
+    """Complex first harmonics (4,) of the displacements of both masses in m, and of the forces on both walls in N."""
     displacement = outputs["location_harmonics"][:, 1] + 1j * outputs["location_harmonics_imaginary"][:, 1]
     return np.append(displacement, outputs["first_wall_force"] * np.exp(-1j * np.radians(outputs["wall_force_lag"])))
 
 
 def linear_phasors(*drives: dict[str, Any]) -> np.ndarray:
-    """The phasors at 1.3 rad/s of a state that touches no stop."""
+    """The ``phasors`` at 1.3 rad/s of the linear state under ``drives``, with a stop out of reach."""
     case = rig(*drives, range=[1.3, 2.0])
     states = states_of(NfrcCase.from_table(case.model_dump(by_alias=True, exclude_none=True) | FAR))
     return phasors(states.measured(first_state(states).xi).outputs)
 
 
-# So far that nothing touches: the states are linear.
+# A stop that is out of reach, so that states are linear.
 FAR = {"contacts": TWO_MASSES["contacts"] | {"clearance": 1e3}}
 
 
@@ -62,28 +62,28 @@ FAR = {"contacts": TWO_MASSES["contacts"] | {"clearance": 1e3}}
     ids=["forces", "walls", "mixed", "3"],
 )
 def test_without_contact_drives_are_superposed(drives):
-    """Displacements and forces on the walls are sums of those of each drive alone, at its own amplitude."""
+    """Without contact, displacements and wall forces are sums of those under each drive alone, at its own amplitude."""
     together = linear_phasors(*drives)
     alone = sum(np.sign(drive["amplitude"]) * linear_phasors(drive) for drive in drives)
-    # The phase counts from the first drive, whose sign therefore turns all.
+    # Phases are relative to the first drive, whose sign therefore changes all signs.
     np.testing.assert_allclose(together * np.sign(drives[0]["amplitude"]), alone, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_two_forces_on_one_mass_are_one():
-    """Halves of a force act as the whole, also with contact, in every unknown of the state."""
+    """Two halves of a force act as the whole force, also with contact, in every unknown of the state."""
     half = FORCE | {"amplitude": 0.5}
     whole = first_state(states_of(rig(FORCE | {"amplitude": 1.0}, range=[1.4, 2.0], harmonics=15)))
     halves = first_state(states_of(rig(half, half, range=[1.4, 2.0], harmonics=15)))
-    assert abs(whole.xi[:-1]).max() > 1.05  # over the clearance
+    assert abs(whole.xi[:-1]).max() > 1.05  # clearances: the state is in contact
     np.testing.assert_allclose(halves.xi, whole.xi, atol=1e-10)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drives", [(FORCE, BEYOND), (LEFT, FORCE)], ids=["forces", "wall and force"])
 def test_states_with_contact_repeat_themselves_in_time(drives):
-    """SciPy's motion from a steady state is back after a period; the loads have the ratios of the case."""
-    # Large enough for contact.
+    """A steady state in contact under two drives returns after a period by SciPy; loads have the case's ratios."""
+    # The amplitudes are large enough for contact.
     larger = [drive | {"amplitude": 4 * drive["amplitude"]} for drive in drives]
     states = states_of(rig(*larger, range=[1.45, 2.0]))
     ratio = drives[1]["amplitude"] / drives[0]["amplitude"]
@@ -94,12 +94,12 @@ def test_states_with_contact_repeat_themselves_in_time(drives):
     point: Response = first_state(states)
     assert states.measured(point.xi).episodes > 0
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
-    # What the harmonics that were left out leave.
+    # The error is that of the harmonics that are left out.
     assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()
 
 
 def test_sweeps_in_time_that_look_for_isolated_curves_have_all_drives():
-    """Each is a chirp at its own place, in the ratio of the amplitudes."""
+    """Sweeps in time that look for isolated curves have a chirp for each drive, at its place and with its amplitude."""
     run = _sweep(states_of(rig(LEFT, BEYOND)), 4, 1)
     assert run.drive.end == "left"
     assert run.drive.amplitude == 0.1

@@ -1,4 +1,4 @@
-"""Shooting: frequencies, portraits and multipliers of orbits against theory; arcs that end on a change or overflow."""
+"""Shooting: frequencies, portraits and multipliers of orbits against theory, and arcs that are hard to integrate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vipetsc.modes.system import SmoothSpring, System
 
 
 def test_half_map_of_an_asymmetric_system():
-    """x'' + x + a x^2 = 0: the second-order frequency 1 - 5/12 a^2 A^2 (Nayfeh and Mook 1979)."""
+    """Orbits of x'' + x + a x^2 = 0 have the frequency 1 - 5/12 a^2 A^2 to second order (Nayfeh and Mook 1979)."""
     a = 0.1
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=a)])
     problem = Shooting(Dop853Flow(system), MAPS["half"])
@@ -34,7 +34,10 @@ def test_half_map_of_an_asymmetric_system():
 
 
 def test_an_arc_that_ends_where_a_contact_just_closes_ends():
-    """The time left, 1e-8 of the arc, is all rounding: a search that lands on its beginning again has no end."""
+    """An arc that ends within rounding of a contact's closing comes to an end, with the contact's onset.
+
+    A search for the change in the remaining time, which is all rounding, must not return to its beginning for ever.
+    """
     system = System.reduced(four_band("printed"), Stops.both(four_band_contact("hertz"), CLEARANCE))
     flow = Dop853Flow(system)
     start = np.array([7.732456897616884, 7.742513284851792, 0.0, 0.0])
@@ -48,7 +51,10 @@ def test_an_arc_that_ends_where_a_contact_just_closes_ends():
 
 @pytest.mark.parametrize("cubic", [1e8, 1e12])
 def test_a_step_that_overflows_is_taken_again_shorter(cubic):
-    """The longest step is a radian of the linear system, of which the spring makes thousands."""
+    """A step that overflows is repeated shorter, until the flow keeps energy and volume.
+
+    The longest step is a radian of the linear system; the cubic spring oscillates thousands of times in it.
+    """
     stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
     spring = SmoothSpring.between(None, 0, cubic=cubic)
     system = System(masses=np.ones(2), stiffness=stiffness, contacts=(), springs=(spring,))
@@ -57,7 +63,7 @@ def test_a_step_that_overflows_is_taken_again_shorter(cubic):
 
     before, after = (system.energy(state[:2], state[2:]) for state in (arc.start, arc.end))
     assert after == pytest.approx(before, rel=1e-9)
-    # The flow of a conservative system keeps volumes.
+    # The flow of a conservative system keeps volumes in phase space.
     assert np.linalg.det(arc.sensitivity) == pytest.approx(1.0, rel=1e-6)
 
 
@@ -77,7 +83,7 @@ def test_multipliers_are_those_of_the_monodromy_matrix(name):
 
 
 def test_a_portrait_is_the_orbit_itself():
-    """The quarter that is mirrored into a whole period agrees with a flow over the whole period."""
+    """A portrait, which mirrors a quarter into a whole period, agrees with a flow over the whole period."""
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
     start = linear_start(problem, OUT_OF_PHASE, 0.02)
     *_, point = Continuation(problem, start, NnmTable(points=150, energy=[0.0, 0.5]))
@@ -85,7 +91,7 @@ def test_a_portrait_is_the_orbit_itself():
 
     displacement, velocity = sample_orbit(problem, point, samples)
 
-    # In the second and in the last quarter.
+    # The two samples lie in the second and in the last quarter.
     for number in (13, 33):
         time = number / samples * point.period
         arc = problem.flow.arc(np.append(point.x, [0, 0]), time, point.period)

@@ -1,4 +1,4 @@
-"""Runs whose sites all have a law of their own: the law of all, which no site has, is not computed."""
+"""Runs whose sites all have laws of their own: the common law of the table, which no site uses, is not computed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vipetsc.io.store import RunMemory
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize("damping", ["exact", "flores"])
 def test_a_law_that_no_site_has_may_have_no_limit(engine, damping):
-    # The dampings of both names grow without bound towards a restitution of 0.
+    # The damping factors of both names grow without bound as the restitution tends to 0.
     contacts = {"restitution": 0.0, "damping": damping, "each": {"restitution": [0.5, 0.6, 0.7]}}
     case = small_case(contacts=contacts, time={"end": 0.04, "engine": engine})
     memory = RunMemory(MPI.COMM_SELF)

@@ -1,4 +1,4 @@
-"""Frequency responses of lattices whose springs are not linear: Duffing's oscillator, chains, one with a stop."""
+"""Frequency responses of lattices with nonlinear springs: Duffing's oscillator, and chains without and with a stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
-# u'' + 0.1 u' + u + u^3 = 0.1 cos(Om t): half of each spring on either side of the mass.
+# Duffing's oscillator u'' + 0.1 u' + u + u^3 = 0.1 cos(Om t). Half of the stiffness is on either side of the mass.
 HARDENING = {"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "next_cell": True}
 DUFFING: dict[str, Any] = {
     "name": "duffing",
@@ -41,7 +41,7 @@ STOP["pair"] = [0, 1]
 
 
 def chain_of(count: int, spring: dict[str, Any], **nfrc: Any) -> dict[str, Any]:
-    """A chain of masses between walls with dashpots, driven at its first mass."""
+    """The table of a chain of ``count`` masses between walls, with dashpots, driven at its first mass."""
     springs = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True} | spring]
     lattice = {"cells": count, "cell": {"masses": [1.0], "springs": springs, "contact": [1, 1]}}
     options = DUFFING["nfrc"] | nfrc
@@ -49,7 +49,7 @@ def chain_of(count: int, spring: dict[str, Any], **nfrc: Any) -> dict[str, Any]:
 
 
 def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
-    """By how much a state misses itself after a period of SciPy's integration, relatively; multipliers beyond 1."""
+    """The relative error with which a state returns after a period by SciPy, and the number of multipliers beyond 1."""
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
     period = period_map(states, point, state)
     grows = np.abs(period.multipliers) > 1.001
@@ -58,16 +58,17 @@ def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
 
 @pytest.fixture(scope="module")
 def duffing(tmp_path_factory):
+    """The folder, the steady states and the points of the curve of Duffing's oscillator."""
     folder = tmp_path_factory.mktemp("smooth") / "duffing"
     return folder, *followed(NfrcCase.from_table(DUFFING), folder)
 
 
 def test_its_first_harmonic_is_that_of_duffings_oscillator(duffing):
-    """With one harmonic, a^2 ((1 - Om^2 + 3 a^2/4)^2 + (0.1 Om)^2) = F^2 exactly: the textbook's response."""
+    """With one harmonic the response is exactly that of textbooks, a^2 ((1 - Om^2 + 3 a^2/4)^2 + (0.1 Om)^2) = F^2."""
     _, states, points = duffing
     case = states.case.model_copy(update={"nfrc": states.options.model_copy(update={"harmonics": 1})})
     one = SteadyStates(case, 1.0, 0.1)
-    # States of the whole curve, both sides of the folds among them, as guesses for one harmonic.
+    # States along the whole curve, on both sides of the folds, are guesses for the state with one harmonic.
     for point in points[::8]:
         # The mass moves as the first spring's end, so that its harmonics are those of the elongation.
         guess = point.measured.outputs["spring_harmonics"] + 1j * point.measured.outputs["spring_harmonics_imaginary"]
@@ -89,16 +90,18 @@ def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers
         assert error < 1e-6
         assert regular[number].measured.unstable == growing
         unstable.add(growing)
-    # Otherwise no state between the folds was among those that were tried.
+    # States between the folds, which are unstable, are among those tried.
     assert unstable == {0, 1}
 
 
 def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
-    """The response turns at its peak, and where the frequency right of the backbone is least; to 1 %."""
+    """The folds are at the largest frequency left of the backbone and the least one right of it, to 1 %.
+
+    Both follow from the response with one harmonic. The third harmonic moves the folds by less than 1 %.
+    """
     _, states, points = duffing
-    # Third harmonics, which one harmonic leaves out, move the folds by less than 1 %.
     a = np.linspace(1e-3, 1.5, 20001)
-    # Of a there are two frequencies, left and right of the backbone, up to the peak where they meet.
+    # Every amplitude a below the peak has two frequencies, left and right of the backbone.
     with np.errstate(invalid="ignore"):
         middle = 1 + 0.75 * a**2 - 0.005
         width = np.sqrt(middle**2 - (1 + 0.75 * a**2) ** 2 + (0.1 / a) ** 2)
@@ -113,7 +116,10 @@ def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
     [(2, {"cubic": 2.0}, 0.8, 0.3), (3, {"cubic": 1.0, "quadratic": 0.4}, 0.9, 0.2), (2, {"cubic": -0.2}, 0.8, 0.1)],
 )
 def test_chains_come_back_after_a_period(count, spring, omega, amplitude):
-    """Also where springs soften, and where their force is not odd, which makes a mean and even harmonics."""
+    """States of chains return after a period and are stable as their multipliers are.
+
+    Springs harden or soften. Those with a quadratic part give a mean and even harmonics.
+    """
     options = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega], "harmonics": 15}
     case = NfrcCase.from_table(chain_of(count, spring, **options))
     assert case.nfrc.symmetric is ("quadratic" not in spring)
@@ -134,7 +140,7 @@ def test_a_stop_beside_a_nonlinear_spring():
     assert measured.largest.shape == measured.closed.shape == (1,)
     assert measured.outputs["largest_elongation"].shape == (3,)
     error, _ = misses(states, point)
-    # Harmonics of a bilinear contact fall as k^-4 alone: with 41 of them so much is left.
+    # Harmonics of the motion with a bilinear contact fall as k^-4, so that 41 of them leave an error of this size.
     assert error < 1e-3
 
 
@@ -157,7 +163,7 @@ def test_walls_feel_the_whole_force_of_their_springs():
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_elongations_are_those_of_every_nonlinear_spring(ends):
-    """Their compliance is b^T (K - om^2 M)^-1 b, with a row of b for each spring that the ends leave."""
+    """The compliance of elongations is b^T (K - om^2 M)^-1 b, with a column of b for each nonlinear spring."""
     springs = (Spring(0, 1, 1.0, cubic=1.0), Spring(1, 0, 2.0, next_cell=True, quadratic=1.0))
     chain = Chain(UnitCell((1.0, 0.5), springs, host=0, resonator=1), 3, ends, sites=(1,), clearances=(1.0,))
     rows = []
@@ -180,7 +186,7 @@ def test_elongations_are_those_of_every_nonlinear_spring(ends):
     found = ModalCompliance(chain).at(0.7)[0][1:, 1:]
     dynamic = chain.stiffness_matrix().toarray() - 0.49 * np.diag(chain.masses())
     expected = b.T @ np.linalg.solve(dynamic, b)
-    # The springs are found cell by cell, those in the cell and those to the next one in turn.
+    # The package numbers springs cell by cell, those within the cell and those to the next one in turn.
     order = [row if place.number == 0 else 3 + row for place in places for row in [_rank(places, place)]]
     np.testing.assert_allclose(found, expected[np.ix_(order, order)], atol=1e-10)
 
@@ -204,7 +210,7 @@ def test_files_and_pictures_have_the_springs(duffing, tmp_path):
 
 
 def test_a_curve_over_a_cubic_coefficient(tmp_path):
-    """From the linear oscillator to Duffing's: the frequency stays, the coefficient grows."""
+    """A curve over the cubic coefficient begins with the linear response and decreases as the spring hardens."""
     options = {"over": "lattice.cell.springs[1].cubic", "range": [1e-4, 0.5], "largest_step": 1.0}
     drive = DUFFING["drive"] | {"frequency": 0.8}
     case = NfrcCase.from_table(DUFFING | {"drive": drive, "nfrc": DUFFING["nfrc"] | options})

@@ -1,4 +1,4 @@
-"""Special points of a branch: energy folds, two of a kind in a step, roots that Newton misses, doubled periods."""
+"""Special points of a branch: energy folds, two of a kind in a step, roots that are hard to find, period doublings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def folding_steps(points: list[Point]) -> list[tuple[Point, Point]]:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
-    """Along the branch and against it, two folds are found, where the energy is stationary and a half-trace is 1."""
+    """Two folds are found in both directions along a branch, where the energy is stationary and a half-trace is 1."""
     problem = short_branch.problem
     points = [
         replace(point, tangent=sign * point.tangent, energy_tangent=sign * point.energy_tangent)
@@ -48,7 +48,7 @@ def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
         assert abs(fold.energy_tangent) <= 1e-9 * abs(a.energy_tangent)
         assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
 
-    # Far from the folds none is found.
+    # No fold is found far from these two.
     for a, b in itertools.pairwise(points[-20:]):
         assert not of_kind("fold-energy", locate(problem, a, b))
 
@@ -69,7 +69,8 @@ class RoundedPoint(NamedTuple):
         return replace(frame.measures(attempt, -tangent * np.sign(tangent[-1])), step=self.step)
 
 
-# Three points in a row of the in-phase Hertz branch; the first are at 1.0e6 J, the second at 1.7e7 J.
+# Three successive points of the in-phase Hertz branch for each kind, near 1.0e6 J for the first and 1.7e7 J for the
+# second.
 PAIRS = {
     "symmetry-breaking": [
         RoundedPoint([-9.151145747905344, -9.226299568925315], 0.003148020146748403, 0.0986),
@@ -86,7 +87,10 @@ PAIRS = {
 
 @pytest.mark.parametrize("kind", PAIRS)
 def test_two_special_points_within_a_step_are_found(kind):
-    """A test function that turns just behind zero has one sign at both ends of the step: the step before shows it."""
+    """Two special points within one step are found by means of the step before.
+
+    Their test function passes zero twice, and has the same sign at both ends of the step.
+    """
     problem = Shooting(Dop853Flow(reduced_model("hertz")), MAPS["quarter"])
     before, left, right = (rounded.on_branch(problem) for rounded in PAIRS[kind])
 
@@ -98,7 +102,7 @@ def test_two_special_points_within_a_step_are_found(kind):
         residuals = {"symmetry-breaking": point.half_traces[0] + 1, "fold-energy": point.energy_tangent / point.energy}
         assert abs(residuals[kind]) <= 1e-8
 
-    # Without the point before, nothing tells that the function turned.
+    # Without the point before, the turn of the test function is not seen.
     assert not of_kind(kind, locate(problem, left, right))
 
 
@@ -111,7 +115,7 @@ def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, m
     missed = []
 
     def fails_off_the_middle(self, arclength):
-        # Halves of the step are shorter than 0.9 of it, and do not fail.
+        # Segments longer than 0.9 of the step fail off their middle; halves of the step do not.
         if self.length > 0.9 * b.step and arclength != 0.5 * self.length:
             raise ArithmeticError("no luck")
         return at(self, arclength)
@@ -120,7 +124,7 @@ def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, m
     (second,) = of_kind("fold-energy", locate(problem, a, b, missed=missed))
 
     assert second.energy == pytest.approx(fold.energy, rel=1e-12)
-    # Along the branch the energy is stationary at a fold: its place is less sharp than its energy.
+    # The energy is stationary at a fold, so that the fold's place is less exact than its energy.
     assert second.step == pytest.approx(fold.step, rel=1e-3)
     assert not missed
 
@@ -150,7 +154,10 @@ def first_doubling(problem: Shooting, points: list[Point]) -> Point:
 
 
 def test_a_period_doubled_orbit_is_off_its_parent(short_branch):
-    """Near grazing the first attempt ends on the linear mode passed twice; the switch goes on with a smaller one."""
+    """The switch at a period doubling ends on an orbit of the doubled period, not on the parent passed twice.
+
+    Near grazing the first attempt ends on the linear mode passed twice, and the switch tries a smaller amplitude.
+    """
     problem = short_branch.problem
     point = first_doubling(problem, short_branch.points)
 
@@ -159,6 +166,6 @@ def test_a_period_doubled_orbit_is_off_its_parent(short_branch):
     assert repetitions(doubled_problem, first) == 1
     assert first.energy == pytest.approx(point.energy, rel=1e-3)
     assert first.period == pytest.approx(2 * point.period, rel=1e-3)
-    # The parent itself, taken for an orbit of the doubled period, repeats itself.
+    # The parent itself repeats itself twice in the doubled period.
     parent = replace(first, x=point.x, period=2 * point.period)
     assert repetitions(doubled_problem, parent) == 2

@@ -1,4 +1,4 @@
-"""Special points of frequency responses: kinds and places against multipliers by time integration; their files."""
+"""Special points of frequency responses: kinds and places against multipliers by time integration; files of them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ from vipetsc.modes.response.state import Response
 
 pytestmark = pytest.mark.parallel(1)
 
-# Ranges of frequency in which two masses with a stop have a pair that grows, one that flips, and an uneven motion.
+# Changes of the rig of two masses with a stop, with the ranges in rad/s in which a complex pair of multipliers passes
+# the unit circle, one passes -1, and one passes +1, beyond which the motion is asymmetric.
 PAIR = {"nfrc": {"range": [1.12, 1.24]}}
 FLIP = {"contacts": {"clearance": 0.1}, "nfrc": {"range": [1.05, 1.15]}}
 UNEVEN = {"contacts": {"side": "both", "clearance": 0.05}, "nfrc": {"range": [0.9, 0.95]}}
 
 
 def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
-    """Two masses with these ``changes`` by section, in as long steps as the curve allows."""
+    """The case of two masses with ``changes`` by section, in long steps; ``nfrc`` updates the table [nfrc]."""
     table = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"harmonics": 41, "largest_step": 1.0}}
     table |= {section: table[section] | values for section, values in changes.items()}
     return NfrcCase.from_table(table | {"nfrc": table["nfrc"] | nfrc})
@@ -41,12 +42,12 @@ def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
 
 @pytest.fixture(scope="module")
 def with_pair(tmp_path_factory):
-    """The curve on which a pair grows, and its equations."""
+    """The steady states and the points of the curve on which a pair of multipliers passes the unit circle."""
     return followed(case_of(PAIR), tmp_path_factory.mktemp("pair") / "rig")
 
 
 def multipliers_at(states, point) -> np.ndarray:
-    """Floquet multipliers of a state by differences of the map of a period."""
+    """The Floquet multipliers (4,) of a state, by differences of the period map."""
     state = np.ravel(motion_at(states, point.xi, np.arange(2)))
     return period_map(states, point, state).multipliers
 
@@ -73,11 +74,11 @@ def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tm
             critical = -1 if kind == "period-doubling" else 1
             assert np.abs(found - critical).min() < 1e-2
             assert point.measured.sideband == (0.5 if critical < 0 else 0.0)
-        # None but the critical ones grow.
+        # Only the critical multipliers have a modulus of 1.
         assert point.measured.unstable == 0
         assert np.abs(found).max() < 1.01
 
-    # One grows on one side of it, none on the other.
+    # On one side of a special point its multipliers exceed 1, on the other side none does.
     places = [points.index(point) for point in special]
     for place in places:
         around = sorted(points[near].measured.unstable for near in (place - 1, place + 1))
@@ -86,7 +87,7 @@ def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tm
 
 @pytest.mark.slow
 def test_folds_are_no_branch_points(tmp_path):
-    """At a fold a multiplier is 1 as well; all points that are asked for are those where the number changes."""
+    """Folds are not reported as branch points, although a multiplier is 1 at them as well."""
     states, points = followed(case_of({"nfrc": {"range": [1.2, 1.45]}}, harmonics=31, special_points="all"), tmp_path)
     kinds = [point.kind for point in points if point.kind != "regular"]
     assert kinds.count("fold") == 2
@@ -134,7 +135,7 @@ def test_special_points_are_in_files_and_pictures(tmp_path):
     (picture,) = draw("branches", [tmp_path], formats=("json",))
     assert "period doubling" in picture.read_text()
 
-    # A curve that goes on has the same points.
+    # A curve that is resumed has the same points.
     parts = tmp_path / "parts"
     parts.mkdir()
     few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 8})})
@@ -156,7 +157,7 @@ def test_undecided_states_have_no_special_points_between_them(tmp_path, monkeypa
 
 
 class States:
-    """Steady states of given stability, of which nothing else is given."""
+    """A stand-in for steady states that has the given ``stabilities``, by the first unknown, and nothing else."""
 
     options = SimpleNamespace(special_points="all")
 
@@ -189,7 +190,10 @@ class States:
     ],
 )
 def test_signs_and_numbers_give_the_kinds(right, slope, kinds):
-    """A determinant that changes sign is a real multiplier that passes; pairs are what is left of the number."""
+    """The kinds of special points in a step follow from signs of determinants and the number of multipliers beyond 1.
+
+    A determinant that changes sign is a real multiplier that passes 1 or -1. Complex pairs account for the rest.
+    """
     states = States(Stability(0, 1.0, 1.0), right)
     ends = [Response(xi=np.array([float(i)]), tangent=np.array([tangent])) for i, tangent in enumerate((1.0, slope))]
     assert [kind.name for kind in StabilityChanges(states, *ends).kinds()] == kinds

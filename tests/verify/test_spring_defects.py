@@ -1,4 +1,4 @@
-"""Nonlinear springs in single cells: their motion against SciPy's, their energy, and lattices of equal cells."""
+"""Nonlinear springs in single cells: motion against SciPy, energy, and agreement with lattices of equal cells."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.parallel(1)
 CELLS = 12
 MASSES = (4e-3, 2e-3)
 STIFFNESS = (1e4, 5e3)
-# Quadratic and cubic coefficients by the spring's cell and number: one in a cell, one between cells, one to the wall.
+# Quadratic and cubic coefficients by the spring's cell and number: one in a cell, one between cells, one to a wall.
 TERMS = {(6, 2): (3e6, 4e9), (9, 1): (-2e6, 1e10), (CELLS, 1): (2e6, 5e9)}
 SPRINGS = [
     {"start": 1, "end": 1, "stiffness": STIFFNESS[0], "next_cell": True},
@@ -50,9 +50,9 @@ TABLE: dict[str, Any] = {
     },
     "contacts": {"sites": []},
     "drive": {"amplitude": 0.0},
-    # Near two of the three springs; the waves reach the third, at the wall, within the run.
+    # The struck cell is near two of the three springs; the waves reach the third, at the wall, within the run.
     "initial": {"kind": "velocity", "cell": 7, "velocity": 3.0},
-    # Tolerances far below those of the comparisons, so that these measure the equations, not the steps.
+    # Tolerances are far below those of the comparisons, which therefore measure the equations and not the steps.
     "time": {"end": 0.02, "sample_interval": 2e-4, "engine": "ts", "rtol": 1e-12, "atol": 1e-14},
     "output": {"figures": False, "points": [{"name": "near", "cell": 6, "mass": 2}, {"name": "last", "cell": CELLS}]},
 }
@@ -60,13 +60,16 @@ RING: dict[str, Any] = {"ends": "periodic", "profiles": None}
 
 
 def changed(*, lattice: dict[str, Any] | None = None, **sections: Any) -> Case:
-    """The case of ``TABLE`` with some sections replaced, and some keys of its lattice."""
+    """The case of ``TABLE`` with replaced ``sections`` and keys of its ``lattice``, in which None removes a key."""
     merged = {key: value for key, value in (TABLE["lattice"] | (lattice or {})).items() if value is not None}
     return Case.from_table(TABLE | sections | {"lattice": merged})
 
 
 def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
-    """Forces (mass,) in N of all springs between two walls and their energy in J, spring by spring."""
+    """Forces (mass,) in N of all springs and their energy in J at displacements ``u`` (mass,) in m, between two walls.
+
+    A spring with the elongation z pulls with k z + q z^2 + c z^3.
+    """
     forces = np.zeros(len(u))
     energy = 0.0
     for cell in range(CELLS + 1):
@@ -90,18 +93,18 @@ def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
 
 @pytest.fixture(scope="module", params=["ts", "propagator"])
 def run(request):
-    """The run by each engine."""
+    """The run by either engine."""
     run = run_of(changed(time=TABLE["time"] | {"engine": request.param}))
-    # A refused engine would be replaced by the other one, and pass.
+    # An engine that refuses the case would be replaced by the other one.
     assert run.attrs["statistics"]["engine"] == request.param
     return run
 
 
 @pytest.fixture(scope="module")
 def exact(run) -> np.ndarray:
-    """Displacements before velocities (time, 2 mass) by SciPy, from the run's first sample on."""
+    """Displacements, then velocities (time, 2 mass) by SciPy, from the run's first sample on."""
     masses = np.tile(MASSES, CELLS)
-    # The file's own first sample: how a velocity becomes an initial state is tested elsewhere.
+    # The integration begins with the run's first sample; other tests check how [initial] becomes that state.
     begin = np.concatenate([run[name].values[0].ravel() for name in ("displacement", "velocity")])
 
     def rate(_: float, y: np.ndarray) -> np.ndarray:
@@ -111,15 +114,18 @@ def exact(run) -> np.ndarray:
 
 
 def test_the_motion_is_that_of_scipy(run, exact):
-    """Displacements to 1e-8 of the largest one."""
+    """The run's displacements are those by SciPy, to 1e-8 of the largest one."""
     u = run["displacement"].values.reshape(len(run["time"]), -1)
     assert np.abs(u - exact[:, : 2 * CELLS]).max() < 1e-8 * np.abs(u).max()
 
 
 def test_the_motion_of_identification_is_that_of_scipy(run, exact):
-    """Without a parameter, which has no springs in single cells; to the tolerance of its steps."""
+    """The motion that identification integrates is that by SciPy, to the tolerance of its steps.
+
+    No parameter of an identification stands for springs in single cells, so that derivatives are left out.
+    """
     model = changed().model()
-    # No column of derivatives: only the motion itself is compared.
+    # Without columns of derivatives only the motion itself is computed.
     begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
     watched = np.arange(2 * CELLS)
     coefficients = MotionCoefficients.of(model)
@@ -134,7 +140,7 @@ def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
     stiffness = changed().model().chain.stiffness_matrix()
     linear = [row @ (stiffness @ row) / 2 for row in u]
     np.testing.assert_allclose(run["energy/spring"], energies, rtol=1e-12)
-    # Otherwise a run that drops the nonlinear terms would pass.
+    # The nonlinear terms are large enough for a run without them to fail.
     assert np.abs(energies - linear).max() > 0.05 * energies.max()
     total = run["energy/kinetic"] + run["energy/spring"]
     np.testing.assert_allclose(total, total[0], rtol=1e-9)
@@ -143,7 +149,7 @@ def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
 def test_points_accelerate_by_the_springs_that_they_have(run):
     u = run["displacement"].values.reshape(len(run["time"]), -1)
     forces = np.array([forces_and_energy(row)[0] for row in u])
-    # Mass 2 of cell 6 and mass 1 of cell 12.
+    # The points are mass 2 of cell 6 and mass 1 of cell 12.
     expected = forces[:, [11, 22]] / [MASSES[1], MASSES[0]]
     np.testing.assert_allclose(run["points/acceleration"], expected, atol=1e-9 * np.abs(expected).max())
 
@@ -151,14 +157,14 @@ def test_points_accelerate_by_the_springs_that_they_have(run):
 def test_the_file_says_which_springs_differ(run):
     assert run["lattice/cubic"].values[5].tolist() == [0.0, 4e9]
     assert run["lattice/quadratic"].values[8].tolist() == [-2e6, 0.0]
-    # What does not differ from cell to cell is not stored by cell.
+    # Stiffnesses, which are equal in all cells, are not stored for each cell.
     assert "lattice/stiffness" not in run
     assert Case.from_toml(run.attrs["case"]).model().chain == changed().model().chain
 
 
 @pytest.mark.parametrize("term", ["quadratic", "cubic"])
 def test_equal_lists_are_the_lattice_of_equal_cells(term):
-    """To the last bit, in a ring; and zeros in all cells but one are the spring of that one alone."""
+    """Equal coefficients in a list give the bits of equal cells, and zeros in all cells but one those of one spring."""
     values = {"quadratic": 2e6, "cubic": 4e9}
     springs = [spring | {term: values[term]} for spring in SPRINGS]
     lists = {f"springs[{number}].{term}": [values[term]] * CELLS for number in (1, 2)}
@@ -167,7 +173,7 @@ def test_equal_lists_are_the_lattice_of_equal_cells(term):
     zeros = {f"springs[{number}].{term}": {"cells": others, "value": 0.0} for number in (1, 2)}
     cell = {"masses": list(MASSES), "springs": springs}
 
-    # In a ring, since with walls the list gives the last spring to the right wall, and the cell does to both.
+    # The lattice is a ring. With walls a list has the spring to the right wall only, and a cell those to both walls.
     equal = [run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell}, {"profiles": lists})]
     alone = [
         run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell, "profiles": zeros}, {"profiles": few})
@@ -175,7 +181,7 @@ def test_equal_lists_are_the_lattice_of_equal_cells(term):
     for first, second in (equal, alone):
         for name in ("displacement", "velocity", "energy/kinetic", "energy/spring"):
             assert first[name].values.tobytes() == second[name].values.tobytes()
-    # Otherwise the terms would have no effect, and all would be equal.
+    # The terms have an effect: the two lattices differ.
     assert not np.array_equal(equal[0]["displacement"], alone[0]["displacement"])
 
 
@@ -186,17 +192,17 @@ def test_places_are_those_of_the_profile():
     assert [(place.law.quadratic, place.law.cubic) for place in places] == [TERMS[key] for key in sorted(TERMS)]
     assert [(place.start, place.end) for place in places] == [(10, 11), (16, 18), (22, -1)]
     assert not chain.is_linear
-    # Quadratic terms distinguish the directions.
+    # With quadratic terms the force is not an odd function.
     assert not chain.is_odd
 
 
 def test_what_is_linear_is_that_of_equal_cells():
-    """Modes, and where the lattice differs from its cell, know the linear parts alone."""
+    """Modes and the mean cell of a lattice with nonlinear springs are those of its linear parts."""
     chain = changed().model().chain
     plain = changed(lattice={"profiles": None}).model().chain
     assert chain.linearised() == plain
     assert plain.is_linear and plain.linearised() is plain
-    # The same object: modes are computed once for lattices with equal linear parts.
+    # Lattices with equal linear parts share one object of modes.
     assert linear_modes(chain) is linear_modes(plain)
     assert chain.mean_cell(0, CELLS) == plain.cell
     assert np.flatnonzero(chain.differs).tolist() == [5, 8, CELLS - 1]
@@ -215,7 +221,7 @@ def test_the_system_of_normal_modes_has_the_springs():
 
 
 def test_steady_states_come_back_after_a_period():
-    """By SciPy, to 1e-6, and with the even harmonics of quadratic springs."""
+    """A steady state with even harmonics, by quadratic springs, returns after a period of SciPy's to 1e-6."""
     lattice = TABLE["lattice"] | {"damping": {"mass": 200.0}}
     drive = {"waveform": "harmonic", "amplitude": 6.0, "frequency": 900.0, "cell": 7, "mass": 1}
     options = {"source": "force", "over": "amplitude", "range": [6.0, 8.0], "fixed": [900.0], "harmonics": 15}
@@ -238,7 +244,7 @@ def test_scattered_coefficients_are_drawn_cell_by_cell():
     cubic = changed(lattice=lattice, disorder=disorder).model().chain.spring_terms(0, CELLS).cubic
     assert np.all(cubic[:, 0] == 0.0)
     assert len(np.unique(cubic[:, 1])) == CELLS
-    # Twelve draws have a deviation that is uncertain by a fifth.
+    # The deviation of twelve draws is uncertain by a fifth.
     assert np.std(cubic[:, 1] / 4e9) == pytest.approx(0.1, rel=0.5)
 
 
@@ -257,7 +263,7 @@ SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
 )
 def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):
     table = TABLE | {"contacts": SITES} | sections
-    # Each verb's case has sections of its own; those that it does not have would be a problem of their own.
+    # Each verb's case reads sections of its own. Others are left out, since they would be a problem by themselves.
     readable = {name: value for name, value in table.items() if value is not None and name in kind.keywords()}
     with pytest.raises(CaseError) as caught:
         kind.from_table(readable)
@@ -266,7 +272,7 @@ def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reas
 
 
 def test_a_right_wall_moves_a_linear_spring():
-    """Nonlinear springs elsewhere do not matter to it."""
+    """A right wall with a linear spring may move, whatever springs there are elsewhere."""
     profiles = {"springs[1].cubic": {"cells": [9], "value": 1e10}}
     assert Case.from_table(TABLE | {"drive": WALL, "initial": {}, "lattice": TABLE["lattice"] | {"profiles": profiles}})
 
@@ -281,12 +287,15 @@ def test_a_wrong_name_is_answered_with_the_names_that_there_are():
     [
         (6, 2, "quadratic", 7, "spring 2 of cell 6"),
         (9, 1, "cubic", 9, "spring 1 of cell 9"),
-        # To the wall on the right: it is compressed by a motion towards it, on the side where its force falls off.
+        # A motion towards the right wall compresses the spring to it, on the side where its force falls off.
         (CELLS, 1, "quadratic", CELLS, f"spring 1 of cell {CELLS}"),
     ],
 )
 def test_a_run_that_tears_a_spring_off_names_it(cell, number, name, initial, spring):
-    """A softening spring pulls back up to z = -k/q, or (k/|c|)^(1/2): beyond, it pushes its masses apart for ever."""
+    """A run stops and names the spring when a softening one passes z = -k/q, or |z| = (k/|c|)^(1/2) for a cubic one.
+
+    Beyond that elongation the spring's force has the wrong sign and drives its masses apart for ever.
+    """
     k = STIFFNESS[number - 1]
     value = {"quadratic": -1e4 * k, "cubic": -1e8 * k}[name]
     if initial == CELLS:

@@ -1,4 +1,4 @@
-"""Stops of experiments: laws that differ from site to site, one side alone, damping factors by name."""
+"""Stops as in experiments: laws that differ from site to site, stops on one side, damping factors by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vipetsc.lattice import Contact
 
 
 def differing(engine="propagator", **contacts):
-    """Three sites near the drive, each with a law and stops of its own."""
+    """The case of three sites near the drive, each with a law and stops of its own."""
     table = {"law": "hertz", "exponent": 1.25, "sites": [4, 5, 9], "clearance": [3e-5, 2e-5, 1e-5], "each": DIFFERING}
     return small_case(contacts=table | contacts, time={"end": 0.06, "engine": engine, "rtol": 1e-10})
 
@@ -27,7 +27,7 @@ def test_sites_that_differ_are_followed_alike_by_both_engines():
     site = first["impacts/site"].values
     assert np.array_equal(site, second["impacts/site"].values)
 
-    # Sites 1 and 3 have a stop on one side alone, the other one is infinitely far.
+    # Sites 1 and 3 have a stop on one side alone; the clearance of the other side is infinite.
     sides = {number: set(first["impacts/side"].values[site == number]) for number in (1, 2, 3)}
     assert sides == {1: {1}, 2: {1, -1}, 3: {-1}}
     assert np.isinf(first["sites/clearance"].values[2])
@@ -36,7 +36,7 @@ def test_sites_that_differ_are_followed_alike_by_both_engines():
     work = first["energy/work"].values
     spent = sum(first[f"energy/{name}"].values for name in ("dissipated", "kinetic", "spring", "contact"))
     assert np.abs(work - spent).max() < 1e-8 * work.max()
-    # Of the three, site 3 has restitution 1.
+    # Site 3 has restitution 1, the others have less.
     lost = np.bincount(site, first["impacts/loss"].values)[1:]
     assert lost[0] > 0
     assert lost[1] > 0
@@ -66,7 +66,7 @@ def test_lists_of_equal_values_give_the_bits_of_the_one_value():
     ],
 )
 def test_two_masses_rebound_as_each_law_predicts(factor, damping, rebound, n):
-    """A normal impact with r = 1/2, integrated, has the law's own restitution, whatever exponent and mass are."""
+    """An integrated impact with r = 1/2 has the effective restitution of the law's factor, for any exponent."""
     contact = Contact("power", 1e5, 0.5, factor=factor, exponent=n)
     if damping is not None:
         assert contact.damping == damping

@@ -1,4 +1,4 @@
-"""Struck masses move as theory says, on both engines, and such runs have pictures and measures."""
+"""Struck masses move as theory says, in both engines, and such runs have measures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def test_a_struck_bead_gives_its_velocity_to_the_next():
-    """Of two equal beads the struck one stops and the other goes on, as momentum and energy ask."""
+    """A struck bead gives its whole velocity to an equal one, by conservation of momentum and energy."""
     case = Case(
         lattice={"cells": 2, "ends": "free", "cell": {"masses": [2.05e-3]}},
         contacts={"stiffness": 7.4e9, "sites": [1], "next_cell": True, "side": "minus", "clearance": 1e-6},
@@ -26,15 +26,15 @@ def test_a_struck_bead_gives_its_velocity_to_the_next():
     assert velocity[0].tolist() == [0.5, 0.0]
     assert velocity[-1] == pytest.approx([0.0, 0.5], abs=1e-9)
     assert result.statistics["episodes"] == 1
-    # The work begins with what the lattice was given.
+    # The work begins with the initial energy.
     assert data["energy/work"].values[0] == pytest.approx(0.5 * 2.05e-3 * 0.5**2)
-    # The first contact is after the clearance.
+    # Contact begins when the struck bead has passed the clearance.
     assert data["impacts/onset"].values[0] == pytest.approx(1e-6 / 0.5)
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_a_struck_chain_moves_as_its_modes(engine):
-    """Without contacts the motion is the sum of all modes, each with its part of the two velocities."""
+    """A struck lattice without contacts moves as the sum of its modes, phi_j (phi_j^T M v0) sin(w_j t)/w_j."""
     springs = [
         {"start": 1, "end": 1, "stiffness": 2.0e4, "next_cell": True},
         {"start": 1, "end": 2, "stiffness": 6.0e3},

@@ -1,4 +1,4 @@
-"""Figures of wavenumber scattering show what two small sweeps hold: one with full fields, one of curves."""
+"""Figures of wavenumber scattering show the values in two small sweeps, one with full fields and one of curves."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WHOLE = {
 }
 CURVES = {
     "name": "curves",
-    # Curves need no fields: samples are measured as they come, and few are kept.
+    # Curves need no fields: samples are measured while they are computed, and few are stored.
     "output": {"stride": 4},
     "sweep": {
         "measures": ["entropy"],
@@ -46,13 +46,13 @@ CURVES = {
         "contacts": {"sites": [2, 3]},
     },
 }
-# Figures that need the members' fields, and those of the ensemble's curves.
+# The figures that need the members' fields, and the figures of the ensemble's curves.
 OF_FIELDS = ("amplitudes", "wavelets", "partition", "partition_explained", "reconstruction", "entropy_maps")
 OF_CURVES = ("entropy", "entropy_all", "entropy_history")
 
 
 def swept(table, tmp_path_factory):
-    """The ensemble of a sweep with ``table`` over the common sections."""
+    """The ensemble of a sweep of ``BASE`` updated by ``table``."""
     folder = tmp_path_factory.mktemp(table["name"])
     assert run_sweep(Sweep.from_table(BASE | table), folder).complete
     return open_ensemble(folder)
@@ -60,21 +60,21 @@ def swept(table, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Three amplitudes with all fields: without contact, with a few, with many."""
+    """The ensemble of three amplitudes with all fields: without contacts, with a few, and with many."""
     return swept(WHOLE, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
-    """Both readings, two wavenumbers and two numbers of sites over five amplitudes."""
+    """The ensemble of both readings, two wavenumbers and two numbers of sites over five amplitudes."""
     return swept(CURVES, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def entropy_figures(curves):
-    """The entropy figures of the curves that are read, and one of the other reading and wavenumber.
+    """Entropy figures by name: those of one reading and wavenumber, and one of the other reading and wavenumber.
 
-    Drawing them costs more than all that is read from them.
+    They are drawn once, since drawing takes longer than all checks of them.
     """
     offered = offered_drawings("entropy", [curves])
     assert len(offered) == 2 * 2 * len(AVERAGES)
@@ -91,13 +91,13 @@ def style():
 
 
 def only(name, study):
-    """The one figure of ``name`` that a study yields."""
+    """The only figure of ``name`` that a study offers."""
     (drawing,) = offered_drawings(name, study).values()
     return drawing.draw()
 
 
 def offered_drawings(name, study):
-    """Suffixes and drawings of ``name`` that a study offers."""
+    """The drawings of ``name`` that a study offers, by their suffixes."""
     return {drawing.stem: drawing for drawing in FIGURES[name].function(Sweeps(study, Files()))}
 
 
@@ -145,14 +145,17 @@ def test_suffixes_distinguish_figures(curves):
     names = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
 
-    # Of several sweeps the name comes first.
+    # With several sweeps, names begin with that of the sweep.
     named = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves, curves], Files()))]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 
 @pytest.mark.slow
 def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
-    """Energies over the amplitude's square in cells, wavenumbers and on the dispersion, with branches and sites."""
+    """Panels show energies divided by the square of the amplitude, each row on one scale, with branches and sites.
+
+    The three rows are energies over cells, over wavenumbers and on the dispersion.
+    """
     figure = only("amplitudes", [whole])
     assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
 
@@ -163,11 +166,11 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
         images = [axes.images[0] for axes in panels[3 * row : 3 * row + 3]]
         assert len(limits(images)) == 1
 
-        # A row has one scale, which ends at its largest value.
+        # A row has one scale of colours, which ends at the row's largest value.
         largest = 0.0
         for image, folder, amplitude in zip(images, members(whole), (0.1, 2.0, 20.0), strict=True):
             with h5py.File(folder / "analysis.h5") as file:
-                # Energies grow as the square: over it, three amplitudes can have one scale.
+                # Divided by the square of the amplitude, energies of three amplitudes fit on one scale.
                 expected = file[name][...].T / amplitude**2
             np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
             largest = max(largest, expected.max())
@@ -178,7 +181,7 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
     for axes in panels[6:]:
         for branch in range(2):
             kappa, frequency = axes.lines[branch].get_data()
-            # The branches are of the linear lattice, and not measured.
+            # The dashed branches are those of the linear lattice.
             assert axes.lines[branch].is_dashed()
             np.testing.assert_allclose(1e3 * frequency, bloch(cell, np.pi * kappa).frequency[:, branch])
 
@@ -189,14 +192,14 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
 
 @pytest.mark.slow
 def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
-    """Four snapshots of three amplitudes: the transform of the host's velocity, over the amplitude."""
+    """Panels show the transform of the host's velocity over the amplitude, at four times for three amplitudes."""
     figure = only("wavelets", [whole])
     panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
     assert len(limits([axes.images[0] for axes in panels.flat])) == 1
 
     for axes in panels.flat:
         black = next(line for line in axes.lines if to_rgba(line.get_color()) == (0, 0, 0, 1))
-        # In units of pi a cell.
+        # The wavenumber is in units of pi per cell.
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
@@ -208,7 +211,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     with open_run(members(whole)[2] / "run.h5") as run:
         site = np.min(run["sites/cell"].values)
         wave = DrivenWave.of(Case.of(run))
-        # The second one is taken when the packet is halfway to the first site.
+        # The second snapshot is taken when the packet is halfway to the first site.
         assert times[1] - times[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
         snapshot = int(np.argmin(np.abs(field_time(run) - times[1])))
         # The diatomic cell's first mass is the host.
@@ -233,7 +236,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
         np.testing.assert_array_equal(image.get_array(), field[b].T)
 
     (band,) = [axes for axes in figure.axes if "Band 2" in axes.get_title(loc="left")]
-    # The thick ones are the bins, coloured as their panels.
+    # Thick lines are the bins, in the colours of their panels.
     segments = [line for line in band.lines if line.get_linewidth() == 3]
     for line, colour in zip(segments, bin_colours(12), strict=True):
         np.testing.assert_allclose(to_rgba(line.get_color()), colour)
@@ -248,7 +251,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
 
 @pytest.mark.slow
 def test_a_partition_into_one_bin_is_drawn(whole):
-    """One map with all of the energy, and nothing in the panels of the bins that there are not."""
+    """A partition into one bin has one map, of all the energy, and no panels of other bins."""
     with Files() as files:
         (series,) = series_of(Sweeps([whole], files), FIELD)
         runs = []
@@ -271,14 +274,14 @@ def test_a_partition_into_one_bin_is_drawn(whole):
 @pytest.mark.slow
 def test_explained_inverse_is_the_filter_banks(whole):
     (drawing,) = FIGURES["partition_explained"].function(Sweeps([whole], Files()))
-    # What is said of the other amplitudes of the sweep does not belong below it.
+    # The figure shows one amplitude, and its caption must not name the others.
     assert [member.name for member in drawing.shown] == ["2 N"]
     figure = drawing.draw()
     titled = [(axes.get_title(loc="left"), axes) for axes in figure.axes]
     snapshot = next(axes for title, axes in titled if title.startswith("(a)")).lines[0].get_ydata()
     parts = filter_bank(CELLS).split(np.array(snapshot))
 
-    # The shortest waves stand on top.
+    # The shortest waves are at the top.
     bins = reversed(shown_bins(5 * np.pi / 9, 12, 4))
     for numeral, b in zip(("i", "ii", "iii", "iv"), bins, strict=True):
         title, trace = next(pair for pair in titled if pair[0].endswith(f"(m/s) of $K_{{{b + 1}}}$"))
@@ -288,7 +291,7 @@ def test_explained_inverse_is_the_filter_banks(whole):
 
 @pytest.mark.slow
 def test_bins_of_another_number_are_not_explained_with_those_of_this_program(whole):
-    """The analysis is asked for anew, where the traces would belong to other bins."""
+    """An analysis with another number of bins than this program's is refused, as the traces would be of other bins."""
     with Files() as files:
         (series,) = series_of(Sweeps([whole], files), FIELD)
         fewer = [
@@ -301,7 +304,7 @@ def test_bins_of_another_number_are_not_explained_with_those_of_this_program(who
 @pytest.mark.slow
 @pytest.mark.parametrize("band", [0, 2])
 def test_the_driven_wavenumber_is_marked_if_there_is_one(whole, band):
-    """A drive in a gap has none, and all the rest of the picture."""
+    """The driven wavenumber is marked in each column; a drive in a gap has no wavenumber and no mark."""
     with Files() as files:
         (series,) = series_of(Sweeps([whole], files), *ROWS)
         wave = series.wave
@@ -309,7 +312,7 @@ def test_the_driven_wavenumber_is_marked_if_there_is_one(whole, band):
             wave = DrivenWave(band=0, wavenumber=np.nan, speed=np.nan)
         with rc_style():
             figure = amplitudes.__wrapped__(series._replace(wave=wave))
-    # Sites have the same mark, with a label.
+    # Contact sites have marks of the same colour, with a label.
     lines = [line for axes in figure.axes for line in axes.lines]
     marks = [line for line in lines if line.get_color() == SKY and line.get_label() != "contact sites"]
     assert len(marks) == (3 if band else 0)
@@ -317,7 +320,7 @@ def test_the_driven_wavenumber_is_marked_if_there_is_one(whole, band):
 
 @pytest.mark.parametrize(("swept", "shown"), [([0.0, 1.0, 2.0, 4.0, 8.0], [1.0, 4.0, 8.0]), ([0.0, 1.0, 2.0], [])])
 def test_a_member_without_a_drive_is_none_of_the_three_amplitudes(monkeypatch, swept, shown):
-    """Its energies are not divided by the square of 0."""
+    """A member with amplitude 0 is none of the three shown, as energies are divided by the amplitude's square."""
     monkeypatch.setattr(sweep_members, "axes", lambda _: ("amplitude",))
     rows = [xr.Dataset(coords={"amplitude": amplitude}) for amplitude in swept]
     monkeypatch.setattr(sweep_members, "whole_members", lambda _: [(row, Path()) for row in rows])
@@ -340,13 +343,13 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
         for line, values in zip(energy.lines, expected, strict=True):
             np.testing.assert_allclose(line.get_ydata() * amplitude**2, values, rtol=1e-12)
 
-        # Claim C6 of the paper: within one per cent.
+        # The second line is the paper's claim C6, an error of at most one per cent.
         moving = measured["error"] > 0
         np.testing.assert_array_equal(error.lines[0].get_ydata()[moving], measured["error"][moving])
         assert list(error.lines[1].get_ydata()) == [0.01, 0.01]
         np.testing.assert_array_equal(cross.lines[0].get_ydata(), measured["cross_share"])
 
-        # What the sum of the parts' energies misses, where there is energy to divide by.
+        # The cross terms are the part of the energy that the parts' energies miss, checked where the energy is large.
         late = measured["kinetic"] > 0.5 * measured["kinetic"].max()
         missing = 1 - of_parts[late] / measured["kinetic"][late]
         np.testing.assert_allclose(cross.lines[0].get_ydata()[late], missing, rtol=1e-9)
@@ -359,7 +362,7 @@ CALIBRATED = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
 @pytest.mark.parametrize("average", AVERAGES)
 @pytest.mark.parametrize(("column", "sites"), [(0, 2), (1, 3)])
 def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures, average, column, sites):
-    """Curves are normalised to [0.01, 1], their error bars with them; the reading that is not meant is grey."""
+    """Curves are the ensemble's, normalised to [0.01, 1] with their error bars; the other reading is grey."""
     grid = np.reshape(entropy_figures[f"calibrated-5pi-9-{average}"].axes, (2, 2))
     upper, lower = grid[:, column]
     assert (upper.get_yscale(), lower.get_xscale(), lower.get_yscale()) == ("linear", "log", "log")
@@ -374,7 +377,7 @@ def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures
         np.testing.assert_allclose(line.get_xdata(), curves["amplitude"].values)
         np.testing.assert_allclose(line.get_ydata(), normalised(raw))
         assert to_rgba(line.get_color()) == to_rgba(COLOURS[average])
-        # A bar reaches from below to above by the error each.
+        # A bar extends by the error in either direction.
         halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
         np.testing.assert_allclose(halves, 0.99 * error / np.ptp(raw))
 
@@ -410,13 +413,13 @@ def test_entropy_fits_are_the_ensembles(curves, entropy_figures, average, column
 
 
 def test_some_configuration_has_a_power_law(curves):
-    # Otherwise the test of the fits never sees one.
+    # The test of the fits sees at least one power law.
     assert np.isfinite(curves["fits/entropy/energy_weighted/factor"]).any()
 
 
 @pytest.mark.slow
 def test_all_panels_by_wavenumber_and_configuration(curves):
-    """Rows are wavenumbers, columns configurations, of one reading and one average."""
+    """A figure of one reading and one average has a row for each wavenumber and a column for each configuration."""
     offered = offered_drawings("entropy_all", [curves])
     assert len(offered) == 2 * len(AVERAGES)
 
@@ -448,7 +451,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
         above_threshold = weight > LEAST_WEIGHT * weight.max()
         np.testing.assert_array_equal(shown[above_threshold], local[above_threshold])
         assert np.isnan(shown[~above_threshold]).all()
-        # Otherwise no cell is quiet, and blank ones were not tested.
+        # Some cells are quiet.
         assert (~above_threshold).any()
 
         lines = {line.get_label(): line for line in over.lines}
@@ -466,7 +469,7 @@ def test_entropy_history_is_an_image_over_amplitude(curves):
         row = select(curves, **fixed)
         expected = row["entropy/history"].values
         np.testing.assert_array_equal(np.reshape(mesh.get_array(), expected.shape), expected)
-        # As vectors, a PDF of it would have a polygon for each cell of the mesh.
+        # A PDF with vectors would have a polygon for each cell of the mesh.
         assert mesh.get_rasterized()
 
         # The onset by the linear wave lies below the first amplitude with contact.

@@ -1,4 +1,4 @@
-"""Stops without clearance: contacts that touch at rest, against an independent integration of the same equations."""
+"""Contacts that touch at rest, compared with an independent integration and with motions in closed form."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EXPONENTS = {"hertz": 1.5, "bilinear": 1.0}
 
 
 class Stop(NamedTuple):
-    """A contact of the reference: numbers of its masses, -1 for ground; its side, kc in N/m^n and n."""
+    """A contact of the reference: the numbers of its masses (-1 for the ground), its side, kc in N/m^n, and n."""
 
     host: int
     resonator: int
@@ -38,7 +38,7 @@ class Stop(NamedTuple):
 
 
 def sprung_case(engine: str = "ts", **contacts: object) -> Case:
-    """A chain of two masses a cell under a burst, with one site whose one stop has no clearance."""
+    """The case of a two-mass chain under a burst, with one site that has one stop without clearance."""
     springs = [
         {"start": 1, "end": 2, "stiffness": STIFFNESS},
         {"start": 2, "end": 1, "stiffness": STIFFNESS, "next_cell": True},
@@ -52,7 +52,7 @@ def sprung_case(engine: str = "ts", **contacts: object) -> Case:
 
 
 def bead_case(engine: str = "ts", cells: int = 4) -> Case:
-    """Beads of two masses that only their contacts join, all of which touch at rest: within cells and between them."""
+    """The case of beads of two masses, which are joined only by contacts that touch at rest, in and between cells."""
     pairs = [[1, 2]] * cells + [[2, 1]] * (cells - 1)
     contacts = {
         "clearance": 0.0,
@@ -69,22 +69,25 @@ def bead_case(engine: str = "ts", cells: int = 4) -> Case:
 
 
 def run_complete(case: Case) -> xr.Dataset:
-    """The run of a case, which must come to its end with the engine that it names and with a closed ledger."""
+    """The run of a case; asserts that it is complete, by the engine that the case names, and that its ledger closes."""
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
     assert result.complete, result.sentence
-    # A refused engine would be replaced by the other one, and be compared with itself.
+    # An engine that refuses a case is replaced by the other one, which would be compared with itself.
     assert result.statistics["engine"] == case.time.engine
 
     run = memory.dataset
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
-    # A contact that were entered or left at the wrong instant would open the balance.
+    # A contact that begins or ends at a wrong time would show in the balance.
     assert np.abs(run["energy/work"] - stored).max() < 1e-8 * run["energy/work"].max()
     return run
 
 
 def integrate(stiffness: np.ndarray, stops: Sequence[Stop], drive: dict[str, float], times: np.ndarray) -> np.ndarray:
-    """Displacements (time, mass) of masses with the matrix ``stiffness`` under a burst on the first: SciPy's DOP853."""
+    """Displacements (time, mass) in m at ``times``, by SciPy, of masses with a ``stiffness`` matrix and ``stops``.
+
+    The burst of ``drive`` acts on the first mass.
+    """
     n = len(stiffness)
     mass = np.tile(MASSES, n // 2)
     omega = drive["frequency"]
@@ -103,7 +106,7 @@ def integrate(stiffness: np.ndarray, stops: Sequence[Stop], drive: dict[str, flo
                 force[stop.host] += push
         return np.concatenate([y[n:], force / mass])
 
-    # The steps are short enough to see every contact.
+    # Steps are short enough for no contact to be passed over.
     longest = (times[1] - times[0]) / 4
     span = (0, times[-1])
     solution = solve_ivp(rate, span, np.zeros(2 * n), "DOP853", times, rtol=1e-12, atol=1e-18, max_step=longest)
@@ -111,13 +114,13 @@ def integrate(stiffness: np.ndarray, stops: Sequence[Stop], drive: dict[str, flo
 
 
 def chain_stiffness() -> np.ndarray:
-    """The matrix of the springs of ``sprung_case``, which are all alike, between two walls."""
+    """The stiffness matrix (mass, mass) in N/m of the equal springs of ``sprung_case``, between two walls."""
     n = 2 * CELLS
     return STIFFNESS * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
 
 
 def difference(run: xr.Dataset, expected: np.ndarray) -> float:
-    """The largest difference of displacements from those ``expected`` (time, mass), over the largest of them."""
+    """The largest error of displacements against those ``expected`` (time, mass), divided by the largest of these."""
     found = run["displacement"].values.reshape(expected.shape)
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
@@ -150,7 +153,10 @@ def test_touching_beads_of_two_masses_are_those_of_an_independent_solver(engine)
 
 @pytest.mark.slow
 def test_engines_log_the_same_impacts_of_a_stop_without_clearance():
-    """A site at rest that a front below all tolerances reaches has no impact: the engines resolve it differently."""
+    """Both engines log the same impacts of a stop without clearance.
+
+    The tiny front of the wave, which the engines resolve differently below all tolerances, makes no impact.
+    """
     runs = [run_complete(sprung_case(engine)) for engine in ("ts", "propagator")]
     first, second = ({name: run[f"impacts/{name}"].values for name in ("onset", "indentation")} for run in runs)
     assert len(first["onset"]) == len(second["onset"]) > 5
@@ -164,7 +170,7 @@ def test_with_a_floor_a_touching_stop_dissipates_alike_in_both_engines():
     runs = [run_complete(sprung_case(engine, **lossy)) for engine in ("ts", "propagator")]
     found, expected = (run["displacement"].values for run in runs)
     assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
-    # Displacements alone would not show a loss that is booked wrongly.
+    # Displacements alone would not show a loss that is recorded wrongly.
     losses = [run["energy/dissipated"].values[-1] for run in runs]
     assert losses[0] > 0 and losses[0] == pytest.approx(losses[1], rel=1e-6)
 
@@ -180,7 +186,7 @@ def test_a_loss_in_a_contact_that_touches_at_rest_is_refused(each):
 
 
 def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():
-    # So weak that the contact's force is below all tolerances.
+    # The drive is so weak that the contact's force is below all tolerances.
     case = sprung_case().varied(time={"end": 1e-3, "sample_interval": 2e-4}, drive={"amplitude": 1e-30})
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
@@ -190,7 +196,10 @@ def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():
 @pytest.mark.parametrize(("law", "bound"), [("bilinear", 1e-9), ("hertz", 1e-8)])
 @pytest.mark.parametrize("precompression", [0.0, 1e-7])
 def test_steps_end_where_pressed_contacts_open_and_close(law, bound, precompression):
-    """A ring of beads that part and meet a hundred times: within a step each time would cost 1e-8 to 5e-7."""
+    """The energy error of a ring of beads that part and meet a hundred times is small, as steps end at each change.
+
+    Changes within steps would leave errors of 1e-8 to 5e-7.
+    """
     springs = [{"start": 1, "end": 2, "stiffness": 1e2}, {"start": 2, "end": 1, "stiffness": 1e2, "next_cell": True}]
     each = {"pair": [[1, 2]] * 2 + [[2, 1]] * 2, "next_cell": [False] * 2 + [True] * 2}
     stiffness = {"hertz": 1e9, "bilinear": 1e6}[law]
@@ -212,14 +221,17 @@ def test_steps_end_where_pressed_contacts_open_and_close(law, bound, precompress
 
 @pytest.mark.parametrize("side", ["plus", "minus"])
 def test_a_mass_that_leaves_a_bilinear_stop_and_comes_back_has_the_exact_motion(side):
-    """Pressed by a load P = k d: u'' = -omega^2 u while it is on the stop, u > -d, and u'' = P/m until it is back."""
+    """A mass pressed to a bilinear stop by a load P = k d bounces as in closed form.
+
+    On the stop, u > -d, its motion is u'' = -omega^2 u; away from the stop it is u'' = P/m.
+    """
     mass = 0.02
     omega = 3e4
     depth = 4e-6
     speed = 0.13
     sign = 1 if side == "plus" else -1
     stop = {"law": "bilinear", "stiffness": mass * omega**2, "side": side, "clearance": 0.0, "precompression": depth}
-    # Its neighbours, without which there is no lattice, pull at it with 1e-13 of the load.
+    # The mass needs neighbours to be a lattice; they pull at it with 1e-13 of the load.
     weak = {"start": 1, "end": 1, "stiffness": 1e-6, "next_cell": True}
     case = Case.from_table({
         "lattice": {"cell": {"masses": [mass], "springs": [weak]}, "cells": 4, "ends": "free"},
@@ -232,7 +244,7 @@ def test_a_mass_that_leaves_a_bilinear_stop_and_comes_back_has_the_exact_motion(
     dataset, result = simulated(case)
     assert result.statistics["engine"] == "propagator"
 
-    # On the stop u = A sin(phase), and it leaves at the phase whose sine is -d/A; it is back as fast as it left.
+    # On the stop u = A sin(phase), and the mass leaves where the sine is -d/A. It comes back as fast as it left.
     amplitude = speed / omega
     leaving = np.arcsin(depth / amplitude)
     rebound = np.sqrt(speed**2 - (depth * omega) ** 2)

@@ -1,4 +1,4 @@
-"""Steady states of rigs whose stop touches at rest: a bilinear oscillator, exactly and by SciPy."""
+"""Steady states of rigs whose stop touches at rest, against the exact bilinear oscillator and SciPy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def touching(table: dict[str, Any] = ONE_MASS, contacts: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
-    """A rig with a stop that touches at rest."""
+    """The case of a rig with a stop that touches at rest; ``contacts`` and ``nfrc`` update these tables."""
     options = {
         "source": "force",
         "over": "frequency",
@@ -33,7 +33,7 @@ def touching(table: dict[str, Any] = ONE_MASS, contacts: dict[str, Any] | None =
 
 
 def error_of_a_period(states: SteadyStates, point: Any) -> tuple[float, int]:
-    """By how much a state misses itself after a period of time integration, relatively; multipliers beyond 1."""
+    """The relative error with which a state returns after a period by SciPy, and the number of multipliers beyond 1."""
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
     period = period_map(states, point, state)
     grows = np.abs(period.multipliers) > 1.001
@@ -41,7 +41,10 @@ def error_of_a_period(states: SteadyStates, point: Any) -> tuple[float, int]:
 
 
 def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
-    """Half a period at sqrt(1.5) rad/s and half a period at sqrt(21.5) rad/s, whatever the amplitude."""
+    """The resonance is that of a bilinear oscillator, 2 w1 w2/(w1 + w2) with w1 = sqrt(1.5), w2 = sqrt(21.5) rad/s.
+
+    The oscillator swings half a cycle at each of the two frequencies, whatever the amplitude.
+    """
     states, points = followed(touching(), tmp_path / "one")
     soft, stiff = np.sqrt([1.5, 21.5])
     resonance = 2 * soft * stiff / (soft + stiff)
@@ -57,7 +60,10 @@ def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
 
 
 def test_below_twice_its_resonance_a_motion_of_twice_the_period_grows():
-    """Stiff for half a period and soft for the other, the stop drives a motion of twice the period: it is unstable."""
+    """At 4.5 rad/s the motion of the drive's period is unstable, and one of twice the period grows (a multiplier < -1).
+
+    The stiffness, which alternates between soft and stiff, excites it.
+    """
     case = touching(range=[4.5, 5.0], harmonics=31)
     states = SteadyStates(case, 1.0, 0.2)
     point = first_state(states)
@@ -76,7 +82,7 @@ def test_it_is_proportional_to_the_drive(tmp_path):
 
 
 def test_hertzian_stops_that_touch_beside_one_that_does_not():
-    """The stop of the first mass touches at rest, the second one is met; the state comes back after a period."""
+    """A state with a Hertz stop that touches at rest and a bilinear stop that is met returns after a period."""
     each = {"side": ["plus", "minus"], "law": ["hertz", "bilinear"], "stiffness": [9.0, 4.0]}
     stops = {"sites": [1, 2], "pair": [0, 1], "each": each, "clearance": [0.0, 0.3], "restitution": 1.0}
     table = TWO_MASSES | {"contacts": stops}
@@ -97,7 +103,10 @@ def test_a_wave_is_refused():
 
 
 def test_a_lattice_without_damping_has_a_state_between_its_resonances():
-    """Dashpots of the continuation keep the state from the resonance that a growing force passes; none is left."""
+    """A first state of an undamped lattice between its resonances is found, and contains no dashpots.
+
+    The search for it uses temporary dashpots, which keep it from the resonance that a growing force passes.
+    """
     cell = {
         "masses": [0.004, 0.002],
         "springs": [
@@ -114,5 +123,5 @@ def test_a_lattice_without_damping_has_a_state_between_its_resonances():
     states = SteadyStates(case, 1.0, 1000.0)
     point = first_state(states)
     assert np.abs(states.residual(point.xi, states.shift_near(point.xi))).max() < 1e-10
-    # Nothing takes up energy: all phases are those of the drive or opposite to it.
+    # Without dissipation all motions are in phase with the drive or in antiphase.
     assert np.abs(states.measured(point.xi).harmonics.imag).max() < 1e-9 * states.clearance

@@ -30,12 +30,12 @@ class Reference:
         self.resonator = first + chain.cell.resonator
         self.driven = self.model.drive_cell * chain.cell.dofs + self.model.drive_mass
 
-        # +1 or -1 where a contact is closed, and the relative velocity at its onset.
+        # The side +1 or -1 of a closed contact (0: open), and the relative velocity at its onset.
         self.side = np.zeros(len(first), int)
         self.approach = np.ones(len(first))
 
     def rate(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Time derivative of displacements and velocities."""
+        """The time derivative of the state ``y``, displacements and velocities (2n,)."""
         u, v = y.reshape(2, -1)
         force = self.pull @ u
         if self.side.any():
@@ -44,7 +44,7 @@ class Reference:
         return np.concatenate([v, force / self.masses])
 
     def burst(self, t: float) -> float:
-        """Force of the drive in N, eq. (3) of the paper."""
+        """The force of the drive in N at time ``t`` in s, by eq. (3) of the paper."""
         drive = self.model.drive
         if not 0 < t < drive.duration:
             return 0.0
@@ -52,7 +52,7 @@ class Reference:
         return drive.window_amplitude * (1 - math.cos(phase / drive.cycles)) * math.sin(phase)
 
     def contact_forces(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Forces of the closed contacts on all masses (SPEC section 2)."""
+        """Forces (mass,) in N of the closed contacts (SPEC section 2)."""
         contact = self.model.contact
         w = u[self.resonator] - u[self.host]
         w_rate = v[self.resonator] - v[self.host]
@@ -66,7 +66,7 @@ class Reference:
         return forces
 
     def changes(self) -> list:
-        """Events of SciPy: where an open contact closes on either side, and where a closed one opens."""
+        """Events for SciPy: an open contact closes on either side, or a closed one opens."""
         events = []
         for site, closed in enumerate(self.side):
             for side in (closed,) if closed else (1, -1):
@@ -78,11 +78,11 @@ class Reference:
         return events
 
     def change(self, site: int, side: int):
-        """The indentation of a site on one ``side``, as a function of the state."""
+        """The indentation in m of a ``site`` on one ``side``, as a function of time and state."""
         return lambda _, y: side * (y[self.resonator[site]] - y[self.host[site]]) - self.clearance[site]
 
     def integrate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities (time, cell, dof), and the onsets as rows of time, site and approach velocity."""
+        """Velocities (time, cell, dof) in m/s, and onsets as rows of time, site from 0 and approach velocity."""
         model = self.model
         n = len(self.masses)
         times = np.arange(model.samples) * model.sample_interval
@@ -91,7 +91,7 @@ class Reference:
         t = 0.0
         y = np.zeros(2 * n)
 
-        # The burst's end is a kink: the integration stops there too.
+        # The integration stops at the end of the burst as well, where the force has a kink.
         for end in sorted({min(model.drive.duration, times[-1]), times[-1]}):
             while t < end:
                 events = self.changes()
@@ -129,7 +129,7 @@ class Reference:
 
 
 def relative(difference: np.ndarray, whole: np.ndarray) -> float:
-    """Euclidean norm of a ``difference`` over that of the ``whole``."""
+    """The Euclidean norm of a ``difference``, divided by that of the ``whole``."""
     return float(np.linalg.norm(difference) / np.linalg.norm(whole))
 
 
@@ -138,7 +138,7 @@ def relative(difference: np.ndarray, whole: np.ndarray) -> float:
     ("lattice", "contacts", "drive", "end"),
     [
         ({"reading": "printed"}, {"restitution": 0.4}, {"amplitude": 60.0}, 0.03),
-        # Conservative or free, the lattice is chaotic: pointwise agreement ends early.
+        # This conservative lattice is chaotic, so that trajectories agree for a shorter time.
         ({"ends": "free"}, {"law": "bilinear", "restitution": 1.0}, {}, 0.025),
         ({"ends": "periodic"}, {}, {"cell": 3, "mass": 4}, 0.03),
     ],
@@ -188,7 +188,7 @@ def test_work_of_the_linear_diatomic_case():
     assert result.statistics["work"] == pytest.approx(1.542815e-5, rel=1e-6)
 
 
-# Clearances that the waves of each preset reach at their amplitudes, and a time that holds several impacts.
+# For each preset a clearance that its waves reach, and a duration in s with several impacts.
 PRESETS = {"four-band": {"clearance": 2e-3, "end": 0.07}, "diatomic": {"clearance": 2e-4, "end": 0.06}}
 
 
@@ -214,7 +214,7 @@ def test_ledger_closes(preset, amplitude, law, restitution):
     held = run["energy/kinetic"].values + run["energy/spring"].values + run["energy/contact"].values
     residual = np.abs(work - dissipated - held)
     assert residual.max() <= 1e-8 * work.max()
-    # Relative to the work so far it may fail only where the burst begins, or takes its work back.
+    # Relative to the present work the residual may be larger where the burst begins or takes its work back.
     assert (residual[1:] <= 1e-8 * work[1:]).mean() > 0.99
 
     has_contact = amplitude > 1
@@ -240,7 +240,7 @@ def test_tolerance_keeps_its_promise():
 
 @pytest.fixture(scope="module")
 def exact():
-    """Velocity of the small case by the default method, a hundred times as exact as the others are asked to be."""
+    """Velocities of the small case by the default method, at a tolerance a hundred times lower than the others'."""
     return run_of(small_case(time={"end": 0.04, "rtol": 1e-11}))["velocity"].values
 
 
@@ -250,7 +250,10 @@ def exact():
     ("method", "rtol"), [("5dp", 1e-9), ("3bs", 1e-6), ("5bs", 1e-9), ("6vr", 1e-9), ("7vr", 1e-9)]
 )
 def test_every_method_samples_exactly(folder, exact, method, rtol):
-    """Every Runge-Kutta type lands on samples, where its error is that of its steps: dense output would add more."""
+    """Every Runge-Kutta method ends steps on samples, where its error is that of its steps alone.
+
+    Dense output between steps would add errors. A run that is stopped and resumed has the same bits.
+    """
     case = small_case(time={"end": 0.04, "method": method, "rtol": rtol})
 
     simulate(case, folder / "straight")
@@ -258,7 +261,7 @@ def test_every_method_samples_exactly(folder, exact, method, rtol):
     straight = datasets(folder / "straight" / "run.h5")
     assert relative(straight["velocity"] - exact, exact) < 1e4 * rtol
 
-    # A pair whose last stage is the next step's first must not show where a run was stopped.
+    # Some pairs use the last stage of a step as the first of the next one, which must not depend on a stop.
     assert simulate(case, folder / "stopped", stop=StopAt(150)).resumable
     assert simulate(case, folder / "stopped").complete
     assert_same_bits(straight, datasets(folder / "stopped" / "run.h5"))
@@ -270,19 +273,19 @@ def test_doubling_the_amplitude_doubles_a_linear_run_bit_for_bit():
     twice = run_of(small_case(drive={"amplitude": 0.002}))
 
     assert len(once["impacts/site"]) == 0
-    # The front's tail is below the normal numbers, where doubling rounds.
+    # At the tail of the front velocities are subnormal numbers, whose doubling rounds.
     np.testing.assert_allclose(2 * once["velocity"].values, twice["velocity"].values, rtol=0, atol=1e-300)
     np.testing.assert_array_equal(4 * once["energy/work"].values, twice["energy/work"].values)
 
 
 MIRRORED_CELLS = 20
 MIRRORED_MASSES = [0.005, 0.0025, 0.003, 0.004]
-# Start, end, stiffness, and whether the end lies in the next cell.
+# Each spring has its start, end and stiffness, and whether the end is in the next cell.
 MIRRORED_SPRINGS = [(4, 1, 2e4, True), (1, 2, 1e4, False), (2, 4, 1e4, False), (2, 3, 1e3, False)]
 
 
 def mirror_table() -> dict[str, Any]:
-    """A lattice of four different masses that is driven at its left end."""
+    """The table of a lattice of four different masses a cell that is driven at its left end."""
     springs = [
         {"start": start, "end": end, "stiffness": stiffness, "next_cell": next_cell}
         for start, end, stiffness, next_cell in MIRRORED_SPRINGS
@@ -297,13 +300,13 @@ def mirror_table() -> dict[str, Any]:
 
 
 def mirrored_table() -> dict[str, Any]:
-    """The same lattice with left and right exchanged: masses and cells count from the other end."""
+    """The table of the same lattice with left and right exchanged: masses and cells count from the other end."""
     table = mirror_table()
     last = len(MIRRORED_MASSES) + 1
     springs = []
     for start, end, stiffness, next_cell in MIRRORED_SPRINGS:
         if next_cell:
-            # From the right its end comes first.
+            # Counted from the right, the end of a spring to the next cell comes before its start.
             start, end = end, start
         springs.append({"start": last - start, "end": last - end, "stiffness": stiffness, "next_cell": next_cell})
 
@@ -346,7 +349,10 @@ def test_the_linear_ridge_lies_on_the_bloch_branch():
 
 @pytest.mark.slow
 def test_fixed_steps_converge_with_the_order_of_the_method(petsc_options):
-    """-ts_adapt_type none -ts_dt H: halving H divides the error of 3bs by 2^3, with bilinear contacts in the run."""
+    """With fixed steps (-ts_adapt_type none -ts_dt H) halving H divides the error of the method 3bs by about 2^3.
+
+    The run has bilinear contacts.
+    """
     exact = run_of(small_case(contacts={"law": "bilinear"}, time={"rtol": 1e-13, "end": 0.022}))
     velocity = exact["velocity"].values
 
@@ -357,6 +363,6 @@ def test_fixed_steps_converge_with_the_order_of_the_method(petsc_options):
         assert len(run["impacts/onset"]) == len(exact["impacts/onset"]) > 0
         errors.append(relative(run["velocity"].values - velocity, velocity))
 
-    # 3 less half: changes of contact, located to the tolerance, blur the order a little.
+    # The measured order is a little below 3, as changes of contact are located to a tolerance only.
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.all(orders > 2.5), orders

@@ -1,4 +1,4 @@
-"""Figures of inter-band transfer show what the sweep's files hold, and nothing where files lack."""
+"""Figures of inter-band transfer show the values in a sweep's files, and are left out where files are missing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TABLE = {
 
 
 def swept(folder, **options):
-    """A sweep of 20 cells with one site in ``folder``; ``options`` go into ``[sweep]``."""
+    """Run a sweep of 20 cells with one site in ``folder``, which is returned; ``options`` update the table [sweep]."""
     table = TABLE | {"sweep": TABLE["sweep"] | options}
     result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
     assert result.complete
@@ -47,7 +47,7 @@ def reduced(tmp_path_factory):
     """A sweep over both laws and seven amplitudes without fields, related to a branch of the Hertz law."""
     folder = swept(tmp_path_factory.mktemp("reduced"))
 
-    # A branch with a law of exponent -1 in region III.
+    # The branch's slope is a power law of exponent -1 in region III.
     branch = tmp_path_factory.mktemp("branch")
     write_branch(branch, largest=1e6, last_region=1e5)
 
@@ -57,25 +57,25 @@ def reduced(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Two Hertz members with full fields: one without contact, one with."""
+    """The folder of a sweep with two Hertz members with full fields, one without contact and one with it."""
     table = {"contacts": {"law": ["hertz"]}, "drive": {"amplitude": [1.0, 60.0]}, "fields": True}
     return swept(tmp_path_factory.mktemp("whole"), **table)
 
 
 @pytest.fixture(scope="module")
 def transfer_pictures(whole):
-    """The figures of both members' fields: drawing them costs more than all that is read from them."""
+    """The figures of both members' fields, drawn once, since drawing takes longer than all checks of them."""
     return offered_figures("transfer", whole)
 
 
 def contact_motion(folder):
-    """Motion of the contact cell's two masses, as phase portraits show it."""
+    """The motion of the contact cell's two masses, as phase portraits show it."""
     with MemberRun.open(folder) as member:
         return transfer_curves.ContactMotion.of(member)
 
 
 def offered_figures(name, *folders):
-    """Suffixes and figures of ``name`` from ``folders``."""
+    """The figures of ``name`` from ``folders``, by their suffixes."""
     with rc_style():
         sweeps = Sweeps(map(open_ensemble, folders), Files())
         found = {drawing.stem: drawing.draw() for drawing in FIGURES[name].function(sweeps)}
@@ -84,17 +84,17 @@ def offered_figures(name, *folders):
 
 
 def lines(axes):
-    """Labelled lines of ``axes``: label -> (x, y)."""
+    """The points (2, point) of the lines of ``axes``, by their labels."""
     return {line.get_label(): line.get_xydata().T for line in axes.lines}
 
 
 def all_axes(figure):
-    """The axes that are not colour bars."""
+    """The axes of a figure that are not colour bars."""
     return [a for a in figure.axes if a.get_label() != "<colorbar>"]
 
 
 def panel(figure, text):
-    """The axes whose title holds ``text``."""
+    """The only axes of a figure whose title contains ``text``."""
     (found,) = [a for a in figure.axes if text in a.get_title(loc="left")]
     return found
 
@@ -151,7 +151,7 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
 
 @pytest.mark.slow
 def test_backbone_is_aligned_exactly(reduced):
-    """Energies are those of the branch at grazing, the slope is divided by the fitted divisor, its power law drawn."""
+    """Energies are aligned with the branch at grazing, and the figure shows slope over divisor and the power law."""
     figures = offered_figures("ibtet_backbone", reduced)
     # No branch of the bilinear law was given.
     assert list(figures) == ["calibrated-1-site-4-cycles"]
@@ -172,7 +172,7 @@ def test_backbone_is_aligned_exactly(reduced):
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
     assert fit["initiation_energy"] == start.energy
     assert fit["onset_amplitude"] == start.amplitude
-    # Work grows with the amplitude's square until the first contact comes back to the drive.
+    # Work is proportional to the square of the amplitude until waves from the first contact reach the drive.
     assert start.energy / start.amplitude**2 == pytest.approx(work[0], rel=1e-6)
 
     shown = lines(axes)
@@ -189,7 +189,7 @@ def test_backbone_is_aligned_exactly(reduced):
     (green,) = [xy for label, xy in shown.items() if "adj." in label]
     np.testing.assert_allclose(green[1], fit["factor"] * red[0] ** fit["exponent"], rtol=1e-12)
 
-    # Least squares in logarithms: the residual is orthogonal to a constant and to the logarithm of the energy.
+    # The residual of least squares in logarithms is orthogonal to a constant and to the logarithm of the energy.
     residual = np.log(red[1] / green[1])
     assert abs(residual.sum()) < 1e-9
     assert abs(residual @ np.log(red[0])) < 1e-8
@@ -232,7 +232,7 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures)
     assert [t[4:] for t in titles[1:5]] == ["Band 1", "Band 2", "Band 3", "Band 4"]
     assert titles[7:] == ["(h) Velocity spectra, cell 5", "(i) Velocity spectra, cell 10"]
 
-    # One scale of colours for the whole and its parts.
+    # The whole and its parts have one scale of colours.
     (norm,) = {id(a.images[0].norm) for a in all_axes(figure) if a.get_title(loc="left")[:3] in ("(a)", "(b)", "(e)")}
     assert norm
 
@@ -271,7 +271,10 @@ def test_dispersions_stand_by_law_and_amplitude(whole):
 
 @pytest.mark.slow
 def test_band_energies_sum_to_the_total(whole):
-    """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
+    """Energies of the parts sum to the total over the whole record, in which parts are orthogonal.
+
+    Running means differ from the total by cross terms.
+    """
     figures = offered_figures("band_energies", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
 
@@ -287,20 +290,20 @@ def test_band_energies_sum_to_the_total(whole):
 
 
 def test_closing_error_is_exact_for_parts_in_quadrature():
-    """Of cos 3t + cos 5t the cross term averages out over a common period, 400 samples, and only there."""
+    """The closing error of cos 3t + cos 5t is zero for means over a common period, 400 samples, and not for others."""
     t = 2 * np.pi * np.arange(4000) / 400
     parts = np.array([np.cos(3 * t) ** 2, np.cos(5 * t) ** 2])
     total = (np.cos(3 * t) + np.cos(5 * t)) ** 2
 
     assert np.nanmax(closing_error(parts, total, 400)) < 1e-12
     assert np.nanmax(closing_error(parts, total, 130)) > 0.1
-    # Where there is no energy there is nothing to divide by.
+    # The error is NaN where there is no energy to divide by.
     assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
 
 
 @pytest.mark.slow
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
-    """Two points on the transfer's curve, and for each the phase portrait of host and resonator."""
+    """The figure has two points on the curve of transfer, and for each the phase portrait of host and resonator."""
     (figure,) = offered_figures("phase_regimes", whole, reduced).values()
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
     grey = curve.lines[0].get_xydata().T
@@ -330,7 +333,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
 
 @pytest.mark.slow
 def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
-    # So short a portrait would miss the largest displacement unless it stood about it.
+    # A portrait this short contains the largest displacement only if it is taken around it.
     monkeypatch.setattr(transfer_curves, "PERIODS", 0.1)
     folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
     with open_run(folder / "run.h5") as run:
@@ -345,7 +348,7 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
 def test_regimes_without_an_ensemble(whole):
     (figure,) = offered_figures("phase_regimes", whole).values()
 
-    # The two points themselves, without a curve.
+    # The figure has the two points without a curve.
     assert len(all_axes(figure)[0].lines) == 2
 
 

@@ -1,4 +1,4 @@
-"""Normal modes of contacts that differ, on their two sides and from site to site, and of cells that differ."""
+"""Normal modes of lattices whose cells differ, and whose contacts differ from site to site or on their two sides."""
 
 from __future__ import annotations
 
@@ -33,28 +33,32 @@ from vipetsc.modes.system import ContactPair, System
 MASS = 2.0
 SPRING = 3.0
 STOP = 40.0
-# In the lowest gap: higher up a stop on one side begins no breather, since the mean of its force moves the site away.
+# A frequency in rad/s in the lowest gap. At higher ones a stop on one side has no breather at small amplitudes, since
+# the mean of its force moves the site away.
 OMEGA = 640.0
 SIDES = [(0.1, np.inf), (np.inf, 0.1), (0.1, 0.13)]
 
 
 def mass_between_stops(plus: float, minus: float) -> System:
-    """A mass on a spring, with linear stops of the ground."""
+    """A mass on a spring, with linear stops of the ground at clearances in m on its two sides."""
     pair = ContactPair(None, 0, plus, Contact("bilinear", STOP), minus)
     return System.assemble([MASS], [(None, 0, SPRING)], [pair])
 
 
 def time_on_one_side(energy: float, clearance: float) -> float:
-    """Time in s from the middle to rest on the side of a stop at ``clearance``, piece by piece in closed form."""
-    # Rates of the mass alone, and with the stop's spring in addition.
+    """The time in s from the middle to rest on the side of a stop at ``clearance``, in closed form.
+
+    The motion is harmonic about the middle up to the stop, and about another equilibrium in contact.
+    """
+    # The frequencies of the mass on its spring alone, and on spring and stop.
     slow = np.sqrt(SPRING / MASS)
     fast = np.sqrt((SPRING + STOP) / MASS)
     amplitude = np.sqrt(2 * energy / SPRING)
     if amplitude <= clearance:
         return np.pi / 2 / slow
-    # In contact the motion is harmonic about another place.
+    # The equilibrium about which the motion in contact is harmonic.
     middle = STOP * clearance / (SPRING + STOP)
-    # The kinetic energy with which it arrives there.
+    # The kinetic energy at the stop.
     at_stop = energy - SPRING * clearance**2 / 2
     reach = np.sqrt((clearance - middle) ** 2 + 2 * at_stop / (SPRING + STOP))
     return float(np.arcsin(clearance / amplitude) / slow + np.arccos((clearance - middle) / reach) / fast)
@@ -65,7 +69,7 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
     """Shooting over half a period gives the exact period of a stop on one side, and of stops at two distances."""
     system = mass_between_stops(plus, minus)
     problem = Shooting(Dop853Flow(system), MAPS["half"])
-    # At 0.8 of the energy at which the nearer stop is grazed.
+    # The branch begins at 0.8 of the energy at which the nearer stop is grazed.
     start = linear_start(problem, 0, 0.4 * SPRING * 0.1**2)
     points = [start, *Continuation(problem, start, NnmTable(points=60, largest_step=0.3, first_step=0.1))]
 
@@ -76,9 +80,9 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
 
 
 def test_free_masses_with_a_stop_between_them_move_about_their_centre():
-    """Two masses that nothing holds are one of their reduced mass, and their centre stays where it is."""
+    """Two free masses with a stop between them have the period of their reduced mass, and their centre rests."""
     pair = ContactPair(0, 1, 0.1, Contact("bilinear", STOP), np.inf)
-    # Their reduced mass is MASS.
+    # The reduced mass of the two is MASS.
     system = System.assemble([MASS * 3, MASS * 1.5], [(0, 1, SPRING)], [pair])
     problem = Shooting(Dop853Flow(system), MAPS["half"])
     start = linear_start(problem, 1, 0.4 * SPRING * 0.1**2)
@@ -92,7 +96,7 @@ def test_free_masses_with_a_stop_between_them_move_about_their_centre():
 
 
 def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
-    """Mean and even harmonics included, the condensed motion has the exact period of a stop on one side."""
+    """A condensed motion with mean and even harmonics has the exact period of a stop on one side."""
     system = mass_between_stops(0.1, np.inf)
     _, points = condensed_branch(system, 0, 0.49 * SPRING * 0.1**2, truncation=1e-6, points=14, largest_step=0.2)
 
@@ -100,12 +104,12 @@ def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
     for point in points:
         half = time_on_one_side(point.energy, 0.1) + time_on_one_side(point.energy, np.inf)
         assert point.period == pytest.approx(2 * half, rel=1e-5)
-    # Away from the stop: the mean has the opposite sign.
+    # The mean displacement is away from the stop.
     assert points[-1].x[0] < -1e-3 * 0.1
 
 
 def test_the_other_side_has_the_mirrored_orbits():
-    """Stops that change sides, and clearances that are exchanged, mirror every orbit of a lattice."""
+    """Every orbit of a lattice is mirrored if the clearances of the two sides of each contact are exchanged."""
     case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)
     system = System.from_case(case)
     contacts = []
@@ -116,7 +120,7 @@ def test_the_other_side_has_the_mirrored_orbits():
 
     start = linear_start(problem, 3, 2e-4)
     points = list(Continuation(problem, start, case.nnm))
-    # Contacts on several sites and sides, or the mirror would have little to mirror.
+    # The orbits have contacts at several sites and on both sides.
     assert points[-1].episodes >= 3
     for point in points[::10]:
         frame = mirrored.frame_at("relative", -point.x, point.period)
@@ -129,17 +133,17 @@ def test_the_other_side_has_the_mirrored_orbits():
 
 @pytest.fixture(scope="module")
 def unlike_branch(tmp_path_factory):
-    """The branch of a mode of a lattice whose cells and sites differ, followed as the verb does."""
+    """The shooting problem of a lattice whose cells and sites differ, and the branch of a mode."""
     case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)
     (branch,) = follow_all(case, tmp_path_factory.mktemp("unlike"), MPI.COMM_SELF)
     return Shooting(Dop853Flow(System.from_case(case)), MAPS["half"]), branch
 
 
 def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_branch):
-    """Integrated by SciPy from equations of its own, an orbit comes back after its period."""
+    """An orbit returns after its period when SciPy integrates independent equations of the lattice."""
     problem, branch = unlike_branch
     lattice = independent_lattice()
-    # One orbit near the first contacts, and the last one.
+    # The orbits are one near the first contacts, and the last one.
     for number in (40, 60):
         point = branch.regular()[number]
         u, v = sample_orbit(problem, point, samples=40)
@@ -155,13 +159,13 @@ def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_bran
 
 @pytest.mark.slow
 def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch):
-    """Harmonic balance at three different sites meets the orbits that shooting corrects from its states."""
+    """Shooting corrects a motion by harmonic balance at three different sites to an orbit close to it."""
     shooting, _ = unlike_branch
     system = shooting.system
     case = unlike_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2)
     problem = condensed_system(system, case.nnm)
     omega, shapes = system.linear_modes()
-    # The linear mode at the energy of the branch's contacts.
+    # The start is the linear mode at an energy at which the branch has contacts.
     z = system.contact_rows @ shapes[:, 3] * np.sqrt(2 * 2.1e-4) / omega[3]
     start = problem.from_mode(z, float(omega[3]))
     point = list(Continuation(problem, start, case.nnm))[-1]
@@ -171,7 +175,7 @@ def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch
     assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
     frame = shooting.frame_at("relative", u, point.period)
     row = np.append(u / np.linalg.norm(u), 0.0)
-    # Its amplitude is held, period and shape are free.
+    # The amplitude is held; period and shape are free.
     attempt = frame.solve(frame.xi, row, row @ frame.xi)
     assert attempt.converged
     x, period = frame.chart.decode(attempt.xi)
@@ -181,17 +185,20 @@ def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch
 
 @pytest.fixture(scope="module")
 def one_sided():
-    """The breather of a site with a stop on one side, and its chain, by shooting without matrices."""
+    """The chain, the stops and the breather of a site with a stop on one side, by shooting without matrices."""
     chain = breather_chain()
     stops = [Stops(four_band_contact("hertz"), CLEARANCE, np.inf)]
     system = System.from_chain(chain, stops, dense=False)
-    # Half a period: with a stop on one side the motion has no symmetry within it.
+    # The map is that of half a period, since a motion with a stop on one side has no symmetry of quarters.
     problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, 1e-12, 12)
     return chain, stops, problem.breather(OMEGA)
 
 
 def test_a_breather_on_one_side_closes_by_the_dense_flow(one_sided):
-    """Two flows that share no code agree on the orbit of a lattice with a stop on one side."""
+    """A breather with a stop on one side, found by the lattice's flow, returns after its period in the dense flow.
+
+    The two flows have no code in common.
+    """
     chain, stops, point = one_sided
     dense = Dop853Flow(System.from_chain(chain, stops))
     end = dense.arc(np.append(point.x, 0 * point.x), point.period, point.period).end
@@ -200,7 +207,7 @@ def test_a_breather_on_one_side_closes_by_the_dense_flow(one_sided):
 
 
 def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided):
-    """The compliance of equal cells by waves is that of a lattice by its modes: one motion, that of shooting."""
+    """The compliance by Bloch waves and the one by all modes give the same breather, which is that of shooting."""
     chain, stops, shot = one_sided
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
     by_waves = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), control)
@@ -216,7 +223,10 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
 
 
 def test_a_breather_begins_at_the_site_that_is_asked_for():
-    """At a linear stop that is twice as far the breather is twice as large, on the other side its negative."""
+    """A breather begins at the site asked for: twice as large at twice the clearance, negative on the other side.
+
+    The stops are linear, so that motions are proportional to the clearance.
+    """
     sites = (4, 13)
     chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
@@ -230,6 +240,6 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
     assert np.abs(far.x).argmax() // chain.cell.dofs == sites[1]
     assert np.abs(near.x).argmax() // chain.cell.dofs == sites[0]
     assert system.contact_rows[1] @ far.x == pytest.approx(2 * (system.contact_rows[0] @ near.x), rel=1e-6)
-    # A linear stop has no length of its own: all scales with the clearance.
+    # The energy is proportional to the square of the clearance.
     assert far.energy == pytest.approx(4 * near.energy, rel=1e-6)
     assert opposite.x == pytest.approx(-far.x, abs=1e-9 * np.abs(far.x).max())

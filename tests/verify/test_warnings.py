@@ -1,4 +1,4 @@
-"""Warnings of a run stand in what ``simulate`` returns, in the summary and in the file."""
+"""Warnings of a run are in the result of ``simulate``, in the summary and in the file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HALF = {"time": {"end": 0.04}}
 
 
 def warnings_of(result: Result) -> list[str]:
-    """The warnings of a result, which are those of its files."""
+    """The warnings of a result; asserts that its files have the same."""
     summary = json.loads((result.folder / "summary.json").read_text())
     with h5py.File(result.folder / "run.h5") as file:
         assert json.loads(file.attrs["warnings"]) == summary["warnings"] == result.warnings
@@ -37,7 +37,7 @@ def test_sites_that_nothing_reaches(folder, engine):
 
 @pytest.mark.slow
 def test_indentations_beyond_the_radius(folder):
-    """Hertz's law asks for small indentations: soft spheres are warned of, larger or linear ones are not."""
+    """A run warns of indentations beyond the radius, where Hertz's law does not hold, but not with a bilinear law."""
 
     def warnings(name, **contacts):
         case = small_case(**HALF, drive={"amplitude": 400.0}, contacts={"modulus": 1e5} | contacts)
@@ -58,7 +58,7 @@ def test_the_radius_stays_with_the_case():
 
 @pytest.mark.slow
 def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
-    """Fixed steps that are too long for the tolerance are warned of, by the front door too."""
+    """Fixed steps too long for the energy balance to close give a warning, from Python and from the command line."""
     petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)
     result = simulate(small_case(**HALF), folder / "run")
     assert result.complete
@@ -74,7 +74,7 @@ def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
 
 
 def test_a_record_that_ends_early(folder, petsc_options):
-    """Euler's method with steps of a sample is unstable: the record holds the samples before the energy diverges."""
+    """A run that becomes unstable, by Euler's method with steps of a sample, keeps the samples before it diverges."""
     petsc_options(ts_rk_type="1fe", ts_adapt_type="none")
     result = simulate(small_case(contacts={"sites": []}), folder / "run")
     assert not result.complete

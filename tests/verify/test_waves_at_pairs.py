@@ -1,7 +1,7 @@
 """An incident wave in an infinite lattice whose contacts join other masses than the cell's pair.
 
-Contacts to the ground, with the next cell and two in one cell: energy, mirror images, direct solutions of long
-lattices, and a run in time before waves come back from the ends.
+Contacts are with the ground, with the next cell, and two in one cell. Results are compared with energy balances, mirror
+images, direct solutions of long lattices, and a run that ends before waves come back from the ends.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SITES = (500, 501, 503, 503)
 
 
 def rows_of(chain: Chain) -> np.ndarray:
-    """Rows (pair, mass) that take relative displacements from those of masses; of a chain that is no ring."""
+    """Rows (pair, mass) that give relative displacements from displacements of masses, in a chain that is no ring."""
     d = chain.cell.dofs
     rows = np.zeros((len(chain.sites), chain.cells * d))
     for row, site, pair in zip(rows, chain.sites, chain.contact_pairs, strict=True):
@@ -45,7 +45,10 @@ def rows_of(chain: Chain) -> np.ndarray:
 
 @pytest.mark.parametrize("omega", [400.0 - 40j, 1000.0 - 40j, 3000.0 - 90j])
 def test_compliances_are_those_of_a_long_damped_lattice(omega):
-    """Waves of these frequencies decay before they reach an end of the matrices that are solved."""
+    """Compliances of an infinite lattice are those of a long one, at complex frequencies.
+
+    Waves of these frequencies decay before they reach an end of the long lattice.
+    """
     chain = Chain(CELL, 1000, "free", SITES, (1e-4,) * 4, pairs=PAIRS)
     dynamic = chain.stiffness_matrix().tocsc() - omega**2 * diags(chain.masses(), format="csc")
     rows = rows_of(chain)
@@ -55,7 +58,7 @@ def test_compliances_are_those_of_a_long_damped_lattice(omega):
 
 
 def test_the_ends_of_a_ring_do_not_join_an_infinite_lattice():
-    """A contact of the last cell with the next one is that of any two neighbours."""
+    """In an infinite lattice the compliance of a contact with the next cell is the same in every cell."""
     pair = (Pair(1, 0, next_cell=True),)
     last = Chain(CELL, 5, "periodic", (4,), (1e-4,), pairs=pair)
     inner = replace(last, sites=(1,))
@@ -73,13 +76,13 @@ def test_the_relative_motions_of_a_wave_are_differences_of_its_field():
 
 GROUND = {"pair": [0, 2], "sites": [12, 14]}
 NEIGHBOURS = {"pair": [1, 1], "next_cell": True, "sites": [12, 14]}
-# A resonator meets the next one; in another cell one meets its host and the ground.
+# In one cell a resonator meets that of the next cell; in another cell a resonator meets its host and the ground.
 SEVERAL = {
     "sites": [10, 12, 12],
     "clearance": [1e-4, 3e-5, 1e-4],
     "each": {"pair": [[2, 2], [1, 2], [0, 2]], "next_cell": [True, False, False]},
 }
-# In the mirror image of 24 cells cell n is 25 - n, and the contact of cells n and n + 1 that of 24 - n and 25 - n.
+# In the mirror image of 24 cells, cell n becomes 25 - n, and the contact of cells n and n + 1 belongs to cell 24 - n.
 MIRRORED = {
     "ground": (GROUND, GROUND | {"sites": [13, 11]}),
     "neighbours": (NEIGHBOURS, NEIGHBOURS | {"sites": [12, 10]}),
@@ -88,7 +91,7 @@ MIRRORED = {
 
 
 def wave_case(contacts: dict[str, Any], **nfrc: Any) -> NfrcCase:
-    """Lossy sites under a wave of 1000 rad/s of 2.5 clearances, or as ``nfrc`` says."""
+    """The case of lossy sites under a wave of 1000 rad/s and 2.5 clearances; ``nfrc`` updates the table [nfrc]."""
     common = {"law": "bilinear", "stiffness": 1e4, "clearance": 1e-4, "restitution": 0.5}
     steps = {"harmonics": 15, "first_step": 0.2, "largest_step": 1.0, "range": [2.5, 9.0]}
     return NfrcCase.from_table(
@@ -111,7 +114,7 @@ def measures_of(case: NfrcCase, restitution: float) -> Measures:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MIRRORED)
 def test_energy_and_mirror_images(name):
-    """T + R + U + L = 1 in contact, and a wave from the other side moves the mirrored sites alike."""
+    """A state in contact satisfies T + R + U + L = 1, and a wave from the other side moves mirrored sites alike."""
     forward, backward = (
         measures_of(wave_case(contacts, direction=direction), 0.5)
         for direction, contacts in zip(("forward", "backward"), MIRRORED[name], strict=True)
@@ -128,7 +131,7 @@ def test_energy_and_mirror_images(name):
 
 @pytest.mark.slow
 def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
-    """A force far away makes the wave; contacts to the ground and with the next cell move as computed."""
+    """A run under the wave of a distant force settles to the steady state of contacts with ground and next cell."""
     omega = 1000.0
     period = 2 * np.pi / omega
     contacts = {
@@ -139,7 +142,7 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
         "sites": [320, 322],
         "each": {"pair": [[0, 2], [1, 1]], "next_cell": [False, True]},
     }
-    # Waves go 8 cells a period: they come back from the ends after the run.
+    # Waves travel 8 cells in a period and come back from the ends after the run has ended.
     lattice = {"cells": 640, "cell": TWO_MASS_CELL}
     drive = {"waveform": "harmonic", "frequency": omega, "cell": 300}
     table = {"name": "x", "lattice": lattice, "contacts": contacts, "drive": drive}
@@ -151,7 +154,7 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
     assert measures.unstable == 0
     assert measures.episodes == 4
 
-    # The force of the run alone would move the first site by 2.5 clearances.
+    # Without contacts the run's force would move the first site by 2.5 clearances.
     forced = NfrcCase.from_table(table | {"nfrc": options | {"source": "force", "infinite": True, "range": [0.1, 1.0]}})
     relative = SteadyStates(forced, 0.3, omega).linear_motion(omega).harmonics[0, 1]
     force = amplitude * 1e-4 / abs(relative)
@@ -181,7 +184,7 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
     ],
 )
 def test_the_ground_does_not_push_a_lattice_without_walls(lattice, nfrc):
-    """The mean force of a stop on one side is balanced by walls alone."""
+    """A one-sided stop of the ground is refused in lattices without walls, which alone could balance its mean force."""
     case = wave_case(GROUND)
     table = case.model_dump(by_alias=True, exclude_none=True)
     table["contacts"] |= {"side": "plus"}
