@@ -34,6 +34,7 @@ def tried(monkeypatch) -> list[float]:
 
 
 def test_an_end_is_designed_once_for_all_amplitudes(tried):
+    """Three amplitudes of a burst have one end, found by one search up to the first end that reflects 0.1 or less."""
     ends = [case(amplitude, reflection=0.1).lattice.absorbing for amplitude in (1.0, 2.0, 30.0)]
     assert ends[0] == ends[1] == ends[2]
     assert len(tried) == 1 + sum(fraction > 0.1 for fraction in tried)

@@ -38,6 +38,7 @@ def run():
 
 
 def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
+    """The entropy is that of the hosts' velocities from the arrival of the wave on, which is estimated if not given."""
     model = Case.of(run).model()
     measured = analyse(run, ("entropy",), arrival=0.0399)
 
@@ -87,6 +88,7 @@ def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit)
 
 @pytest.mark.slow
 def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
+    """A coarse map has means over pixels of a fine one, a coarse spectrum sums: energies do not depend on pixels."""
     fine = analyse(run, options=AnalysisTable(pixels=600))
     coarse = analyse(run, options=AnalysisTable(pixels=8))
 
@@ -114,6 +116,7 @@ def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
 
 
 def test_cells_before_and_after_the_first_site_are_measured_apart(run):
+    """The spectrum before the first site is that of cells 1 to 8, the one after it that of cells 9 to 24."""
     # The wave moves no cell from cell 9 on: the spectrum behind that site is zero.
     run["velocity"].values[:, 8:] = 0.0
     measured = analyse(run, ("wavenumber", "dispersion"))
@@ -122,6 +125,7 @@ def test_cells_before_and_after_the_first_site_are_measured_apart(run):
 
 
 def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
+    """Spectra and bands need pi/interval above the top band; otherwise a warning names them and other measures stay."""
     # The top band ends at 3645 rad/s: a sample every 0.8 ms resolves it, one every 1 ms does not.
     resolved = analyse(run.isel(time=slice(None, None, 4)))
     aliased = analyse(run.isel(time=slice(None, None, 5)))
@@ -137,6 +141,7 @@ def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
 
 
 def test_cells_too_sparse_for_the_waves_are_named_and_wavenumbers_left_out(run):
+    """A record of every second cell has energies of bands and no measure that needs wavenumbers."""
     thinned = analyse(run.isel(cell=slice(None, None, 2)))
     groups = {str(name).partition("/")[0] for name in thinned.variables}
     assert not groups & {"wavenumber_content", "dispersion", "entropy", "partition"}
@@ -145,6 +150,7 @@ def test_cells_too_sparse_for_the_waves_are_named_and_wavenumbers_left_out(run):
 
 
 def test_the_ends_of_a_record_are_not_in_the_means(run):
+    """The transfer is the mean fraction of energy above the drive, without the last 2 % of the record."""
     measured = analyse(run, ("bands", "maps"))
     about = measured["ibtet"].attrs
     first = round(about["start"] / INTERVAL)
@@ -160,6 +166,7 @@ def test_the_ends_of_a_record_are_not_in_the_means(run):
 
 
 def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
+    """On a ring the first site is the nearest one in either direction; spectra before and after it are left out."""
     # The drive at cell 3 is 6 cells from cell 9, and 5 cells, across the ends, from cell 22.
     run["sites/cell"].values[:] = [22, 9]
     overrides = ["lattice.cells=24", "contacts.sites=[22, 9]", "drive.cell=3", "drive.cycles=3"]

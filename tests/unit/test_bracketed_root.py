@@ -39,6 +39,7 @@ def flatter(x: float) -> float:
     ("function", "most"), [(smooth, 5), (steep, 20), (root_like, 30), (step, 40), (flat, 20), (flatter, 30)]
 )
 def test_a_zero_is_found_with_few_values(function, most):
+    """The zero is within the tolerance, after as many values as Brent's method needs or fewer."""
     places = []
 
     def value(x):
@@ -53,6 +54,8 @@ def test_a_zero_is_found_with_few_values(function, most):
 
 
 def test_a_value_outside_the_bracket_gives_a_better_estimate():
+    """With a third value the first estimate is the zero of a parabola, exact for a parabola."""
+
     def parabola(x):
         return (x - ROOT) * (x + 2.0)
 
@@ -77,6 +80,7 @@ def test_a_value_outside_that_is_no_number_is_not_used():
 
 @pytest.mark.parametrize("end", [0.0, 1.0])
 def test_an_end_may_be_the_zero(end):
+    """A zero at an end of the bracket is found exactly."""
     assert bracketed_root(lambda x: x - end, 0.0, 1.0, TOLERANCE, {}) == end
 
 

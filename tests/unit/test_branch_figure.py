@@ -81,14 +81,14 @@ def test_an_unstable_part_is_drawn_from_its_first_point_to_its_last():
 
 @pytest.mark.parametrize("slope_at_grazing", [1e-9, 50.0])
 def test_a_branch_keeps_a_corner_where_a_contact_grazes(slope_at_grazing):
-    """Two lines meet at a grazing point, whose tangent is that of either one: no step leaves its line."""
+    """A curve follows two lines that meet at a grazing point, where the tangent is that of one of them."""
 
     def exact(energy: np.ndarray) -> np.ndarray:
         return np.where(energy > 4, 100 * (energy / 4) ** 2, 100.0)
 
     energy = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     frequency = exact(energy)
-    # Not zero: the tangent's direction is taken from its logarithm.
+    # Slopes are not zero, since the direction of a tangent is taken from their logarithm.
     slope = np.array([1e-12, 1e-12, slope_at_grazing, 2 * frequency[3] / 8.0, 2 * frequency[4] / 16.0])
     branch = branch_of(
         energy=energy,

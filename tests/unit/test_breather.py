@@ -117,12 +117,14 @@ def test_the_slope_of_the_energy_is_that_between_points():
 @pytest.mark.slow
 @pytest.mark.parametrize("omega", [1450.0, 1600.0, 1800.0, 2000.0, 3700.0, 4000.0, 5000.0])
 def test_the_built_in_lattice_has_breathers_in_its_gaps(omega):
+    """A breather of every gap, and above all bands, has the frequency asked for and a small residual."""
     _, point = condensed_breather(300, 100, omega, 1e-6)
     assert point.residual < 1e-11
     assert point.frequency == pytest.approx(omega / (2 * np.pi), rel=1e-14)
 
 
 def test_the_breather_of_the_specification_has_its_amplitude_and_energy():
+    """The breather at 1600 rad/s has 1.286 clearances and 0.0203 J."""
     _, point = condensed_breather(300, 100, 1600.0, 1e-6)
     assert point.elongations[0] / CLEARANCE == pytest.approx(1.286, abs=5e-4)
     assert point.energy == pytest.approx(0.0203, abs=5e-5)
@@ -139,6 +141,7 @@ class CountedCompliance(SeriesCompliance):
 
 
 def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
+    """A lattice of a million cells needs at most twice the frequencies of one of 300 cells."""
     counts = {}
     for cells in (300, 1_000_000):
         chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (CLEARANCE,))
@@ -153,6 +156,7 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("sites", [(3, 20, 150, 299), (0,), (150, 152)])
 def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
+    """The series in 1/omega^2 is the compliance above twice the highest frequency of the bands."""
     chain = Chain(four_band("calibrated"), 300, ends, sites, (CLEARANCE,) * len(sites))
     # The series takes over at twice the highest frequency.
     omega = pass_bands(chain.cell)[-1].high * np.array([0.5, 2.01, 3.0, 20.0 - 1e-3j])
@@ -173,6 +177,11 @@ def breather_of_two_sites(signs: list[int]) -> Point:
 
 @pytest.mark.slow
 def test_two_sites_move_in_and_out_of_phase():
+    """Two sites have breathers in phase, out of phase, and of one site alone.
+
+    Energies in and out of phase differ by the coupling, whose sign is opposite: their sum is four times the energy of
+    one site.
+    """
     alone = breather_of_two_sites([1, 0])
     together = breather_of_two_sites([1, 1])
     opposed = breather_of_two_sites([1, -1])
@@ -206,6 +215,7 @@ def followed(case: NnmCase, folder: Path, resume: bool = False, stop: StopReques
 
 @pytest.mark.slow
 def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(tmp_path):
+    """A branch of two points that is resumed has the bits of the whole branch, in memory and in its file."""
     (whole,) = followed(chain_case(), tmp_path / "whole")
     (part,) = followed(chain_case(points=2), tmp_path / "part")
     assert "resume" in part.ending
@@ -222,6 +232,7 @@ def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(tmp_path):
 
 @pytest.mark.slow
 def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
+    """The stored state has the energy of its point, u^T K u/2 plus the contact's; the branch has a table and figure."""
     case = chain_case()
     (branch,) = followed(case, tmp_path)
     file = tmp_path / "branch-breather-4000.h5"
@@ -257,6 +268,7 @@ def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
 
 @pytest.mark.slow
 def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
+    """A branch whose truncation cannot be kept ends with the keys to change, and its file has the points found."""
     # With 61 harmonics the truncation exceeds 4.4e-7 after some points.
     more = "harmonics = 61\ntruncation = 4.4e-7\ndirection = 'up'\nsmallest_step = 1e-4"
     (failed,) = followed(chain_case("3700.0", points=60, more=more), tmp_path)

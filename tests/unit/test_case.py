@@ -55,6 +55,7 @@ def test_the_builtin_case_has_the_papers_contacts_and_drive():
 
 
 def test_the_builtin_case_lasts_until_the_wave_has_crossed():
+    """The end is the duration of the burst and the time of the wave through all cells: 2 pi n/omega + cells/c_g."""
     model = Case.load().model()
     assert model.speed == pytest.approx(428.7, abs=0.05)
     # The burst of 30 cycles, and 300 cells at the group velocity.
@@ -72,6 +73,7 @@ def test_a_single_site_has_the_papers_cell_and_clearance(preset, site, clearance
 
 @pytest.mark.parametrize("wavenumber", ["5pi/9", "5*pi/9", 5 * np.pi / 9])
 def test_a_drive_may_be_given_by_its_wavenumber(wavenumber):
+    """The drive's frequency is that of the band at the wavenumber: 5520.026 rad/s at 5 pi/9."""
     table = {"lattice": {"preset": "diatomic", "reading": "printed"}, "drive": {"wavenumber": wavenumber}}
     assert Case.from_table(table).drive.frequency == pytest.approx(5520.026, abs=1e-3)
 
@@ -99,6 +101,7 @@ def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
 
 
 def test_a_varied_case_is_that_of_a_run_with_other_values():
+    """``varied`` yields a plain case with some values changed, sections left out and overrides applied."""
     law = LawCase.load(EXAMPLES / "law.toml", ["output.stride=2", "time.rtol=1e-9"])
     varied = law.varied(name="ring", without=("output",), lattice={"ends": "periodic"}, drive={"amplitude": 3.0})
     assert type(varied) is Case
@@ -114,6 +117,7 @@ def test_a_varied_case_is_that_of_a_run_with_other_values():
 
 
 def test_a_varied_case_is_resolved_again():
+    """``varied`` resolves defaults of the changed sections and checks the case."""
     case = Case.load()
     nine = case.varied(contacts={"sites": 9, "clearance": None}, time={"rtol": None})
     assert nine.contacts == Case.load(overrides=["contacts.sites=9"]).contacts
@@ -124,6 +128,7 @@ def test_a_varied_case_is_resolved_again():
 
 
 def test_tolerances_scale_with_the_drive():
+    """Absolute tolerances are 0.1 rtol times the scale of the displacement, and omega times that for velocities."""
     # Powers of two, so that nothing is rounded.
     weak = Case.load(overrides=[f"drive.amplitude={2.0**-10}"]).model()
     strong = Case.load(overrides=[f"drive.amplitude={2.0**3}"]).model()
@@ -169,6 +174,7 @@ def test_an_override_below_a_value_is_refused():
 
 
 def test_a_check_that_rests_on_an_invalid_key_is_left_out():
+    """An invalid clearance is the only problem: checks that use it are not made."""
     with pytest.raises(CaseError) as caught:
         Case.from_table(PLAIN | {"contacts": PLAIN["contacts"] | {"clearance": -1.0}})
     assert [problem.key for problem in caught.value.problems] == ["contacts.clearance"]
@@ -283,6 +289,7 @@ def test_any_override_is_taken_or_refused(key, value):
 
 
 def test_exact_damping_is_chosen_by_the_case():
+    """The key ``damping = "exact"`` yields the restitution 0.7; the paper's damping, the default, yields 0.768."""
     exact = Case.load(overrides=["contacts.damping=exact"]).model().contact
     assert exact.effective_restitution == pytest.approx(0.7)
     # The paper's damping returns more than is asked.
@@ -309,7 +316,7 @@ def test_an_output_too_coarse_to_measure_is_a_warning(override, message):
 
 
 def test_a_missing_file_of_samples_hides_no_problem_with_times():
-    """Without its file a drive has no samples, which is one problem; a wrong number of samples in time is another."""
+    """A missing file of a drive's samples and a wrong number of samples in time are both reported."""
     found = problems({"drive": {"waveform": "samples", "samples": {"file": "none.csv"}}, "time": {"samples": 1}})
     assert list(found) == ["drive.samples.file", "time.samples"]
 

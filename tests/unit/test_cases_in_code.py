@@ -37,7 +37,7 @@ def test_keywords_give_the_case_of_the_table():
 def test_what_a_program_holds_is_taken():
     """Arrays, tuples, NumPy's numbers, paths and a case's sections stand for a file's values; None leaves a key out."""
     written = {"cell": {"masses": [0.01, 0.004], "springs": SPRINGS}, "cells": 60}
-    # The types in which a program holds what a file has as lists and numbers.
+    # The same values in the types of a program.
     held = {"cell": {"masses": np.array([0.01, 0.004]), "springs": tuple(SPRINGS)}, "cells": np.int64(60), "ends": None}
     drive = {"amplitude": np.float64(8.0), "band": 2, "at": "max-group-velocity"}
     case = Case(lattice=held, drive=drive, contacts=None)
@@ -124,7 +124,7 @@ def test_text_in_a_table_is_text():
 
 
 def test_a_notebook_shows_what_a_sweep_varies():
-    """Each key that varies stands with its values, and the number of members in the title."""
+    """The table of a sweep lists each key that varies with its values, and its title has the number of members."""
     values = {"amplitude": [1.0, 2.0], "cycles": list(range(1, 13))}
     html = Sweep(**TABLE, sweep={"drive": values})._repr_html_()
     assert "<b>case: 24 members</b>" in html
@@ -134,7 +134,7 @@ def test_a_notebook_shows_what_a_sweep_varies():
 
 
 def test_the_drawing_has_room_for_every_mass_of_the_next_cell():
-    """Two springs to the next cell end at its first and its second mass."""
+    """All circles lie within the drawing, whose two springs to the next cell end at its first and its second mass."""
     springs = (
         Spring(start=0, end=1, stiffness=1.0),
         Spring(start=1, end=2, stiffness=1.0),

@@ -51,7 +51,7 @@ def test_charts_encode_decode_and_differentiate(in_clearances, period, kind):
 @pytest.mark.parametrize(("gap", "scale"), [(0.1, 1.0), (-2.0, 2.0), (6.0, 5.0)])
 def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, scale):
     """A gap is divided by the clearance or by itself, whichever is more, but by no more than the largest amplitude."""
-    # In clearances; the larger of the two displacements is 5.
+    # Displacements are in clearances, and the larger one is 5.
     in_clearances = [5.0 - gap, 5.0] if gap > 0 else [5.0, 5.0 + gap]
     x = CLEARANCE * np.array(in_clearances)
 
@@ -61,7 +61,7 @@ def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, 
 
 
 def masses_in_contact(*pairs: tuple[int | None, int]) -> System:
-    """Three masses on springs to the ground and to each other, with contacts from hosts to resonators."""
+    """Return three masses on springs to the ground and to each other, with contacts of these (host, resonator)."""
     law = Contact("bilinear", 5.0)
     springs = [(None, 0, 1.0), (None, 1, 1.0), (None, 2, 1.0), (0, 1, 0.5), (1, 2, 0.7), (2, 0, 0.9)]
     contacts = [ContactPair(host, resonator, 0.1 + 0.01 * i, law) for i, (host, resonator) in enumerate(pairs)]
@@ -80,6 +80,10 @@ def masses_in_contact(*pairs: tuple[int | None, int]) -> System:
     ],
 )
 def test_the_relative_chart_has_as_many_elongations_as_are_independent(pairs, unknowns):
+    """Unknowns are the elongations of independent contacts and, for the other masses, displacements.
+
+    ``unknowns`` names for each mass the contact whose elongation replaces its displacement.
+    """
     system = masses_in_contact(*pairs)
     x = np.array([0.3, -0.2, 0.1])
     chart = Relative(system, x, 1.0)

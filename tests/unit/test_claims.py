@@ -30,6 +30,7 @@ def contactless_curve(amplitude: list[float] | np.ndarray, value: list[float] | 
 
 @given(st.floats(-1e6, 1e6), st.floats(0, 1e6), st.floats(-2e6, 2e6))
 def test_a_criterion_is_met_within_its_bounds_alone(low, width, value):
+    """A value meets a criterion from its lower to its upper bound; NaN does not."""
     high = low + width
     criterion = Criterion("x", "within", (low, high), "", "")
     # Bounds have a tolerance of 1e-9, so that rounding does not decide.
@@ -61,6 +62,10 @@ def test_a_criterion_of_counts_is_met_from_its_number_on():
     ],
 )
 def test_a_claim_holds_by_all_of_its_criteria_and_fails_by_a_decisive_one(values, expected):
+    """A claim holds if all criteria are met, fails if a decisive one or all are missed, and else holds in part.
+
+    A criterion without a value is not met; a claim without any values is unmeasured.
+    """
     criteria = (Criterion("a", "<=", 2, "", "", decisive=True), Criterion("b", "<=", 2, "", ""))
     judgement, _ = verdict(criteria, values)
     assert judgement == expected
@@ -73,6 +78,7 @@ def test_numbers_of_a_report_are_rounded_and_finite():
 
 @given(st.integers(2, 9), st.floats(1.1, 3.0))
 def test_a_rise_is_measured_between_neighbouring_amplitudes(steps, ratio):
+    """A curve that jumps between two amplitudes has their ratio as its growth."""
     levels = np.arange(steps + 3)
     value = np.where(levels < steps, 0.01, 1.0)
     assert contactless_curve(ratio**levels, value).growth_ratio(0.1, 0.5) == pytest.approx(ratio)
@@ -204,6 +210,7 @@ def value_that_meets(criterion: Criterion) -> float:
     ("claim", "criterion"), CRITERIA, ids=[f"{claim} {criterion.quantity}" for claim, criterion in CRITERIA]
 )
 def test_a_number_on_either_side_of_its_threshold_decides(claim, criterion):
+    """Each criterion is met just inside its threshold; just outside it is missed, which changes the verdict."""
     criteria = CLAIMS[claim].criteria
     values = {each.quantity: value_that_meets(each) for each in criteria}
     low, high = criterion.interval
@@ -227,6 +234,7 @@ def test_a_number_on_either_side_of_its_threshold_decides(claim, criterion):
 
 
 def test_without_files_nothing_is_measured_and_thresholds_stand(tmp_path):
+    """Without files every claim is unmeasured and has its reason, thresholds and figure."""
     rows = [SimpleNamespace(**row) for row in measure_claims(tmp_path)]
 
     assert [(row.id, row.reading) for row in rows] == [(id, reading) for id in IDS for reading in CLAIMS[id].readings]

@@ -80,6 +80,7 @@ def test_branches_with_folds_and_limits_hold(tmp_path):
     ],
 )
 def test_branches_on_either_side_of_their_thresholds_decide(tmp_path, change, expected):
+    """Claim C15 holds just inside each of its thresholds and holds in part just outside."""
     put_branch(tmp_path, "hertz")
     put_branch(tmp_path, "bilinear", **change)
     assert measure("C15", tmp_path, "printed").verdict == expected
@@ -152,6 +153,7 @@ def put_backbone(root: Path, exponent: float, scatter: float) -> None:
     ("exponent", "scatter", "expected"), [(-1.0, 0.0, HOLDS), (-0.5, 0.0, IN_PART), (-0.5, 3.0, FAILS)]
 )
 def test_transfer_is_compared_with_the_slope_of_the_branch(tmp_path, exponent, scatter, expected):
+    """Claim C16 holds if transfer and slope have the same exponent, -1, and fails if the transfer is no power law."""
     put_backbone(tmp_path, exponent, scatter)
     found = measure("C16", tmp_path)
     assert found.verdict == expected, found
@@ -208,6 +210,7 @@ def put_portraits(root: Path, linearity: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("linearity", "expected"), [(1.0, HOLDS), (0.0, IN_PART)])
 def test_portraits_pass_the_regimes(tmp_path, linearity, expected):
+    """Claim C17 holds in part if the resonator has left the linear motion at the second amplitude."""
     put_portraits(tmp_path, linearity)
     found = measure("C17", tmp_path)
     assert found.verdict == expected, found

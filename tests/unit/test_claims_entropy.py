@@ -161,6 +161,7 @@ def test_entropies_that_only_rise_do_not_decay(tmp_path):
     ("of_configurations", "of_curves", "expected"), [(0.951, 0.901, HOLDS), (0.949, 0.899, IN_PART)]
 )
 def test_fits_on_either_side_of_their_thresholds_decide(decaying, of_configurations, of_curves, expected):
+    """Claims C7 and C8 hold just above their bounds on R^2, 0.95 and 0.9, and hold in part just below."""
     for claim, r2 in (("C7", of_configurations), ("C8", of_curves)):
         for step in (SPREAD, NEIGHBOURS):
             for average in ("energy_weighted", "masked", "joint"):
@@ -171,6 +172,7 @@ def test_fits_on_either_side_of_their_thresholds_decide(decaying, of_configurati
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "nonlinear"), [(0.95, 0.5), (0.5, 0.95), (np.nan, 0.95)])
 def test_the_better_fit_counts_at_every_wavenumber(decaying, line, nonlinear):
+    """A curve counts if either its line of logarithms or its nonlinear fit is above the bound."""
     set_fits(decaying, SPREAD, r2_log_log=line, r2_nonlinear=nonlinear)
 
     found = measure("C8", decaying)
@@ -182,6 +184,7 @@ def test_the_better_fit_counts_at_every_wavenumber(decaying, line, nonlinear):
 
 @pytest.mark.slow
 def test_fits_of_three_points_do_not_count(decaying):
+    """Fits count from four points on, and count as power laws only if no worse than the mean."""
     for points, expected in ((4, HOLDS), (3, IN_PART)):
         set_fits(decaying, SPREAD, points=points)
         assert measure("C8", decaying).verdict == expected

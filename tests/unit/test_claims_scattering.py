@@ -115,6 +115,7 @@ def test_scattering_as_the_paper_has_it_holds(tmp_path):
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0099, HOLDS), (0.0101, FAILS)])
 def test_partitions_that_miss_more_than_one_per_cent_do_not_reconstruct(tmp_path, error, expected):
+    """Claim C6 holds up to an error of 1 % of the energy."""
     put_scattering(tmp_path, error=error)
     assert measure("C6", tmp_path).verdict == expected
 

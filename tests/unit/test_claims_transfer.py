@@ -60,6 +60,7 @@ def test_transfer_that_never_sets_in_is_measured(tmp_path):
 
 @pytest.mark.slow
 def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
+    """A selection by two keys of a zipped axis finds their common member, and refuses values that have none."""
     put_transfer(tmp_path)
     with Evidence(tmp_path) as evidence:
         single = evidence.select("interband", "calibrated", law="bilinear", sites=1, cycles=30)
@@ -119,6 +120,7 @@ def put_scatter(root: Path) -> None:
 
 @pytest.mark.slow
 def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
+    """Scatter adds a mean and a deviation to claims C11 and C14, and changes neither verdict nor threshold."""
     put_transfer(tmp_path)
     before = {claim: measure(claim, tmp_path) for claim in ("C11", "C14")}
     put_scatter(tmp_path)
@@ -142,6 +144,7 @@ def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
     [(0.05, 0.03, 16.0, HOLDS), (0.07, 0.03, 16.0, IN_PART), (0.05, 0.05, 16.0, IN_PART), (0.05, 0.03, 25.0, IN_PART)],
 )
 def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, onset, expected):
+    """Claim C18 holds if errors are below 0.06 decades and 0.04 and contacts begin between the same amplitudes."""
     coordinates = {"amplitude": [12.0, 20.0, 30.0]}
     data = {"predicted/upper": ("amplitude", [0.0, 0.1, 0.2]), "simulated/contact_episodes": ("amplitude", [0.0, 3, 9])}
     good = {"rms_upper": 0.01, "worst_upper": 0.2, "worst_dissipated": 0.01, "onset_amplitude": 16.0}
@@ -162,6 +165,7 @@ def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, ons
 @pytest.mark.slow
 @pytest.mark.parametrize(("weak_below", "expected"), [(0.0, 10**0.25), (90.0, 10.0)])
 def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
+    """The onset is the ratio of the last amplitude on the floor and the first one at half the maximum."""
     # Amplitudes are 10^(1/4) apart: the onset takes one step, or four where the transfer is weak below 90 N.
     put_transfer(tmp_path, weak_below=weak_below)
     ratio = measure("C11", tmp_path).value["ratio of amplitudes from the floor to half the maximum, hertz"]
@@ -170,6 +174,7 @@ def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
 
 @pytest.mark.slow
 def test_transfer_of_another_size_holds_in_part(tmp_path):
+    """Claims C11 and C14 hold in part if floor and maxima have other sizes than the paper's."""
     put_transfer(tmp_path, maximum=0.2, floor=1e-3, one_site=0.3)
     onset = measure("C11", tmp_path)
     assert onset.verdict == IN_PART
@@ -197,6 +202,7 @@ def put_amplitudes(root: Path, content: Callable[[Case], dict[str, Any]]) -> Non
 
 @pytest.mark.parametrize(("medium", "high", "expected"), [(0.3, 0.02, HOLDS), (0.1, 0.2, IN_PART)])
 def test_medium_amplitude_fills_the_upper_bands(tmp_path, medium, high, expected):
+    """Claim C12 holds if the transfer at 24 N exceeds that at 1 N and at 200 N."""
     transfer = {1.0: 1e-4, 24.0: medium, 200.0: high}
     put_amplitudes(tmp_path, lambda case: {"ibtet": transfer[case.drive.amplitude]})
     assert measure("C12", tmp_path).verdict == expected

@@ -154,6 +154,7 @@ def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_pa
 
 
 def test_a_kernel_is_translated_only_where_python_calls_it():
+    """A kernel that another kernel calls has no entry for Python until Python calls it."""
     double = kernel.Kernel(lambda x: 2.0 * x, numba.njit, {})
     quadruple = kernel.Kernel(lambda x: double(double(x)), numba.njit, {})
     assert quadruple(3.0) == 12.0
@@ -198,6 +199,7 @@ def test_kernels_are_in_the_users_cache_or_else_in_the_package(package, tmp_path
 
 @pytest.mark.usefixtures("forgotten")
 def test_kernels_that_were_used_longest_ago_make_room(tmp_path, monkeypatch):
+    """Beyond the largest size the folders unused for the longest time are removed."""
     monkeypatch.setattr(kernel_cache, "LARGEST", 250)
     for age in range(4):
         folder = tmp_path / f"kernels-{age}"
@@ -206,7 +208,7 @@ def test_kernels_that_were_used_longest_ago_make_room(tmp_path, monkeypatch):
         when = time.time() - 2 * kernel_cache.DAY * (age + 1)
         os.utime(folder, (when, when))
 
-    # One of them is used meanwhile.
+    # One of the folders is used again.
     kernel_cache.note_use(tmp_path / "kernels-2")
     kernel_cache.remove_oldest(tmp_path)
     assert {folder.name for folder in tmp_path.iterdir()} == {"kernels-0", "kernels-2"}

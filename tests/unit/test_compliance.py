@@ -64,6 +64,7 @@ FINITE = [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))]
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize(("cells", "sites"), FINITE)
 def test_the_compliance_of_a_finite_lattice_is_that_of_dense_matrices(name, ends, cells, sites):
+    """Compliance and fields by waves are those of (K - omega^2 M)^-1, for all ends, sites and frequencies."""
     chain = chain_of(CELLS[name], cells, sites, ends)
     d = chain.cell.dofs
     # A mass of the last cell stands for a driven one.
@@ -89,6 +90,10 @@ def test_the_compliance_of_a_finite_lattice_is_that_of_dense_matrices(name, ends
 
 @pytest.mark.parametrize("name", CELLS)
 def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
+    """A lattice of 1000 cells in which waves decay has the compliance of the infinite one.
+
+    At a real omega the infinite lattice has the limit from Im omega < 0.
+    """
     chain = chain_of(CELLS[name], 1000, (500, 503), "free")
     infinite = WaveCompliance(chain, infinite=True)
     # Waves of these frequencies decay before they reach an end.
@@ -109,6 +114,7 @@ def bloch_sum(cell: UnitCell, wavenumbers: np.ndarray, omega: complex) -> comple
 
 
 def test_self_compliance_is_a_sum_over_bloch_waves():
+    """The self-compliance is the mean over wavenumbers of sum |u_r - u_h|^2/(omega_b^2 - omega^2), over the bands b."""
     cell = CELLS["four-band"]
     infinite = WaveCompliance(chain_of(cell, 1, (0,)), infinite=True)
     wavenumbers = 2 * np.pi * np.arange(4096) / 4096
@@ -119,6 +125,7 @@ def test_self_compliance_is_a_sum_over_bloch_waves():
 
 @pytest.mark.parametrize("infinite", [False, True])
 def test_the_compliance_is_reciprocal(infinite):
+    """The compliance matrix is symmetric."""
     compliance = WaveCompliance(chain_of(RICH, 90, (3, 40, 41)), infinite).at(FREQUENCIES)
     assert np.abs(compliance - compliance.swapaxes(1, 2)).max() < 1e-12 * np.abs(compliance).max()
 
@@ -126,6 +133,7 @@ def test_the_compliance_is_reciprocal(infinite):
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize(("band", "direction"), [(1, 1), (2, 1), (2, -1)])
 def test_an_incident_wave_leaves_with_its_flux(name, band, direction):
+    """Without forces the flux of an incident wave leaves on the other side; it goes with the amplitude squared."""
     cell = CELLS[name]
     compliance = WaveCompliance(chain_of(cell, 30, (7, 12)), infinite=True)
     wave = compliance.incident(float(bloch(cell, 1.3).frequency[band - 1]), band, direction)
@@ -141,6 +149,7 @@ def test_an_incident_wave_leaves_with_its_flux(name, band, direction):
 # The first spring is elastic, the second one takes energy.
 @pytest.mark.parametrize("spring", [3e3, 3e3 * (1 + 0.2j)])
 def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band, direction, spring):
+    """Flux that leaves and power that complex springs take, Re(F* i omega w)/2, sum to the incident flux."""
     cell = CELLS[name]
     chain = chain_of(cell, 30, (7, 12))
     compliance = WaveCompliance(chain, infinite=True)
@@ -159,6 +168,7 @@ def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band
 
 
 def test_the_flux_is_energy_times_group_velocity():
+    """The flux of a wave is (sum m |u|^2) omega^2/2 times the group velocity; a gap has no wave."""
     cell = CELLS["four-band"]
     kappa = 1.1
     point = bloch(cell, kappa)
@@ -183,6 +193,7 @@ def test_a_long_lattice_costs_what_a_short_one_does():
 
 
 def test_a_long_ring_has_the_sum_over_its_bloch_waves():
+    """The self-compliance of a ring of n cells is the mean over its n wavenumbers 2 pi j/n."""
     cell = CELLS["four-band"]
     cells = 10_007
     ring = chain_of(cell, cells, (5,), "periodic")

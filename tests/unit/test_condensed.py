@@ -84,6 +84,7 @@ def harmonics_of(samples: np.ndarray, orders: int) -> np.ndarray:
 @pytest.mark.parametrize("law", CONSERVATIVE)
 @pytest.mark.parametrize("seed", range(3))
 def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
+    """Harmonics of forces, potential and closed time are those of 2^18 samples; elastic contacts have no loss."""
     forces = SiteForces([Stops.both(law, 1.0), Stops(law, 0.8, 0.4), Stops(law, 0.5, np.inf)])
     order = 9
     z = random_harmonics(forces, order, seed, "any")
@@ -106,6 +107,7 @@ def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
 
 
 def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
+    """A spring 2 w^2 + w^3/2 under w = 3 cos theta has the harmonics of these powers of a cosine."""
     spring = Spring(0, 1, 0.0, quadratic=2.0, cubic=0.5)
     series = SiteForces([], [spring]).series(np.array([[0.0, 3.0]]), OMEGA)
     # 2 cos^2 = 1 + cos 2 and 4 cos^3 = 3 cos + cos 3.
@@ -114,6 +116,7 @@ def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
 
 @pytest.mark.parametrize("law", DISSIPATIVE)
 def test_a_dissipative_contact_loses_the_work_of_its_force(law):
+    """The loss of w = cos theta at two stops is twice the integral of F dw over the closed time of one."""
     forces = SiteForces([Stops.both(law, 0.5)])
 
     series = forces.series(np.array([[0.0, 1.0]], complex), OMEGA)
@@ -136,6 +139,7 @@ def test_a_dissipative_contact_loses_the_work_of_its_force(law):
     [*itertools.product(CONSERVATIVE, ("at rest", "odd", "any")), *itertools.product(DISSIPATIVE, ("odd", "any"))],
 )
 def test_derivatives_are_those_of_the_residual(law, symmetry):
+    """The Jacobian and the derivative by omega of the residual agree with central differences."""
     # A quadratic spring would break the symmetry of odd motions.
     quadratic = 0.3 if symmetry == "any" else 0.0
     forces = SiteForces(
@@ -196,6 +200,7 @@ def test_a_growing_perturbation_has_the_derivative_of_its_frozen_growth(law):
 
 
 def test_short_arcs_are_not_missed():
+    """The arc of cos(theta + 0.3) - 1 above -d has the half-width arccos(1 - d), also far below the sample spacing."""
     theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
     motion = np.stack([np.cos(theta) - 1, -np.sin(theta), -np.cos(theta)], axis=1)
     # The shortest of these arcs is a thousandth of the distance between samples.
@@ -229,6 +234,7 @@ def hardening_forces() -> SiteForces:
 
 
 def test_the_solution_does_not_depend_on_the_shift():
+    """A motion that solves the equations solves them with any shift."""
     forces = hardening_forces()
     balance = random_balance(forces, 5, "odd")
     x = balance.pack(random_harmonics(forces, 5, 2, "odd"))
@@ -243,6 +249,7 @@ def test_the_solution_does_not_depend_on_the_shift():
 @pytest.mark.parametrize("weight", [0.1, 0.4, 1.0])
 @pytest.mark.parametrize("symmetry", ["odd", "any"])
 def test_a_weight_multiplies_the_compliance_of_harmonics_above_the_first(symmetry, weight):
+    """With a weight the residual has weight times G at all orders above 1, and its Jacobian follows."""
     forces = hardening_forces()
     whole = random_balance(forces, 5, symmetry)
     balance = whole.weighted(weight)
@@ -296,15 +303,17 @@ def record_weights(monkeypatch) -> list[float]:
 
 
 def test_the_harmonics_above_the_first_are_brought_in_by_growing_weights(monkeypatch):
+    """Weights grow in steps that are 1.6 times as long as the last one, and the motion of weight 1 is a solution."""
     tried = record_weights(monkeypatch)
     point = gap_motions().in_gap(2.1, np.array([1.0]))
-    # Steps of 0.1, 0.16, 0.256, 0.4096, and what is left.
+    # Steps are 0.1, 0.16, 0.256, 0.4096, and the rest to 1.
     assert tried == pytest.approx([0.1, 0.26, 0.516, 0.9256, 1.0])
     assert point.frequency == pytest.approx(2.1 / (2 * np.pi), rel=1e-14)
     assert point.residual < 1e-11
 
 
 def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(monkeypatch):
+    """A step of the weight after which the motion changes too much is cut to 0.4 of it, down to the smallest step."""
     tried = record_weights(monkeypatch)
     # No change is small enough: steps are 0.1 times powers of 0.4, until the next one is below the smallest step.
     monkeypatch.setattr(conservative, "FURTHEST", 0.0)
@@ -396,7 +405,7 @@ def test_a_motion_in_a_gap_needs_a_sign():
 
 
 def test_the_state_of_rest_is_no_motion():
-    """Within the clearance no force acts, and at a frequency of the gap rest is the only solution."""
+    """A guess within the clearance is refused: no force acts, and rest is the only motion of a frequency in a gap."""
     motions = gap_motions()
     guess = motions._guess(motions.one_harmonic(np.array([0.5])), 2.1)
     with pytest.raises(ContinuationError, match="the state of rest"):
@@ -418,6 +427,7 @@ def test_folds_are_sought_where_both_motions_have_contact():
 
 
 def test_folds_of_motions_that_are_never_linear_are_sought_everywhere():
+    """Folds are searched for between motions without contact, too, where a spring is nonlinear."""
     compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
     motions = ConservativeMotions(compliance, SiteForces([], [Spring(0, 1, 0.0, cubic=0.2)]), NnmTable())
     point = motions.from_mode(np.array([0.1]), 1.0)
@@ -447,6 +457,7 @@ def test_a_start_whose_guess_needs_fewer_harmonics_than_the_motion_has_enough():
 
 @pytest.mark.parametrize("harmonics", [20, 21])
 def test_the_highest_order_is_odd_and_a_start_that_needs_more_has_it(harmonics):
+    """A start that needs more orders than ``nnm.harmonics`` has the largest odd number of them."""
     point = one_mass(truncation=1e-9, harmonics=harmonics).from_mode(np.array([1.01]), 1.0)
     assert point.truncation > 1e-9
     assert point.order == {20: 19, 21: 21}[harmonics]

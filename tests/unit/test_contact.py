@@ -48,6 +48,7 @@ def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, secon
 @LAWS
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_force_is_that_of_the_law_in_numpy(law, side):
+    """The compiled force on either side is that of ``Contact.force``; the power lost is (F - F_elastic) w' > 0."""
     contact = Contact(law, STIFFNESS, RESTITUTION)
     contacts = create_contacts(contact, [CLEARANCE, 2 * CLEARANCE])
     contacts["mode"][1] = side * CLOSED
@@ -68,6 +69,7 @@ def test_the_force_is_that_of_the_law_in_numpy(law, side):
 
 @LAWS
 def test_energy_force_and_gradient_belong_together(law):
+    """The force is k x^n and the derivative of the energy, and the slope is the derivative of the force."""
     contact = Contact(law, STIFFNESS)
     record = elastic_records([contact])[0]
     x = 3e-5
@@ -88,6 +90,7 @@ def test_energy_force_and_gradient_belong_together(law):
 
 
 def test_a_power_law_has_the_exponent_given():
+    """The law k x^n with n = 1.25 has the slope n k x^(n-1) and the energy k x^(n+1)/(n+1)."""
     record = elastic_records([Contact("power", STIFFNESS, exponent=1.25)])[0]
     x = 3e-5
     assert elastic_force(record, -x) == pytest.approx(-STIFFNESS * x**1.25)
@@ -113,6 +116,7 @@ def excursion(side: int) -> np.poly1d:
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
+    """A parabola beyond the clearance for 0.2 ms of a step has its onset first and, from there on, its separation."""
     w = excursion(side)
     onset = MIDDLE - HALF_WIDTH
     separation = MIDDLE + HALF_WIDTH
@@ -138,6 +142,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_extremes_of_an_excursion_are_its_height_and_its_largest_force(side):
+    """The largest indentation is the height of the parabola, the largest force the maximum of 5001 samples."""
     w = excursion(side)
     onset = MIDDLE - HALF_WIDTH
     contacts = closed_sites(HERTZ, 2, side * 8e-3)
@@ -152,6 +157,7 @@ def test_the_extremes_of_an_excursion_are_its_height_and_its_largest_force(side)
 
 @pytest.mark.parametrize(("order", "site"), [(1, 0), (-1, 2)])
 def test_the_earliest_of_several_sites_changes_first(order, site):
+    """Three sites that move by 6 D in a step have clearances D, 3 D and 5 D: the first change is at 1/6 of the step."""
     clearances = CLEARANCE * np.array([1.0, 3.0, 5.0])[::order]
     rate = 6 * CLEARANCE / STEP
     start = np.array([[0.0, rate, 0.0]] * 3)
@@ -162,6 +168,7 @@ def test_the_earliest_of_several_sites_changes_first(order, site):
 
 
 def test_either_side_has_its_own_clearance():
+    """A motion to -1.5 D in a step meets a clearance D on the side - at 2/3 of the step."""
     contacts = create_contacts(Contact("hertz", STIFFNESS), [2 * CLEARANCE])
     contacts["clearance_minus"] = CLEARANCE
     rate = -1.5 * CLEARANCE / STEP
@@ -184,6 +191,7 @@ def test_the_extremes_of_a_contact_that_turns_within_a_step_are_those_of_its_tur
 
 
 def test_clipping_begins_where_g_falls_through_zero():
+    """A contact that must not pull is clipped where g = 1 + c w'/w'_minus = 0, and closed where g rises through 0."""
     approach = 0.01
     # The site leaves the contact faster and faster.
     w = np.poly1d([CLEARANCE + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])
@@ -200,7 +208,7 @@ def test_clipping_begins_where_g_falls_through_zero():
     clipping = changes.switching(contacts, 1, change.function, end[1])
     assert clipping.mode == CLIPPED
 
-    # It ends where the same function rises through zero.
+    # Clipping ends where the same function rises through zero.
     contacts[1]["mode"] = CLIPPED
     back = changes.switching(contacts, 1, 1, end[1])
     assert (back.mode, back.value, back.rate) == (CLOSED, -clipping.value, -clipping.rate)
@@ -224,6 +232,7 @@ def test_a_landing_on_a_root_converges():
 
 
 def test_a_landing_on_a_near_miss_is_searched_again_until_it_is_missed():
+    """A landing on a maximum at -1e-6 asks for new searches until its attempts are used up, and then is missed."""
     attempt = landing_at(0.5)
     outcome = search.RETRY
     outcomes = []
@@ -267,6 +276,7 @@ def pull(tracker: ImpactTracker, start: float) -> None:
 
 
 def test_a_site_that_touches_and_recedes_grazes():
+    """A site at its clearance that moves inwards has no onset and is counted as grazing."""
     tracker = create_tracker()
     tracker.start[1] = -CLEARANCE, 0.01, 0.0
     assert tracker.switch(0.1, np.array([0.0, 0.25])) == 0
@@ -274,12 +284,13 @@ def test_a_site_that_touches_and_recedes_grazes():
 
 
 def test_the_tracker_follows_an_impact_from_onset_to_separation():
+    """An impact is one episode with onset, extremes, loss and separation, also for a tracker resumed within it."""
     tracker = create_tracker()
     tracker.start[1] = -CLEARANCE, -0.01, 0.0
     assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
     site = tracker.contacts[1]
     assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
-    # One onset, slower than the floor.
+    # The site has one onset, which is slower than the floor.
     assert tracker.counts[1].tolist() == (0, 1, 0, 0)
     assert tracker.contact_time() == impact_time(tracker.contacts[0], 0.05)
 
@@ -320,6 +331,7 @@ def test_every_impact_that_pulls_is_counted():
 
 @LAWS
 def test_the_contact_time_is_that_of_an_integrated_impact(law):
+    """The contact time of a mass is twice the time of an integrated impact up to the turn."""
     speed = 0.3
     contacts = closed_sites(Contact(law, STIFFNESS), 1, speed, MASS)
 

@@ -1,4 +1,4 @@
-"""The restitution of an impact: what the paper's and the exact damping return."""
+"""The effective restitution of an impact with the paper's and with the exact damping."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def integrated_restitution(contact: Contact) -> float:
     ("asked", "effective"), [(0.0, 0.4877413), (0.3, 0.5812880), (0.5, 0.6629622), (0.7, 0.7679998), (0.9, 0.9090157)]
 )
 def test_the_papers_damping_returns_more_than_is_asked(law, asked, effective):
+    """An integrated impact with g = 1 + c w'/w'_minus, c = 3 (1 - e)/2, has the effective restitution, above e."""
     contact = Contact(law, STIFFNESS, asked)
     assert integrated_restitution(contact) == pytest.approx(contact.effective_restitution, rel=1e-6)
     assert contact.effective_restitution == pytest.approx(effective, rel=1e-6)
@@ -45,6 +46,7 @@ def test_the_papers_damping_returns_more_than_is_asked(law, asked, effective):
 @LAWS
 @pytest.mark.parametrize("asked", [0.1, 0.3, 0.5, 0.7, 0.9])
 def test_the_exact_damping_returns_what_is_asked(law, asked):
+    """An integrated impact with the exact damping has the restitution asked for."""
     contact = Contact(law, STIFFNESS, asked, factor="exact")
     assert integrated_restitution(contact) == pytest.approx(contact.effective_restitution, rel=1e-6)
     assert contact.effective_restitution == pytest.approx(asked, rel=1e-6)

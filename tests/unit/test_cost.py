@@ -69,6 +69,7 @@ def test_contacts_are_expected_of_every_pair_at_every_stop(contacts, stops):
 
 
 def test_a_sine_that_does_not_end_is_beyond_a_clearance_all_the_time():
+    """The wave of a harmonic drive touches both stops in each of omega t/(2 pi) cycles if it exceeds the clearance."""
     sine = {"waveform": "harmonic"}
     stop = {"pair": [0, 1], "side": "both"}
     assert expected_episodes(chain_with_a_stop(stop, sine, over=1.01)) == pytest.approx(2 * 0.2 * 1000.0 / (2 * np.pi))

@@ -37,6 +37,7 @@ def test_short_contacts_are_compared_by_their_depth():
 
 
 def test_images_that_appear_together_are_one_change():
+    """Departures that appear or vanish with their images are one changed family."""
     pair = [A, Departure(0.47, 0.1)]
     assert changed_families([], pair) == 1
     assert changed_families([Departure(0, 0.3), *pair], [Departure(0, 0.3)]) == 1

@@ -36,6 +36,7 @@ def draw(contacts: dict[str, Any] = TEN_SITES, **disorder: Any) -> Case:
 @pytest.mark.parametrize("distribution", ["normal", "uniform", "lognormal"])
 @pytest.mark.parametrize("size", [{"relative": 0.1}, {"absolute": 0.1 * CLEARANCE}])
 def test_mean_and_deviation_are_those_asked_for(distribution, size):
+    """100,000 drawn numbers have the mean, the deviation, the range and the skewness of their distribution."""
     nominal = np.full(100_000, CLEARANCE)
     drawn = Deviation(distribution=distribution, **size).draw(nominal, 7, "clearance") / CLEARANCE
 
@@ -53,6 +54,7 @@ def test_mean_and_deviation_are_those_asked_for(distribution, size):
 
 
 def test_a_seed_gives_the_same_bits_whatever_else_is_drawn():
+    """Numbers of a quantity depend on the seed and not on other quantities; fewer sites have the first of them."""
     spread = {"relative": 0.05}
     one = draw(seed=3, clearance=spread)
     assert draw(seed=3, clearance=spread).to_toml() == one.to_toml()
@@ -77,6 +79,7 @@ def test_a_deviation_of_zero_leaves_the_case_as_it_is_without_the_section():
 
 
 def test_the_resolved_case_holds_what_was_drawn():
+    """A resolved case has drawn masses, springs and stiffness, the nominal drive and times, and no [disorder]."""
     nominal = draw()
     case = draw(seed=1, masses={"relative": 0.02}, springs={"relative": 0.02}, modulus={"relative": 0.1})
     assert Case.from_toml(case.to_toml()) == case
@@ -108,6 +111,7 @@ def test_sites_move_by_whole_cells():
 
 @pytest.mark.slow
 def test_samples_of_contacts_alone_have_one_linear_run():
+    """Samples that differ in contacts alone have one linear run, and samples with other masses one each."""
     contacts = {"clearance": {"relative": 0.1}, "restitution": {"absolute": 0.02}}
     by_contacts = {linear_name(draw(seed=seed, **contacts)) for seed in range(3)}
     by_cells = {linear_name(draw(seed=seed, masses={"relative": 0.1})) for seed in range(3)}
@@ -140,6 +144,7 @@ def test_what_cannot_be_drawn_is_refused(disorder, message):
 
 
 def test_the_clearances_of_the_two_sides_are_drawn_independently():
+    """Clearances on the side w < 0 have numbers of their own, and those on the side w > 0 are as without them."""
     scatter = {"seed": 2, "clearance": {"relative": 0.05}}
     equal = draw(**scatter).contacts.clearance
     minus = [3e-3] * 10
@@ -167,6 +172,7 @@ def test_a_deviation_is_described_with_its_size_and_distribution():
 
 
 def test_a_restitution_is_drawn_for_every_site():
+    """Restitutions are drawn for every site, and stand in the list of the sites or, for one site, in the common key."""
     case = draw(seed=3, restitution={"relative": 0.05})
     drawn = case.contacts.each.restitution
     assert len(set(drawn)) == 10
@@ -229,6 +235,7 @@ SWEEP = BASE | {
 
 
 def test_a_count_of_seeds_is_an_axis_of_samples():
+    """A sweep over a count of seeds has an axis of seeds, whose members are the cases with these seeds."""
     plan = Sweep.from_table(SWEEP)
     assert plan.shape == (5, 7)
     assert plan.axes[0] == {"disorder.seed": (0, 1, 2, 3, 4)}
@@ -249,6 +256,7 @@ def test_the_disorder_of_a_sweep_is_that_of_its_first_seed():
 
 
 def test_one_sample_that_cannot_be_drawn_refuses_the_sweep():
+    """A sweep of which one sample has an impossible clearance is refused, though others could be drawn."""
     plan = Sweep.from_table(SWEEP | {"disorder": {"clearance": {"relative": 0.8}}})
     possible = [plan.member(number).case is not None for number in range(0, plan.count, 7)]
     assert any(possible)
@@ -292,6 +300,7 @@ def ensemble(tmp_path_factory):
 
 @pytest.mark.slow
 def test_statistics_are_those_of_the_samples_that_came_out(ensemble):
+    """Mean, deviation and quantiles over the samples leave failed members out, and are NaN where all failed."""
     mean = ensemble["statistics/ibtet/mean"]
     deviation = ensemble["statistics/ibtet/deviation"]
     quantiles = ensemble["statistics/ibtet/quantiles"]
@@ -313,6 +322,7 @@ def test_statistics_are_those_of_the_samples_that_came_out(ensemble):
 
 
 def test_fits_and_pictures_have_means_in_place_of_single_samples(ensemble):
+    """Fits of the mean are stored, and curves of pictures are means over the samples."""
     mean = ensemble["statistics/ibtet/mean"]
     assert "fits/ibtet/peak" in ensemble
     assert ensemble["statistics/fits/ibtet/peak"] == np.nanmax(mean)

@@ -39,7 +39,7 @@ def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
 class ClosedContact:
     """A Runge-Kutta engine at rest in time, in a random state whose first contact is closed, its second one free."""
 
-    # In m and m/s: the indentation at w = 3e-5 m is 2e-5 m.
+    # The clearance in m and the approach velocity in m/s: at w = 3e-5 m the indentation is 2e-5 m.
     clearance = 1e-5
     approach = 0.02
     work = 0.25
@@ -100,6 +100,7 @@ def lattice(request):
 
 
 def test_rates_are_those_of_the_equations(lattice):
+    """The rates are velocities, M^-1 (-K u + drive + contact force), the drive's power and the dissipated power."""
     rates = lattice.engine.state.duplicate()
     lattice.engine.ts.computeRHSFunction(lattice.time, lattice.engine.state, rates)
     half = CELLS * lattice.chain.cell.dofs
@@ -116,6 +117,7 @@ def test_rates_are_those_of_the_equations(lattice):
 
 
 def test_the_motion_of_sites_is_that_of_the_equations(lattice):
+    """The motion (w, w', w'') of the sites has the accelerations of the equations."""
     motion = np.empty((2, 3))
     lattice.engine.observe(motion, lattice.time)
     for row, cell in zip(motion, CONTACT_CELLS, strict=True):
@@ -125,6 +127,7 @@ def test_the_motion_of_sites_is_that_of_the_equations(lattice):
 
 
 def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
+    """Energies are m v^2/2, u^T K u/2 and that of the contact; work and losses are those of the ledger."""
     energies = energies_of(lattice.model, lattice.layout, lattice.engine.state)
     u = lattice.u.ravel()
     kinetic = 0.5 * np.sum(np.array(lattice.chain.cell.masses) * lattice.v**2)
@@ -138,6 +141,7 @@ def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
 
 
 def test_energies_below_the_unit_of_the_sums_add_up():
+    """Energies of 0.4 units a cell are not rounded to zero one by one: their sum is exact."""
     model = small_case().model()
     layout = Layout(model, MPI.COMM_SELF)
     unit = EnergyMeter(model, layout).unit
@@ -148,6 +152,7 @@ def test_energies_below_the_unit_of_the_sums_add_up():
 
 
 def test_energies_beyond_all_scales_saturate_the_sums():
+    """Energies that are NaN or beyond the largest count as ``LARGEST`` in the sum."""
     sums = np.zeros((ENERGY_SUMS, 2), np.int64)
     for energy in (np.nan, np.inf, 1e300):
         add_energy(sums, energy, 1.0)
@@ -173,6 +178,7 @@ def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
 @pytest.mark.parametrize("size", [1, 31, 77, 640])
 @pytest.mark.parametrize("count", [1, 4, 7, 13])
 def test_stages_are_added_as_petsc_adds_them(size, count):
+    """The compiled sum of stages has the bits of PETSc's VecMAXPY, for any number of stages and any size."""
     rng = np.random.default_rng(size + count)
     by_petsc = PETSc.Vec().createMPI(size, comm=MPI.COMM_SELF)
     registered = by_petsc.duplicate()

@@ -77,7 +77,7 @@ def test_several_ranks_without_a_direct_solver_for_them_factor_the_whole_matrix_
 
 
 def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch):
-    # None in sys.modules makes an import fail.
+    # An entry None in sys.modules makes the import fail.
     monkeypatch.setitem(sys.modules, "slepc4py", None)
     with pytest.raises(CaseError, match=r"slepc4py: is needed only for modes of long lattices .*apt install slepc-dev"):
         load_slepc()
@@ -98,6 +98,7 @@ def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
 
 
 def test_the_lowest_frequency_of_a_fixed_lattice_is_not_taken_for_zero():
+    """The lowest mode of a fixed lattice of n cells has omega = pi/(n + 1) (k/m)^(1/2), with the mass m of a cell."""
     # A long wave: chain of mass 2 and spring 1 a cell, omega^2 = (pi/401)^2/2, which is 6e-6 of the largest omega^2.
     matrices = matrices_of("fixed", 400)
     (frequency,) = modes_near(matrices, 1, 0.0).frequency
@@ -111,7 +112,7 @@ def test_both_copies_of_a_mode_of_a_ring_are_found():
     modes = modes_near(matrices, 3, 0.0)
     assert modes.frequency[0] == 0.0
     assert modes.frequency[1] == pytest.approx(modes.frequency[2], rel=1e-9)
-    # They are different motions.
+    # The two modes are different motions.
     overlap = np.sum(modes.shapes[1] * modes.shapes[2])
     assert abs(overlap) < 1e-8
     matrices.destroy()

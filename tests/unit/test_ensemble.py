@@ -72,6 +72,7 @@ def test_warnings_that_differ_in_numbers_alone_are_one():
 
 @pytest.mark.slow
 def test_a_sample_is_compared_member_by_member(folder, tmp_path):
+    """Members of a sample are compared with the same members of the sweep; a difference beyond 1e-3 is no agreement."""
     sample = sampled(Sweep.from_table(SWEEP), 6, 1)
     members = sample.members()
     assert len(members) == 6
@@ -94,6 +95,7 @@ def test_a_sample_is_compared_member_by_member(folder, tmp_path):
 
 @pytest.mark.slow
 def test_every_member_stands_at_the_values_of_its_keys(folder):
+    """Every member has its place by the values of its keys, zipped ones too; a failed member has NaN and a status."""
     ensemble = open_ensemble(folder)
     assert ensemble["ibtet"].dims == ("law", "sites", "amplitude")
     assert dict(ensemble["cycles"].sizes) == {"sites": 3}
@@ -135,6 +137,7 @@ def test_a_curve_comes_with_its_first_member(folder):
 
 
 def test_a_power_law_is_fitted_from_the_largest_value_on():
+    """The fit of a curve begins at its largest value; amplitudes may be in any order."""
     amplitude = np.geomspace(1.0, 100.0, 12)
     law = 3.0 * amplitude**-0.8
     # A smaller peak comes before.
@@ -178,6 +181,11 @@ def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
 
 
 def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envelope():
+    """A linear run yields the time of the largest |v| of the hosts in each cell, and the envelope of w.
+
+    The envelope is (max |w|^2 + (max |w'|/omega)^2)^(1/2); times the amplitude and over the clearance it says how near
+    a member comes to its stops.
+    """
     case = Case.load(overrides=["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
     peak = 0.2 + 0.02 * np.arange(30)
     data = linear_wave(case, peak)
@@ -235,6 +243,7 @@ def test_records_of_another_version_count_as_missing(folder, monkeypatch):
 
 
 def test_the_latest_record_counts_but_no_failure_after_a_success(folder):
+    """A later record of a member replaces an earlier one, except a failure after a success."""
     sweep = Sweep.from_table(SWEEP)
     put_members(folder, sweep, lambda number, case: "later", file=1)
     results = Results(sweep, folder)

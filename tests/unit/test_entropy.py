@@ -70,6 +70,7 @@ def test_white_noise_approaches_its_limit():
 
 
 def test_the_local_entropy_is_that_of_the_wavelet_transform():
+    """The local entropy is that of the squares of the wavelet transform, octave by octave."""
     signal = noise((5, 150))
     local, weight = local_entropy(signal)
 
@@ -109,6 +110,7 @@ def test_long_waves_keep_their_weight_at_fewer_cells(stride):
 
 
 def test_the_mask_is_relative_to_the_largest_weight_of_all_snapshots():
+    """The threshold of the mask is 1 % of the largest weight of all snapshots, also of those left out of averages."""
     # The loudest snapshot is not among every second one.
     signal = scattering_run()
     signal[5] *= 4
@@ -170,6 +172,7 @@ def test_snapshots_do_not_see_each_other():
 
 
 def test_averages_are_those_of_their_definitions():
+    """Averages are those of their definitions in SPEC.md, from the local entropy and weight after the start."""
     signal = scattering_run()
     start = 5
     # Loud before the averages start: it must not count.

@@ -45,6 +45,7 @@ LATTICES = pytest.mark.parametrize(
 @pytest.mark.parametrize(("interval", "tolerance"), [(1.5e-4, 1e-15), (3e-4, 1e-7)])
 @LATTICES
 def test_a_step_is_the_exponential_within_its_bound(ends, differing, damped, interval, tolerance):
+    """A step differs from exp(A H) by no more than the truncation of its series, which is below the tolerance."""
     model = unlike_lattice(ends, CELLS, differing, dashpots=float(damped))
     layout = Layout(model, MPI.COMM_SELF)
     series = StepSeries(model.chain, interval, tolerance)

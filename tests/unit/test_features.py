@@ -1,4 +1,4 @@
-"""A verb's case refuses by name what its class declares, and accepts the rest; verbs and sections have one list."""
+"""The case of a verb refuses the features that its class declares, by their keys, and accepts all others."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ ROUNDING = 1e-12
 
 
 def interpolation_error(coefficients: np.ndarray) -> float:
-    """Return what the search allows for the interpolant's error, from its coefficients of orders 4 and 5."""
+    """Return the error of the interpolant that the search allows, from its coefficients of orders 4 and 5."""
     return 0.01 * (abs(coefficients[5]) + 0.3 * abs(coefficients[4]))
 
 

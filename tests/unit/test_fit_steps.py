@@ -32,6 +32,7 @@ def slopes(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("precision", [FINAL, GROWING, Precision(cost=1e-5)])
 def test_a_fit_ends_where_scipys_does_with_one_jacobian_less(precision):
+    """A fit ends at the point of ``scipy.optimize.least_squares``, to the bit, and computes one Jacobian less."""
     counted = [0, 0]
 
     def count(x: np.ndarray) -> np.ndarray:
@@ -125,6 +126,7 @@ def test_a_start_that_is_no_case_leaves_derivatives_to_the_place_where_they_are_
 
 
 def test_motions_are_as_exact_as_the_noise_needs():
+    """Tolerances of motions follow the noise: exact at the end, rough at first, and never finer than exact."""
     assert FINAL.tolerances(0.02).motion == EXACT.motion
     assert GROWING.tolerances(0.02).motion == ROUGHEST
     # For records without noise the estimate of the error is far smaller than any tolerance.

@@ -1,4 +1,4 @@
-"""Frequency-energy plots: where the inset on grazing lies and what it shows, the legend's place, an orbit's region."""
+"""Frequency-energy plots: the inset on grazing, its place and its range, the place of the legend, regions of orbits."""
 
 import numpy as np
 import pytest

@@ -17,6 +17,7 @@ def point(*half_traces: complex) -> SimpleNamespace:
 
 
 def test_all_real_half_traces_may_cross_a_level():
+    """Real half-traces may cross a level, hence are followed."""
     assert real_half_traces(point(-0.2, 0.9), point(-0.1, 1.1)) == [0, 1]
 
 

@@ -45,7 +45,10 @@ def test_growth_is_found_where_the_determinant_is_cut_off(monkeypatch):
 
 
 def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude: float) -> np.ndarray:
-    """Of masses of 1 kg over 2 pi s, with ``contact`` N/m on ``row`` while |cos t| exceeds 1/``amplitude``."""
+    """Return the monodromy matrix (state, state) of masses of 1 kg over a period of 2 pi s.
+
+    A spring of ``contact`` N/m acts on ``row`` while |cos t| exceeds 1/``amplitude``.
+    """
     n = len(row)
 
     def flow(spring: float, duration: float) -> np.ndarray:
@@ -62,11 +65,11 @@ def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude:
 @pytest.mark.parametrize(
     ("frequencies", "contact", "amplitude"),
     [
-        # An order that 48 would leave out is next to a mode.
+        # A mode lies near an order beyond 48.
         ((0.7, 59.5), 1e3, 1.3),
         ((0.7, 60.3), 1e3, 1.3),
         ((0.7, 63.2), 1e3, 1.3),
-        # Both modes are slow, but with a closed contact there is one above 48 rad/s.
+        # Both modes are slow; with a closed contact one is above 48 rad/s.
         ((0.7, 12.5), 2.6e3, 1.3),
     ],
 )

@@ -72,7 +72,7 @@ def _imported(path: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             for alias in node.names:
-                # What is imported may be a module, or a name in one.
+                # The imported name may be a module or a name in a module.
                 inner = f"{node.module}.{alias.name}"
                 is_module = inner.removeprefix("vipetsc.") in MODULES
                 yield inner if is_module else node.module
@@ -95,7 +95,7 @@ def part(module: str) -> str:
 
 
 def run_python(code: str) -> str:
-    """What a fresh Python prints."""
+    """Return the output of a new Python process that runs ``code``."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
     return done.stdout.strip()
 

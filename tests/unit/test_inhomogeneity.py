@@ -31,6 +31,7 @@ def scattered_chain(ends: str = "fixed", seed: int = 1) -> Chain:
 
 @ENDS
 def test_rows_are_those_of_an_assembly_spring_by_spring(ends):
+    """Rows of stiffness and damping are symmetric and those of an assembly; rows of ranks have their bits."""
     chain = scattered_chain(ends)
     springs = chain.cell.springs
     stiffness = assembled(chain, chain.variation.stiffness, [s.stiffness for s in springs])
@@ -49,6 +50,7 @@ def test_rows_are_those_of_an_assembly_spring_by_spring(ends):
 
 @ENDS
 def test_a_variation_that_changes_nothing_leaves_the_bits(ends):
+    """A variation with the reference's numbers is uniform and has the bits of the matrices without it."""
     plain = Chain(four_band(), CELLS, ends)
     values = plain.coefficients(0, CELLS)
     same = Chain(four_band(), CELLS, ends, variation=Variation(values.masses, stiffness=values.stiffness))
@@ -124,6 +126,7 @@ def damped_table(lattice: dict[str, Any] | None = None, **cell: Any) -> dict[str
 
 
 def test_rayleigh_damping_is_added_to_the_dashpots_of_a_case():
+    """A spring k gets the dashpot c + b k and a mass m the dashpot g + a m to the ground, with the case's a and b."""
     case = Case.from_table(damped_table())
     cell = case.model().chain.cell
     # Dashpots of a spring get 1e-5 s of its stiffness, those of a mass 2/s of the mass.

@@ -97,6 +97,7 @@ def test_a_case_may_name_the_mode_near_a_frequency(ends):
 
 
 def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
+    """A packet with the width s has the envelope exp(-x^2/(2 s^2)): its square has the deviation s/sqrt(2)."""
     packet = gaussian_packet(four_band(), 2, 1.2, 500, 20.0)
     u, v = packet.on(Chain(four_band(), 1000), 0, 1000)
     envelope = np.hypot(u, v / bloch(four_band(), 1.2).frequency[1]).max(axis=1)
@@ -108,6 +109,7 @@ def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
 
 
 def test_a_packet_is_the_same_in_parts_and_on_a_ring():
+    """A packet has the same bits computed for parts of the cells, and the same values on a ring."""
     packet = gaussian_packet(four_band(), 2, 1.2, 500, 20.0)
     chain = Chain(four_band(), 1000)
     u, _ = packet.on(chain, 0, 1000)
@@ -124,6 +126,7 @@ def test_a_lattice_at_rest_is_the_default():
 
 
 def test_without_a_drive_the_frequency_and_the_cell_are_those_of_the_motion():
+    """A case with a packet and no drive has its frequency, cell and scale, and ends after a traverse of the lattice."""
     case = case_with(initial=PACKET)
     assert (case.drive.amplitude, case.drive.cell) == (0.0, 12)
     assert case.drive.frequency is None
@@ -146,12 +149,14 @@ def test_a_drive_acts_in_addition_to_the_motion():
 
 
 def test_a_mode_near_an_edge_is_counted():
+    """The mode near 2034 rad/s, which lies in the gap above band 2, has the number 48 in a lattice of 24 cells."""
     case = case_with(initial={"kind": "mode", "near": 2034.0, "energy": 1e-3})
     assert case.initial.frequency == pytest.approx(2034.8251, abs=1e-4)
     assert case.initial.number == 48
 
 
 def test_members_of_a_sweep_begin_in_motion():
+    """Four times the energy of a packet is twice its amplitude."""
     table = TABLE | {"initial": PACKET | {"cell": 5}, "sweep": {"initial": {"energy": [1e-3, 4e-3]}}}
     plan = Sweep.from_table(table)
     assert plan.case(1).initial.amplitude == pytest.approx(2 * plan.case(0).initial.amplitude)
@@ -240,6 +245,7 @@ def branch(tmp_path):
 
 
 def test_a_run_may_begin_with_an_orbit_of_a_branch(branch):
+    """A case that begins with an orbit has its frequency, its amplitude and the cell that moves most."""
     case = case_with(initial={"kind": "file", "path": str(branch), "orbit": 1})
     assert case.initial.frequency == pytest.approx(2 * np.pi / 0.004)
     # The cell that moves most is the fourth, by 7 times the size.

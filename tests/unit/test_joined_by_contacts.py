@@ -157,7 +157,7 @@ def test_no_search_is_for_energies_of_bands(objective):
 
 
 def chain_of(pairs: tuple[Pair, ...]) -> Chain:
-    """Two cells with contacts of these ``pairs`` in the first one."""
+    """Return two cells with contacts of these ``pairs`` in the first one."""
     return Chain(CELL, 2, "free", sites=(0,) * len(pairs), clearances=(0.0,) * len(pairs), pairs=pairs)
 
 
@@ -251,7 +251,7 @@ def test_responses_are_those_of_a_pressed_chain():
     assert NfrcCase.from_table(response(contacts=APART)).nfrc.symmetric
     with pytest.raises(CaseError, match="its mean force pushes them apart"):
         NfrcCase.from_table(response(contacts=APART | {"side": "minus"}))
-    # Springs hold what a contact within a cell would push apart.
+    # Springs hold masses that a contact within a cell would push apart.
     inside = {"sites": [1, 2, 3, 2], "pair": None, "next_cell": None, "precompression": None}
     each = {"pair": [[1, 1]] * 3 + [[1, 2]], "next_cell": [True] * 3 + [False], "precompression": [1e-4] * 3 + [0.0]}
     assert NfrcCase.from_table(response(contacts=inside | {"each": each}))

@@ -90,6 +90,7 @@ class SubstepsOnKinks:
 
 
 def test_a_substep_is_repeated_until_no_kink_is_inside(monkeypatch):
+    """A substep that is cut at a kink is repeated at that length, until no kink is inside; counts stay the same."""
     loop = SubstepsOnKinks(monkeypatch, [0.5, 0.75])
     assert loop.end(0.4) == Substep(EXIT, 0.5 * 0.75 * 0.4)
     assert loop.lengths == [0.5 * 0.4, 0.75 * 0.2]

@@ -97,6 +97,7 @@ def test_long_waves_travel_at_the_static_speed():
 
 @pytest.mark.parametrize("cell", [four_band(), four_band("calibrated"), diatomic()])
 def test_waves_at_a_frequency_lie_on_the_branch(cell):
+    """The wave at a frequency of band 2 is that of its wavenumber on the branch, with the branch's group velocity."""
     _, frequency, speed = max_group_velocity(cell, 2)
     # There is one wave, since bands do not overlap at this frequency.
     ((band, kappa, found),) = waves_at(cell, frequency)
@@ -114,6 +115,7 @@ def test_no_wave_travels_in_a_gap(cell):
 @settings(max_examples=40)
 @given(cells(), st.floats(-np.pi, np.pi))
 def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
+    """The Bloch stiffness of any cell is Hermitian and positive semidefinite; at kappa = 0 rigid motions are free."""
     k = cell.stiffness_matrix(kappa)
     # The matrix is Hermitian to the bit, since eigh reads one triangle alone.
     assert np.array_equal(k, k.conj().T)
@@ -126,6 +128,7 @@ def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
 @settings(max_examples=40)
 @given(cells(), st.floats(0.3, 2.8))
 def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, kappa):
+    """Bloch waves solve K(kappa) u = omega^2 M u, are orthonormal in M, and have c_g = d omega/d kappa."""
     point = bloch(cell, kappa)
     m = np.diag(cell.masses)
     assert np.allclose(point.vectors.conj().T @ m @ point.vectors, np.eye(cell.dofs), atol=1e-9)
@@ -144,6 +147,7 @@ def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, k
 @settings(max_examples=25)
 @given(cells(), st.integers(3, 9))
 def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
+    """The modes of a ring of n cells are the Bloch waves of the wavenumbers 2 pi j/n."""
     chain = Chain(cell, n, "periodic")
     root = 1 / np.sqrt(chain.masses())
     squared = np.linalg.eigvalsh(chain.stiffness_matrix().toarray() * root[:, None] * root)
@@ -155,6 +159,7 @@ def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
 @settings(max_examples=25)
 @given(cells(), st.integers(2, 6))
 def test_fixed_ends_are_free_ones_with_springs_to_walls(cell, n):
+    """Fixed ends add to the free chain, on the diagonal, the springs to the next cell that end at walls."""
     fixed = Chain(cell, n, "fixed").stiffness_matrix().toarray()
     free = Chain(cell, n, "free").stiffness_matrix().toarray()
     assert np.array_equal(fixed, fixed.T)
@@ -225,6 +230,7 @@ def test_a_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
 
 
 def test_the_scale_of_the_wave_is_linear_in_the_drive():
+    """The scale is proportional to the amplitude; Hann's window has half the scale of the paper's."""
     chain = Chain(four_band(), 60)
     burst = ToneBurst(1.0, 1206.34, 30)
     one = chain.wave_scale(burst)
@@ -273,6 +279,7 @@ def test_an_unknown_law_is_refused():
     st.sampled_from(["hertz", "bilinear"]),
 )
 def test_a_contacts_force_is_odd_and_restoring(w, d, rate, approach, law):
+    """The force of a contact is odd, restoring, and zero within the clearance; its potential is even."""
     contact = Contact(law, 1e6, 0.7)
     force = contact.force(w, d, rate, approach)
     assert contact.force(-w, d, -rate, -approach) == -force
@@ -296,6 +303,7 @@ def test_a_conservative_contact_has_the_factor_one():
 
 
 def test_a_fast_separation_pulls_unless_it_is_clipped_or_the_approach_has_a_floor():
+    """g = 1 + c w'/w'_minus is negative at a fast separation, 0 if clipped, and bounded by a floor of w'_minus."""
     contact = Contact("hertz", 1e6, 0.7)
     assert contact.dissipation_factor(-1.0, 0.1) < 0
     assert Contact("hertz", 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0

@@ -43,6 +43,7 @@ def graded(masses: int) -> UnitCell:
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-4, 0.7, np.pi])
 def test_one_band_of_a_long_cell_is_that_of_all_bands(kappa):
+    """Frequency and speed of one band of a long cell are those of the solution for all bands."""
     cell = graded(bands.MANY_MASSES + 3)
     every = bands.bloch(cell, kappa)
     for band in (1, 2, 17, cell.dofs):

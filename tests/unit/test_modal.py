@@ -60,6 +60,10 @@ def free_motion(chain: Chain, u: np.ndarray, v: np.ndarray, interval: float) -> 
 @ENDS
 @pytest.mark.parametrize("name", CELLS)
 def test_energies_sum_up_and_modes_turn_freely(name, ends, cells):
+    """Modal energies sum to the lattice's energy; amplitudes of a free motion turn by exp(i omega t).
+
+    The free motion is computed by a matrix exponential.
+    """
     chain = Chain(CELLS[name], cells, ends, (1,), (1e-3,))
     parts = ModalParts.of(chain)
     u, v = random_fields(chain)
@@ -77,6 +81,7 @@ def test_energies_sum_up_and_modes_turn_freely(name, ends, cells):
 @ENDS
 @pytest.mark.parametrize("name", CELLS)
 def test_modes_are_in_bands_but_for_those_of_the_ends(name, ends):
+    """Each band has one mode a cell, except for a few at the ends; modes in bands lie on the dispersion relation."""
     cells = 30
     chain = Chain(CELLS[name], cells, ends)
     parts = ModalParts.of(chain)
@@ -102,6 +107,7 @@ def test_modes_are_in_bands_but_for_those_of_the_ends(name, ends):
 
 @pytest.mark.parametrize("name", CELLS)
 def test_inverse_iteration_gives_the_modes_of_a_dense_solution(name):
+    """Modes of 60 cells have the frequencies of a dense solution, are orthonormal, and have small residuals."""
     chain = Chain(CELLS[name], 60)
     found = linear_modes(chain)
     root = 1 / np.sqrt(chain.masses())
@@ -157,6 +163,7 @@ def test_a_long_force_drives_the_modes_as_its_integral_says(start, stop):
 
 @ENDS
 def test_an_impulse_gives_the_modes_the_amplitudes_of_its_velocity(ends):
+    """The amplitudes by an impulse of 1 N s on a mass are those of its velocity 1/m."""
     modes_ = linear_modes(Chain(CELLS["four-band"], 12, ends))
     u, v = np.zeros((2, 1, 12, 4))
     # An impulse of 1 N s gives a mass m the velocity 1/m.
@@ -190,6 +197,7 @@ def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
 
 
 def test_the_upper_fraction_is_that_of_the_bands_above_the_drive():
+    """The upper fraction is the energy of bands above the driven one over the work, NaN for a drive in the highest."""
     chain = Chain(CELLS["four-band"], 20)
     burst = ToneBurst(1.0, DRIVEN, 30)
     u, v = random_fields(chain, 1)
@@ -205,6 +213,7 @@ SEPARATION = np.array([2.7, 1.6, 4.8, 3.0, 7.0, np.nan, 9.9])
 
 
 def test_episodes_that_touch_between_the_same_samples_are_one_cluster():
+    """Episodes are in one cluster if the samples around them overlap; an unfinished one lasts until the end."""
     bounds, cluster = cluster_samples(ONSET, SEPARATION, TIME)
     assert bounds.tolist() == [[1, 3], [4, 5], [6, 7], [8, 10]]
     assert cluster.tolist() == [0, 0, 1, 0, 2, 3, 3]

@@ -116,7 +116,10 @@ def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
 
 @pytest.mark.slow
 def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(tmp_path):
-    """With velocities alone, what a frame shows is the kinetic energy of the cells as they are."""
+    """Frames of a record without displacements show the kinetic energy with the masses of each cell.
+
+    The bands are those of the mean cell of the cells that are shown.
+    """
     write_run(tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5", "a") as file:
         profiles = (
@@ -145,7 +148,7 @@ def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(
     assert content.cell.masses == pytest.approx((0.0075, *CELL.masses[1:]))
     assert part.cell.masses[0] == pytest.approx(masses[10:, 0].mean())
     stiffness = CELL.springs[0].stiffness
-    # One cell of 24 has three times the stiffness, and none of those shown.
+    # One cell of 24 has three times the stiffness; it is not among the cells 11 to 24.
     assert content.cell.springs[0].stiffness == pytest.approx((1 + 2 / 24) * stiffness)
     assert part.cell.springs[0].stiffness == pytest.approx(stiffness)
 

@@ -93,7 +93,7 @@ def plan(*changes: str) -> OptimiseCase:
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_search_is_named(changes, message):
-    """A search with one thing wrong is refused with one problem: its key, its value and what would be right."""
+    """A search with one error is refused with one problem: its key, its value and a remedy."""
     with pytest.raises(CaseError) as error:
         plan(*changes)
     assert message in str(error.value)
@@ -188,7 +188,7 @@ class Bowl:
         self.fails = fails
 
     def runs(self, case):
-        # One run a design, at 1 N and of the first sample.
+        # A design has one run, at 1 N and with the first sample.
         return {(1.0, 0): case}
 
     def judge(self, case):

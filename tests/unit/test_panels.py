@@ -133,7 +133,7 @@ def test_regions_follow_one_another(axes):
 
 
 def test_means_over_blocks_keep_the_mean():
-    """1300 rows are more than a picture shows: each of 434 is the mean of three, the last one of what is left."""
+    """Each of 434 rows is the mean of three of 1300, more than a picture shows; the last one is the remaining row."""
     values = np.random.default_rng(1).random((1300, 7))
 
     pooled = panels.block_means(values)

@@ -170,7 +170,7 @@ def test_curves_and_points_of_a_picture_are_in_its_numbers(curves_and_map, tmp_p
     # A page shows fewer than 400 of the 2001 points.
     assert len(many["x"]) < 400
     thinned = np.interp(np.log(WAVE_X), np.log(many["x"]), many["y"])
-    # The curve rises by up to 1 between neighbouring points: the bound is a few points.
+    # The curve changes by up to 0.5 between neighbouring points: the bound is a dozen of them.
     assert thinned == pytest.approx(WAVE_Y, abs=6)
 
     assert points["label"] == "by colour"

@@ -64,7 +64,7 @@ def searched(tmp_path) -> tuple[Plan, Path]:
     """Make the search of a plan that has no other step, and return the plan and its folder."""
     plan = paper_plan(FULL)
     step = replace(step_of(plan, "design"), changes=SMALL)
-    # One figure of the search, and one that needs no step.
+    # The figures are one of the search and one that needs no step.
     figures = [figure for figure in plan.figures if figure.id in ("figS3", "fig10")]
 
     search_design(step.case, tmp_path / "design")
@@ -101,7 +101,7 @@ def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
 
 
 def test_times_of_files_make_nothing_stale(searched):
-    """A result stays done, with the same inputs to what is derived from it, though its files are newer."""
+    """Newer times of files change neither the state of a step nor the inputs of figures and claims."""
     plan, root = searched
     before = plan.inputs(root)
 
@@ -299,7 +299,7 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
         members, sample = ([member.case for member in case.members()] for case in (sweep, step.case))
         assert len(sample) == len(set(map(curve, sample))) == step.sample
 
-        # One member of each part of the range of amplitudes, if that is cut into as many parts as the sample has.
+        # The range of amplitudes, cut into as many parts as the sample has members, has one member in each part.
         amplitudes = sorted({case.drive.amplitude for case in members})
         places = sorted(amplitudes.index(case.drive.amplitude) for case in sample)
         assert [place * step.sample // len(amplitudes) for place in places] == list(range(step.sample))

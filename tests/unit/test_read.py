@@ -102,7 +102,7 @@ def test_a_run_is_read_by_name(run):
 
 
 def test_other_files_are_refused(tmp_path, folder):
-    """An absent file, one of another kind and results of an earlier version are refused with what is wrong."""
+    """A missing file, a file of another kind and results of an earlier version are refused with the reason."""
     with pytest.raises(OSError):
         open_run(tmp_path / "absent.h5")
 

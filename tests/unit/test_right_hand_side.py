@@ -186,6 +186,7 @@ PAIRS = {
 @pytest.mark.parametrize("pairs", PAIRS)
 @ENDS
 def test_the_rates_are_those_of_all_forces(ends, pairs):
+    """The rates are velocities, M^-1 times all forces, drives' powers and losses of sites and dashpots."""
     model = lattice(ends, PAIRS[pairs])
     motion = random_motion(model)
     found = evaluate(model, motion)

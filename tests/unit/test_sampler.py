@@ -101,7 +101,7 @@ def test_the_step_of_a_whole_number_does_not_vanish():
 
 
 def test_a_first_generation_changes_neighbours_together():
-    """The mean has the step that is asked, the slope half of it, and differences of neighbours have little."""
+    """The shapes of a first generation are independent with equal steps; neighbouring variables differ little."""
     shapes = smooth(10)
     step = 0.02
     sampler = CmaEs(np.full(10, 0.5), np.zeros(10), shapes, step, seed=4, population=4000)

@@ -1,4 +1,4 @@
-"""Variables that are keys of a case: their places in designs, their values in the unit cube, and what is refused."""
+"""Variables that are keys of a case: their places in designs, their values in the unit cube, and refusals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def plan_of(variables: dict, **sections) -> OptimiseCase:
 
 
 def test_every_key_has_its_place_in_a_design():
-    """Each value is at its path in the design, of its type, and all that does not vary is that of the case."""
+    """Each value is at its path in the design, with its type; all other keys have the values of the case."""
     profiles = {"springs[1].stiffness": {"last": {"log": [1e3, 1e5]}}}
     plan = plan_of(
         {

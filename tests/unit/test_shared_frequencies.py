@@ -21,6 +21,7 @@ def oscillators(*omega: float, minus: float | None = None, cubic: float = 0.0) -
 
 
 def test_equal_frequencies_are_companions_of_each_other():
+    """Modes of equal frequency are companions of each other, with the factor 1."""
     system = oscillators(1.0, 3.0 + 1e-3, 1.0)
     assert companions(system, 0) == [Companion(1, 1)]
     assert companions(system, 1) == [Companion(0, 1)]

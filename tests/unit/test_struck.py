@@ -91,7 +91,7 @@ def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
     ],
 )
 def test_what_is_refused(initial, message):
-    """Each problem names its key, the value and what to do."""
+    """Each problem of an initial velocity has its key, its value and a remedy."""
     with pytest.raises(CaseError, match=message):
         beads(initial)
 

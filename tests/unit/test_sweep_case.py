@@ -77,7 +77,7 @@ def test_zipped_keys_vary_together_and_share_a_dimension():
 
 
 def test_a_key_inside_a_table_and_short_names():
-    """A key inside a table varies as well; axes are named by the last parts of their keys that tell them apart."""
+    """A key inside a table may vary; the short names of axes differ."""
     text = "[contacts]\nsites = { first = 11, spacing = 1, count = 1 }\n[sweep.contacts.sites]\ncount = [1, 3]"
     plan = sweep_of(text)
     assert plan.names() == {"contacts.sites.count": "sites"}
@@ -125,7 +125,7 @@ def test_written_out_and_read_back_it_has_the_same_members():
     ],
 )
 def test_what_is_wrong_is_named_with_its_remedy(text, message):
-    """A section that varies nothing, or wrongly, is refused with its key and what would be right."""
+    """A section without a key that varies, or with a wrong one, is refused with its key and a remedy."""
     with pytest.raises(CaseError) as error:
         sweep_of(text).members()
     assert message in str(error.value)

@@ -109,7 +109,7 @@ def test_a_system_of_ones_own_has_its_springs_and_its_contact():
 
 
 def test_a_chain_has_the_modes_and_sites_of_its_cells():
-    """Three cells of the four-band lattice have 12 modes, and a contact in each cell that is a site."""
+    """The system of three four-band cells has 12 modes and a contact in each of the cells 1 and 3, its sites."""
     table = {"lattice": {"cells": 3}, "contacts": {"sites": [1, 3]}}
 
     system = System.from_case(NnmCase.from_table(table | {"nnm": {"system": "chain", "modes": [12]}}))

@@ -109,7 +109,7 @@ def test_constant_is_the_integral(kc):
 
 
 def test_nodes_span_the_log_grid():
-    """Nodes are equally spaced in their logarithm, from pi/60 to 5 pi/3, at least as many an octave as asked for."""
+    """Nodes are equally spaced in their logarithm, from pi/60 to 5 pi/3, as many an octave as requested or more."""
     nodes = Nodes.log(6.0, 4.0)
     assert nodes.kappa[[0, -1]] == pytest.approx([np.pi / 60, np.pi * 5 / 3])
     assert np.diff(np.log(nodes.kappa)) == pytest.approx(np.full(len(nodes.kappa) - 1, nodes.weight))
