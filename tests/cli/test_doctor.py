@@ -109,9 +109,11 @@ def test_scalars_other_than_real_doubles(scalar):
 
 def test_one_mpi_for_all():
     """Two MPI libraries in one process are a fault: petsc4py and mpi4py of different builds crash at a common call."""
-    ours, other = loaded_libraries(MPI_LIBRARY), "/opt/mpich/lib/libmpi.so.12"
+    ours = loaded_libraries(MPI_LIBRARY)
+    other = "/opt/mpich/lib/libmpi.so.12"
     assert len(ours) == 1
     assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
+
     two = check_mpi([*ours, other], 1, {})
     assert "built for different MPIs" in two.fault
     assert ours[0] in two.value and other in two.value

@@ -41,7 +41,7 @@ def shown(tmp_path_factory):
         picture = save(figure, folder / "fig99-both.png")
         axes = json.loads(save(figure, folder / "fig99-both.json").read_text())
 
-    figure = PaperFigure("fig99", "Fig. 99", "A map and two points", "", (), ())
+    figure = PaperFigure(id="fig99", label="Fig. 99", title="A map and two points", caption="", claims=(), parts=())
     contents = ReportContents(
         note="", claims=[], pictures=[(figure, [picture])], statistics={}, versions={"date": ""}, cpu={"steps": {}}
     )
@@ -122,10 +122,11 @@ def page(tmp_path_factory):
         picture = save(figure, folder / "fig99-panels.png")
         save(figure, folder / "fig99-panels.json")
 
+    paper_figure = PaperFigure(id="fig99", label="Fig. 99", title="Three panels", caption="", claims=(), parts=())
     contents = ReportContents(
         note="",
         claims=[],
-        pictures=[(PaperFigure("fig99", "Fig. 99", "Three panels", "", (), ()), [picture])],
+        pictures=[(paper_figure, [picture])],
         statistics={},
         versions={"date": ""},
         cpu={"steps": {}},
@@ -138,7 +139,7 @@ def page(tmp_path_factory):
 @pytest.mark.browser
 @NEEDED
 def test_panels_have_full_names_of_their_own(page):
-    """Panels with equal titles are numbered in the list of panels; the index stands beside the text on a wide page."""
+    """Panels with equal titles are numbered in the list of panels; on a wide page the index is left of the text."""
     path, browser = page
     session = browser.open(path, 1280, 900)
     names = browser.ask(session, "return [...document.querySelectorAll('option')].map(o => o.textContent).slice(1);")
@@ -186,8 +187,10 @@ def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path, monke
         figure = new_figure(7, 5)
         figure.subplots().plot(*POINTS)
         picture = save(figure, tmp_path / "fig99-high.png")
+    caption = "In a few words. " * 20
     figures = [
-        PaperFigure(f"fig{k}", f"Fig. {k}", "A high picture", "In a few words. " * 20, (), ()) for k in range(37)
+        PaperFigure(id=f"fig{k}", label=f"Fig. {k}", title="A high picture", caption=caption, claims=(), parts=())
+        for k in range(37)
     ]
     contents = ReportContents(
         note="",

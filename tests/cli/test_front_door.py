@@ -263,7 +263,7 @@ def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
     printed = in_process(*bands, "--out", out, "--modes", "2", "--near", "2034")
     assert printed.returncode == 0, printed.stderr
     rows = [line.split() for line in printed.stdout.splitlines() if line.endswith("edge")]
-    # Two modes in a gap have the same frequency: each is localised at one end of the lattice.
+    # Two modes in a gap have the same frequency, and are localised at the ends of the lattice.
     assert [row[:3] for row in rows] == [["1", "2034.825055", "gap"], ["2", "2034.825055", "gap"]]
     with h5py.File(out / "modes.h5") as file:
         assert file["shape"].shape == (2, 40, 4)

@@ -92,7 +92,7 @@ def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
     """``plot`` draws the default pages, each named by its measure and by the keys that vary."""
     assert main(["plot", str(burst)]) == 0
     keys = "contacts.clearance-contacts.restitution"
-    # The bands' parts of the energy have a panel for each band.
+    # The bands' parts of the energy also vary with the band, which is then part of the name.
     assert drawn(burst) == {f"{name}-over-{keys}{'-band' * (name == 'bands_share')}.png" for name in PAGES}
 
 

@@ -153,12 +153,14 @@ def test_an_own_lattice_with_pictures(typed, put, tmp_path):
 
     # At the upper edge of band 3, qa = pi, neighbouring cells move in antiphase: the springs between hosts, of 2e4 N/m,
     # add 2 k (1 - cos qa) = 4 k to the hosts' stiffness.
-    masses, stiffness = np.diag([0.010, 0.004, 0.002]), np.array([[8.6e4, -6e3, 0], [-6e3, 7e3, -1e3], [0, -1e3, 1e3]])
+    masses = np.diag([0.010, 0.004, 0.002])
+    stiffness = np.array([[8.6e4, -6e3, 0], [-6e3, 7e3, -1e3], [0, -1e3, 1e3]])
     top = np.sqrt(np.linalg.eigvals(np.linalg.solve(masses, stiffness)).max())
     assert f"{top:.2f}" in printed
 
     with vipetsc.open(tmp_path / "runs/my-lattice") as run:
-        work, lost = run["energy/work"][-1], run["energy/dissipated"][-1]
+        work = run["energy/work"][-1]
+        lost = run["energy/dissipated"][-1]
         kept = run["energy/kinetic"][-1] + run["energy/spring"][-1] + run["energy/contact"][-1]
         assert float(kept + lost) == pytest.approx(float(work), rel=1e-8)
     assert pages(tmp_path / "runs/my-lattice") == {

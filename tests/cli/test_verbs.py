@@ -105,7 +105,7 @@ def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
     assert call(name, lambda case, work: Outcome(drawable=False)).returncode == DONE
     assert len(drawn) == 1
 
-    # The cases of these have no [output].
+    # The cases of nnm and design have no section [output]; tests/cli/test_small_things.py switches their pictures off.
     if VERBS[name].case.verb not in ("nnm", "design"):
         call(name, finish, "--set", "output.figures=false")
         assert len(drawn) == 1

@@ -117,7 +117,8 @@ def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
     out = tmp_path / "out"
     simulate(Case.load(case), whole)
 
-    # The command has processes of its own from beginning to end, which the trials of a worker do not have.
+    # The command has processes of its own from beginning to end, which the trials of a worker do not have. The fault
+    # meets rank 1 at its 60th step.
     fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
     assert fault.returncode == code, fault.stderr
     assert "Traceback" not in fault.stderr

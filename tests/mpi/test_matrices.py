@@ -151,7 +151,7 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
 
 @pytest.mark.parallel([1])
 def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
-    """With cells that differ, modes are those of the dense matrices, and shares of energy use each cell's masses."""
+    """With cells that differ, modes are those of the dense matrices, and fractions of energy use each cell's masses."""
     profiles = {"masses[1]": [0.005, 0.02], "springs[2].stiffness": [1e4, 3e4]}
     case = small_case(lattice={"cells": 2, "profiles": profiles}, contacts={"sites": [1]})
     data = find_modes(case, 8, 900.0, folder, COMM)
