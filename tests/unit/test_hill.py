@@ -44,6 +44,31 @@ def test_growth_is_found_where_the_determinant_is_cut_off(monkeypatch):
     assert fastest(touching, closed) == pytest.approx(alone, rel=1e-9)
 
 
+class EqualOscillators:
+    """The compliance of equal masses of 1 kg that nothing joins, with springs and dashpots to the ground."""
+
+    highest = 0.8
+
+    def __init__(self, count: int, decay: float) -> None:
+        self.count = count
+        self.decay = decay
+
+    def at(self, omegas: np.ndarray) -> np.ndarray:
+        gain = 1 / (self.highest**2 + 2j * self.decay * omegas - omegas**2)
+        return gain[:, None, None] * np.eye(self.count)
+
+
+@pytest.mark.parametrize(("stiffness", "growing"), [(2.3, 1), (0.5, 0)])
+def test_each_of_several_equal_sites_counts(stiffness, growing):
+    """Their zeros coincide, beside the line on which D is followed: D turns by a whole circle between two positions."""
+    for count in (1, 5, 6):
+        z = np.zeros((count, 10), complex)
+        z[:, 1] = 1.3
+        series = SiteForces([Stops.both(Contact("bilinear", stiffness), 1.0)] * count).series(z, 1.0)
+        found = Hill(EqualOscillators(count, 0.05), 1.0, 9, odd=False, finite=True, decay=0.05)
+        assert found.unstable(series) == count * growing
+
+
 def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude: float) -> np.ndarray:
     """Return the monodromy matrix (state, state) of masses of 1 kg over a period of 2 pi s.
 

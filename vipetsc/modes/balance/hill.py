@@ -59,6 +59,8 @@ COARSE = 24
 FINEST = 14
 # Largest turn of D in rad from one position to the next: at pi its sense would be ambiguous.
 TURN = 0.7
+# Largest change of log|D| from one position to the next. Beside an interval with two zeros in its middle it is 2.2.
+STEEP = 1.5
 # Exponent at which ``stability_changes`` takes D(0): at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
 # Steps, first step and accuracy, over Om, of the secant method.
@@ -222,6 +224,7 @@ class Hill:
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.
 
+        Nor does log|D| change by more than ``STEEP`` there.
         Where a zero is so near to the line that the finest interval does not resolve it, it is counted on either side.
         """
         # D varies over the distance from the line to the poles, which are those of the modes of a finite system.
@@ -232,7 +235,11 @@ class Hill:
         values, sizes = self._evaluate(series, growth + 1j * positions)
         for _ in range(FINEST):
             turns = np.abs(np.angle(values[1:] / values[:-1]))
-            (wide,) = np.nonzero(turns > TURN)
+            # Several zeros beside one interval may turn D in it by a whole circle, which the angles do not show; but
+            # then |D| changes much in that interval or in the next one.
+            steep = np.abs(np.diff(sizes.sum(axis=0))) > STEEP
+            near_steep = np.convolve(steep, np.ones(3), "same") > 0
+            (wide,) = np.nonzero((turns > TURN) | near_steep)
             if not wide.size:
                 break
             middles = (positions[wide] + positions[wide + 1]) / 2
