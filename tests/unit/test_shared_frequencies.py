@@ -78,7 +78,8 @@ def test_waves_around_a_ring_are_refused_before_anything_is_written(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_branch_in_memory_ends_with_the_same_reason():
-    alone, shared = follow_all(ring(modes=[4, 3]), None, MPI.COMM_SELF)
+@pytest.mark.parametrize("method", ["shooting", "condensed"])
+def test_a_branch_in_memory_ends_with_the_same_reason(method):
+    alone, shared = follow_all(ring(modes=[4, 3], method=method), None, MPI.COMM_SELF)
     assert "2 points reached" in alone.ending
     assert "mode 3 has the frequency of mode 2" in shared.ending

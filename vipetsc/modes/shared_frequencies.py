@@ -8,6 +8,7 @@ the left and to the right have one frequency, so that nearly all modes come in p
 from typing import NamedTuple
 
 from vipetsc.case import CaseError, NnmCase, Problem
+from vipetsc.modes.problem import StartError
 from vipetsc.modes.system import System
 
 # Squared frequencies are equal within this fraction, or within rounding of the largest one in the eigenvalues.
@@ -70,6 +71,14 @@ def why_not_alone(system: System, mode: int) -> str:
         f"mode {first.mode + 1} has {first.multiple} times the frequency of mode {number}: small motions of both "
         f"together are periodic, too; {REMEDY}"
     )
+
+
+def check_start(system: System, mode: int, energy: float) -> None:
+    """Raise StartError if no branch begins with ``mode`` (from 0) alone at an ``energy`` in J, where it is linear."""
+    if energy < system.grazing_energy(mode):
+        reason = why_not_alone(system, mode)
+        if reason:
+            raise StartError(reason)
 
 
 def check_modes_alone(case: NnmCase) -> None:

@@ -30,6 +30,7 @@ from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import FlowError, PeriodicProblem
+from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting
@@ -118,7 +119,9 @@ class CondensedMethod(NnmMethod):
         if self.system is not None and not self.options.start_frequency:
             system = self.system
             omega, shapes = system.linear_modes()
-            amplitude = np.sqrt(2 * start_energy(self.options, system, job)) / omega[job]
+            energy = start_energy(self.options, system, job)
+            check_start(system, job, energy)
+            amplitude = np.sqrt(2 * energy) / omega[job]
             rows = np.vstack([system.contact_rows, system.spring_rows])
             return self.motions.from_mode(rows @ shapes[:, job] * amplitude, float(omega[job]))
         signs = np.zeros(self.motions.forces.pairs)

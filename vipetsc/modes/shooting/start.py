@@ -4,7 +4,7 @@ import numpy as np
 
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import StartError
-from vipetsc.modes.shared_frequencies import why_not_alone
+from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting.shooting_equations import A, ShootingEquations
 
 
@@ -17,10 +17,7 @@ def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Poi
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
         raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
-    if energy < problem.system.grazing_energy(mode):
-        reason = why_not_alone(problem.system, mode)
-        if reason:
-            raise StartError(reason)
+    check_start(problem.system, mode, energy)
     # The energy of a mass-normalised mode q is (q'^2 + omega^2 q^2)/2: from rest all of it is potential, from the
     # centre, where the initial values are velocities, all of it is kinetic.
     amplitude = np.sqrt(2 * energy)
