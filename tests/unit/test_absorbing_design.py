@@ -10,7 +10,7 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def case(amplitude: float, reflection: float) -> Case:
-    """A lattice of 60 cells under a burst in its fourth band, with an absorbing right end."""
+    """Return the case of a lattice of 60 cells under a burst in its fourth band, with an absorbing right end."""
     return Case.from_table({
         "lattice": {"preset": "four-band", "cells": 60, "absorbing": {"end": "right", "reflection": reflection}},
         "contacts": {"sites": 0},

@@ -27,7 +27,7 @@ EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
 
 def branch_of(**columns: np.ndarray | list) -> xr.Dataset:
-    """A branch with these values at its points."""
+    """Return a branch with these values (point,)."""
     return xr.Dataset({name: ("point", values) for name, values in columns.items()})
 
 

@@ -166,7 +166,7 @@ def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
 
 
 def breather_of_two_sites(signs: list[int]) -> Point:
-    """The breather at 4000 rad/s of a chain with contacts in cells 29 and 32, mirror images of one another."""
+    """Return the breather with these ``signs`` at 4000 rad/s in a chain with contacts in cells 29 and 32."""
     # The middle of the lattice is between them, so that they are equal.
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (CLEARANCE, CLEARANCE))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
@@ -200,13 +200,13 @@ def chain_case(
     system: str = "condensed",
     more: str = "truncation = 1e-5",
 ) -> NnmCase:
-    """The case of a branch of a breather; ``more`` are lines of its section."""
+    """Return the case of a branch of a breather; ``more`` are lines of its section."""
     text = BREATHER.format(omega=omega, points=points, cells=cells, site=site, system=system)
     return NnmCase.from_toml(f"{text}{more}\n")
 
 
 def followed(case: NnmCase, folder: Path, resume: bool = False, stop: StopRequest | None = None) -> list[Branch]:
-    """The branches of a case, followed as the verb does."""
+    """Return the branches of a case, followed as the verb ``nnm`` does."""
     with claim_branches(case, folder, MPI.COMM_SELF, resume=resume) as claim:
         branches = follow_all(case, claim.folder, MPI.COMM_SELF, claim.going_on, None, stop)
         claim.publish()

@@ -38,7 +38,7 @@ EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
 
 def problems(table: dict[str, Any], *overrides: str) -> dict[str, str]:
-    """The problems of a case by their keys, as they are printed."""
+    """Return the printed problems of a case by their keys."""
     with pytest.raises(CaseError) as caught:
         Case.from_table(table, overrides)
     return {problem.key: str(problem) for problem in caught.value.problems}

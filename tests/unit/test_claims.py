@@ -23,7 +23,7 @@ IDS = [f"C{number}" for number in range(1, 19)]
 
 
 def contactless_curve(amplitude: list[float] | np.ndarray, value: list[float] | np.ndarray) -> AmplitudeCurve:
-    """A curve of values over the amplitude, of runs without contact."""
+    """Return a curve of values over the amplitude, of runs without contact."""
     data = {"value": ("amplitude", value), "contact_episodes": ("amplitude", np.zeros(len(value)))}
     return AmplitudeCurve(xr.Dataset(data, {"amplitude": amplitude}, {"folder": "step"}), "value")
 

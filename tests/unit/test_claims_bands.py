@@ -30,7 +30,7 @@ TIME = np.arange(1500) * 2.5e-4
 
 
 def travelling_waves(case: Case, energies: Mapping[float, float]) -> np.ndarray:
-    """Velocity (t, cell, dof) of waves with energies in J by their frequencies in rad/s."""
+    """Return the velocity (t, cell, dof) of waves, whose ``energies`` in J are given by their frequencies in rad/s."""
     masses = np.asarray(case.lattice.unit_cell().masses)
     cells = case.lattice.cells
     velocity = np.zeros((len(TIME), cells, len(masses)))
@@ -42,7 +42,7 @@ def travelling_waves(case: Case, energies: Mapping[float, float]) -> np.ndarray:
 
 
 def in_two_bands(case: Case) -> np.ndarray:
-    """Waves with 0.7 J in band 2 and 0.3 J in band 3."""
+    """Return the velocity of waves with 0.7 J in band 2 and 0.3 J in band 3."""
     return travelling_waves(case, {1000.0: 0.7, 2700.0: 0.3})
 
 
@@ -51,7 +51,7 @@ def noise(case: Case) -> np.ndarray:
 
 
 def on_an_edge(case: Case) -> np.ndarray:
-    """A tone at the upper edge of band 2 that beats in all cells together."""
+    """Return the velocity of a tone at the upper edge of band 2 that beats in all cells together."""
     edge = pass_bands(case.lattice.unit_cell())[1].high
     beat = np.cos(20 * TIME) * np.sin(edge * TIME)
     return beat[:, None, None] * np.ones((case.lattice.cells, 4))

@@ -27,7 +27,7 @@ EntropyOf = Callable[[Case], float]
 
 
 def decaying_entropy(case: Case) -> float:
-    """Entropy in bits: a floor below the onset, a jump there, and a power law with the exponent -1 behind it."""
+    """Return an entropy in bits: a floor below the onset, a jump there, and a power law of exponent -1 behind it."""
     amplitude = case.drive.amplitude
     if amplitude < ONSET:
         return 1.0
@@ -35,7 +35,7 @@ def decaying_entropy(case: Case) -> float:
 
 
 def steady_error(case: Case) -> float:
-    """An error bar in bits that is the same at all amplitudes."""
+    """Return an error bar in bits that is the same at all amplitudes."""
     return 0.1
 
 
@@ -85,7 +85,7 @@ def set_fits(root: Path, step: str, average: str = "energy_weighted", **values: 
 
 @pytest.fixture(scope="module")
 def finished_sweeps(tmp_path_factory):
-    """The sweeps of entropies that decay as powers, at two wavenumbers: hundreds of members, written once."""
+    """Return the folder of sweeps whose entropies decay as powers: hundreds of members, written once."""
     root = tmp_path_factory.mktemp("decaying")
     put_entropies(root, error=lambda case: 0.1 + 0.01 * case.drive.amplitude, wavenumbers=["4pi/9", "5pi/9"])
     return root
@@ -93,7 +93,7 @@ def finished_sweeps(tmp_path_factory):
 
 @pytest.fixture
 def decaying(finished_sweeps, tmp_path):
-    """A copy of ``finished_sweeps`` that a test may change: claims on the entropy read nothing but these files."""
+    """Return a copy of ``finished_sweeps`` that a test may change, of the files that claims on the entropy read."""
     for step in (SPREAD, NEIGHBOURS):
         (tmp_path / step).mkdir()
         shutil.copy(finished_sweeps / step / "ensemble.h5", tmp_path / step)

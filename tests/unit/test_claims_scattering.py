@@ -23,13 +23,13 @@ PAPER_REFLECTED = (0.0, 0.2, 0.8)
 
 
 def driven_packet() -> np.ndarray:
-    """Energy over wavenumbers in a narrow packet at the driven one, of sum 1."""
+    """Return the energy (wavenumber,) of a narrow packet at the driven wavenumber, of sum 1."""
     energy = np.exp(-(((WAVENUMBERS - DRIVEN) / 0.02) ** 2))
     return energy / energy.sum()
 
 
 def spectrum_on_branches(case: Case, frequency: np.ndarray) -> np.ndarray:
-    """Energy (wavenumber, frequency) of the packet on the optical branch, 6 rad/s wide, of sum 1."""
+    """Return the energy (wavenumber, frequency) of the packet on the optical branch, 6 rad/s wide, of sum 1."""
     optical = bloch(case.lattice.unit_cell(), WAVENUMBERS).frequency[:, 1:]
     distance = np.abs(frequency[None, :] - optical)
     energy = driven_packet()[:, None] * np.exp(-((distance / 6.0) ** 2))

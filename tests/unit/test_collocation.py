@@ -109,7 +109,7 @@ def test_a_cubic_spring_moves_a_mass_as_jacobis_cosine():
 
 
 def cluster_on(part: str) -> Cluster:
-    """A moving mass on a bilinear stop or on a cubic spring."""
+    """Return a moving mass on a bilinear stop or on a cubic spring."""
     if part == "stop":
         return mass_on_stop()
     cluster = mass_on_cubic_spring(MASS * 1e14)
@@ -123,7 +123,7 @@ def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
 
     Picard's iteration contracts below h omega = 13 and does not converge for 60.
 
-    Forces that have grown may still converge in the next substep; its rounding would then depend on a trial in vain.
+    Forces of the failed trial, if kept, could converge in the next substep with a rounding that depends on them.
     """
     cluster = cluster_on(part)
     too_long = Substep(PLAIN, 60.0 / RATE / cluster.interval)

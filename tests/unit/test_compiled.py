@@ -95,7 +95,7 @@ def ask(package, tmp_path):
 
 @pytest.fixture
 def package(tmp_path):
-    """A package with kernels of two files."""
+    """Return the folder of a package with kernels in two files."""
     folder = tmp_path / "vipetsc"
     folder.mkdir()
     (folder / "__init__.py").write_text("")

@@ -12,7 +12,7 @@ from vipetsc.lattice.dense_compliance import DenseCompliance
 
 pytestmark = pytest.mark.parallel(1)
 
-# Three springs to the next cell, which overlap in masses: two waves of rank 2 in each direction.
+# The three springs to the next cell start at two masses and end at two: there are two waves in each direction.
 RICH = UnitCell(
     (0.005, 0.003, 0.002, 0.004),
     (
@@ -36,7 +36,7 @@ DRIVEN = 1023.27
 
 
 def chain_of(cell: UnitCell, cells: int, sites: Sequence[int], ends: str = "fixed") -> Chain:
-    """A chain with contacts at ``sites``, whose clearances do not matter here."""
+    """Return a chain with contacts at ``sites``, whose clearances do not matter here."""
     return Chain(cell, cells, ends, tuple(sites), (1e-3,) * len(sites))
 
 
@@ -46,7 +46,7 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def site_rows(chain: Chain) -> np.ndarray:
-    """Rows (site, mass of the chain) that take w = u_resonator - u_host from displacements."""
+    """Return rows (site, mass of the chain) that yield w = u_resonator - u_host from displacements."""
     cell = chain.cell
     rows = np.zeros((len(chain.sites), chain.cells * cell.dofs))
     for row, site in zip(rows, chain.sites, strict=True):
@@ -107,7 +107,7 @@ def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
 
 
 def bloch_sum(cell: UnitCell, wavenumbers: np.ndarray, omega: complex) -> complex:
-    """Self-compliance of a site in a ring with these ``wavenumbers``, as a sum over its Bloch waves."""
+    """Return the self-compliance of a site in a ring with these ``wavenumbers``, as a sum over its Bloch waves."""
     waves = bloch(cell, wavenumbers)
     weight = np.abs(waves.vectors[:, cell.resonator] - waves.vectors[:, cell.host]) ** 2
     return np.mean(np.sum(weight / (waves.frequency**2 - omega**2), axis=1))

@@ -50,7 +50,7 @@ class DefinedCompliance:
 
 
 def random_harmonics(forces: SiteForces, order: int, seed: int, symmetry: Symmetry) -> np.ndarray:
-    """Random harmonics (pairs, order + 1) that pass the clearances; ``at rest`` ones are odd and at rest at phase 0."""
+    """Return random harmonics (pairs, order + 1) that pass the clearances; ``at rest``: odd and at rest at phase 0."""
     rng = np.random.default_rng(seed)
     z = rng.normal(size=(forces.pairs, order + 1)) + 1j * rng.normal(size=(forces.pairs, order + 1))
     # Harmonics fall as in a smooth motion, and the first one passes the clearances.
@@ -65,7 +65,7 @@ def random_harmonics(forces: SiteForces, order: int, seed: int, symmetry: Symmet
 
 
 def random_balance(forces: SiteForces, order: int, symmetry: Symmetry) -> HarmonicBalance:
-    """The equations of a random system with five degrees of freedom, on which ``forces`` act."""
+    """Return the equations of a random system with five degrees of freedom, on which ``forces`` act."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(5, 5))
     stiffness = root @ root.T + np.eye(5)
@@ -282,7 +282,7 @@ def test_the_shift_is_the_effective_mass_of_the_system_whatever_the_weight():
 
 
 def gap_motions(**options: object) -> ConservativeMotions:
-    """The motions of two masses with a hardening contact, whose breathers have frequencies above both modes."""
+    """Return the motions of two masses with a hardening contact, whose breathers have frequencies above both modes."""
     stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
     compliance = DefinedCompliance(np.ones(2), stiffness, np.array([[1.0, 0.0]]))
     control = NnmTable(tolerance=1e-12, truncation=1e-4, **options)
@@ -365,7 +365,7 @@ def test_a_weight_cut_to_1_in_vain_is_followed_by_a_smaller_one(monkeypatch):
 
 
 def coupled_masses(masses: int, coupling: float) -> ConservativeMotions:
-    """The motions of masses of 1 kg, each on a spring of 1 N/m and with a contact, and springs between neighbours."""
+    """Return the motions of masses of 1 kg with contacts, on springs of 1 N/m, and ``coupling`` N/m between them."""
     neighbours = coupling * (np.eye(masses, k=1) + np.eye(masses, k=-1))
     stiffness = (1 + 2 * coupling) * np.eye(masses) - neighbours
     compliance = DefinedCompliance(np.ones(masses), stiffness, np.eye(masses))
@@ -436,7 +436,7 @@ def test_folds_of_motions_that_are_never_linear_are_sought_everywhere():
 
 
 def one_mass(**options: object) -> ConservativeMotions:
-    """The motions of a mass of 1 kg on a spring of 1 N/m with a stop of 20 N/m, 1 m away on one side."""
+    """Return the motions of a mass of 1 kg on a spring of 1 N/m with a stop of 20 N/m, 1 m away on one side."""
     compliance = DenseCompliance(np.ones(1), np.array([[1.0]]), np.array([[1.0]]))
     stops = Stops(Contact("bilinear", 20.0), 1.0, np.inf)
     return ConservativeMotions(compliance, SiteForces([stops]), NnmTable(tolerance=1e-12, **options))

@@ -99,7 +99,7 @@ def test_a_power_law_has_the_exponent_given():
 
 
 def motion_at(w: np.poly1d, t: float) -> np.ndarray:
-    """Motion (sites, 3) at time ``t`` of two sites, of which the first one rests and the second one moves as ``w``."""
+    """Return the motion (site, 3) at time ``t`` of two sites: the first one rests, the second one moves as ``w``."""
     return np.array([[0.0, 0.0, 0.0], [w(t), w.deriv()(t), w.deriv(2)(t)]])
 
 

@@ -26,7 +26,7 @@ TEN_SITES = {"sites": list(range(5, 15)), "clearance": CLEARANCE}
 
 
 def draw(contacts: dict[str, Any] = TEN_SITES, **disorder: Any) -> Case:
-    """A case with the quantities of ``disorder`` drawn, or the nominal one without any."""
+    """Return the case with the quantities of ``disorder`` drawn, or the nominal case without any."""
     table = BASE | {"contacts": contacts}
     if disorder:
         table = table | {"disorder": disorder}
@@ -270,7 +270,7 @@ FAILED = (3, 6, 13, 20, 27, 34)
 
 
 def transfer_of_members() -> np.ndarray:
-    """Random transfer (seed, amplitude) that sets in at 4 N."""
+    """Return a random transfer (seed, amplitude) that sets in at 4 N."""
     count = 35
     values = np.random.default_rng(1).uniform(0.1, 0.3, count) * (np.arange(count) % 7 > 1)
     return values.reshape(5, 7)

@@ -1,4 +1,4 @@
-"""The driven wave as figures of wavenumber scattering name it, and the bins of wavenumbers that they show for it."""
+"""The driven wave in figures of wavenumber scattering: its band and wavenumber, and the bins that are shown for it."""
 
 from __future__ import annotations
 

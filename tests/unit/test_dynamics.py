@@ -29,7 +29,7 @@ CONTACT_CELLS = (3, 7)
 
 
 def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
-    """Energies of one state."""
+    """Return the energies of one state."""
     meter = EnergyMeter(model, layout)
     with state.localForm() as local:
         work = local.array[meter.lattice.shape.work]
@@ -37,7 +37,7 @@ def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
 
 
 class ClosedContact:
-    """A Runge-Kutta engine at rest in time, in a random state whose first contact is closed, its second one free."""
+    """A Runge-Kutta engine at one instant, in a random state whose first contact is closed and second one free."""
 
     # The clearance in m and the approach velocity in m/s: at w = 3e-5 m the indentation is 2e-5 m.
     clearance = 1e-5
@@ -74,7 +74,7 @@ class ClosedContact:
         self.engine.state.ghostUpdate()
 
     def contact_force(self, dissipates: bool = True) -> float:
-        """The force of the closed contact in N, or its elastic part."""
+        """Return the force of the closed contact in N, or its elastic part."""
         site = CONTACT_CELLS[0] - 1
         w = float(np.diff(self.u[site, self.pair])[0])
         rate = float(np.diff(self.v[site, self.pair])[0])
@@ -83,7 +83,7 @@ class ClosedContact:
         return float(self.model.contact.force(w, self.clearance))
 
     def accelerations(self) -> np.ndarray:
-        """Accelerations (cell, dof) in m/s^2 by springs, the drive and the closed contact."""
+        """Return accelerations (cell, dof) in m/s^2 by springs, the drive and the closed contact."""
         force = -(assembled_stiffness(self.chain) @ self.u.ravel()).reshape(self.u.shape)
         force[DRIVEN_CELL - 1, 1] += float(self.model.drive.force(self.time))
         site = CONTACT_CELLS[0] - 1

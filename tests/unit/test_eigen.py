@@ -99,7 +99,7 @@ def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
 
 def test_the_lowest_frequency_of_a_fixed_lattice_is_not_taken_for_zero():
     """The lowest mode of a fixed lattice of n cells has omega = pi/(n + 1) (k/m)^(1/2), with the mass m of a cell."""
-    # A long wave: chain of mass 2 and spring 1 a cell, omega^2 = (pi/401)^2/2, which is 6e-6 of the largest omega^2.
+    # A cell has the mass 2 and the spring 1: omega^2 = (pi/401)^2/2 is 6e-6 of the largest omega^2, far above rounding.
     matrices = matrices_of("fixed", 400)
     (frequency,) = modes_near(matrices, 1, 0.0).frequency
     assert frequency == pytest.approx(np.pi / 401 / np.sqrt(2), rel=1e-4)
@@ -175,7 +175,7 @@ def test_modes_keep_their_digits_beside_one_that_was_hit_exactly(monkeypatch):
 
 
 def test_all_modes_but_one_may_be_asked_for():
-    """The search for further copies is then left with one dimension."""
+    """All modes but one are found, though the search for further copies has one dimension left."""
     matrices = matrices_of("fixed", 4)
     modes = modes_near(matrices, matrices.rows - 1, 0.5)
     assert len(modes.frequency) == matrices.rows - 1

@@ -57,7 +57,7 @@ def put_sweep(
 
 @pytest.fixture
 def folder(tmp_path):
-    """A sweep of which one member failed."""
+    """Return the folder of a sweep of which one member failed."""
     return put_sweep(tmp_path / "all", Sweep.from_table(SWEEP), failing=[FAILING])
 
 
@@ -160,7 +160,7 @@ def test_a_power_law_is_fitted_from_the_largest_value_on():
 
 
 def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
-    """A run in which the hosts' velocities peak at the times ``peak`` (cell,), those of the resonators 0.1 s later."""
+    """Return a run whose hosts have their largest velocities at the times ``peak`` (cell,), resonators 0.1 s later."""
     cell = four_band()
     time = np.linspace(0, 1, 201)
     velocity = np.zeros((201, 30, 4))
@@ -257,7 +257,7 @@ def test_the_latest_record_counts_but_no_failure_after_a_success(folder):
 
 
 def scaled_record(name: str, site: int, work: float, warnings: list[str]) -> dict[str, Any]:
-    """The record of a member without contact, whose measures are those of the linear run ``wave`` at its ``site``."""
+    """Return the record of a member without contact that has the measures of the linear run ``wave`` at ``site``."""
     statistics = {"episodes": 0, "dissipated": 0.0, "engine": "ts", "work": work, "ledger_error": 0.0}
     return {
         "id": name,

@@ -26,7 +26,7 @@ def noise(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
 
 
 def packet(centre: float, kappa: float = 5 * np.pi / 9) -> np.ndarray:
-    """A packet of 600 cells about ``centre``, 30 cells wide."""
+    """Return a packet (cell,) of 600 cells about ``centre``, with the deviation 30 cells."""
     x = np.arange(600) - centre
     return np.exp(-0.5 * (x / 30) ** 2) * np.cos(kappa * x)
 

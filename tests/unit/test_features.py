@@ -63,7 +63,7 @@ DRIVEN = [kind for kind in VERB_CASES if kind not in (NnmCase, DesignCase)]
 
 
 def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> set[str]:
-    """The keys of the problems of the built-in case with the section of the verb and with ``changes``."""
+    """Return the keys of the problems of the built-in case with the section of the verb and ``changes``."""
     table: dict[str, Any] = {"name": "four-band"}
     if kind.section:
         table[kind.section] = copy.deepcopy(VERB_SECTIONS.get(kind.section, {}))

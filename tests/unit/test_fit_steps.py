@@ -20,12 +20,12 @@ BOUNDS = (np.zeros(2), np.full(2, 10.0))
 
 
 def residuals(x: np.ndarray) -> np.ndarray:
-    """Residuals (datum,) of a decaying exponential."""
+    """Return residuals (datum,) of a decaying exponential."""
     return x[0] * np.exp(-x[1] * TIMES) - DATA
 
 
 def slopes(x: np.ndarray) -> np.ndarray:
-    """Derivatives (datum, 2) of the residuals."""
+    """Return derivatives (datum, 2) of the residuals."""
     decay = np.exp(-x[1] * TIMES)
     return np.column_stack([decay, -x[0] * TIMES * decay])
 

@@ -31,7 +31,7 @@ def claim(*arguments, **options) -> AbstractContextManager[Claim]:
 
 
 def assert_refused(match: str, *arguments, **options) -> None:
-    """A claim with these arguments is refused with a message."""
+    """Assert that a claim with these arguments is refused with a message."""
     with pytest.raises(FolderError, match=match), claim(*arguments, **options):
         pass
 
@@ -232,7 +232,7 @@ def test_verbs_without_results_of_their_own_remove_such_files_too(tmp_path):
 
 
 def test_a_file_that_another_command_writes_stays(tmp_path):
-    """A sweep below a paper's folder has a lock of its own: its temporary files are in use."""
+    """A claim keeps temporary files of a folder below, which another command has locked and may be writing."""
     with claim(tmp_path, PAPER, OLD):
         pass
 

@@ -22,7 +22,7 @@ def house_style():
 
 
 def branch_of(frequency: np.ndarray, grazing: int = GRAZING) -> xr.Dataset:
-    """A branch with this ``frequency`` (point,) over energies from 1 to 100 J, in contact from ``grazing`` on."""
+    """Return a branch with this ``frequency`` (point,) over 1 to 100 J, in contact from the point ``grazing`` on."""
     number = np.arange(POINTS)
     columns = {
         "energy": 100.0**PLACE,

@@ -99,7 +99,7 @@ def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude:
     ],
 )
 def test_growth_of_a_slow_motion_is_that_of_the_monodromy_matrix(frequencies, contact, amplitude):
-    """Orders up to the highest frequency are kept, also that of the system with a closed contact."""
+    """The growth is that of the monodromy matrix, as orders up to the highest frequency, also in contact, are kept."""
     turned = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     stiffness = turned @ np.diag(np.square(frequencies)) @ turned.T
     row = np.array([1.0, 0.0])

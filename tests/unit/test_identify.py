@@ -20,12 +20,12 @@ SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
 
 def record_in(path, **changes):
-    """The table of a record in ``path``."""
+    """Return the table of a record in ``path``."""
     return {"file": str(path), "time": "t", "sensors": [SENSOR]} | changes
 
 
 def written(folder, rows=None, names="t,v"):
-    """A record of 20 samples, or of ``rows``, in a table of text."""
+    """Write a record of 20 samples, or of ``rows``, as a table of text, and return its path."""
     path = folder / "record.csv"
     if rows is None:
         rows = [f"{1e-3 * k:.4f},{np.sin(k):.6f}" for k in range(20)]
@@ -34,14 +34,14 @@ def written(folder, rows=None, names="t,v"):
 
 
 def problems_of(record, **options):
-    """The problems of an identification with one ``record``, by key."""
+    """Return the problems of an identification with one ``record``, by key."""
     with pytest.raises(CaseError) as caught:
         IdentifyCase.from_table(identify_table(lattice_table(), record, **options))
     return {problem.key: f"{problem.value}: {problem.remedy}" for problem in caught.value.problems}
 
 
 def rows_with(index, row):
-    """The rows of a record, with another one at ``index``."""
+    """Return the rows of a record, with another one at ``index``."""
     rows = [f"{1e-3 * k:.4f},{np.sin(k):.6f}" for k in range(20)]
     rows[index] = row
     return rows

@@ -60,7 +60,7 @@ MODULES = {module_of(path): path for path in SOURCES}
 # Five tests use the same files, and parsing all of them takes a second.
 @cache
 def imported(path: Path) -> list[str]:
-    """Every name that a file imports, inside functions and for type checkers too."""
+    """Return every name that a file imports, also inside functions and for type checkers."""
     return [*_imported(path)]
 
 
@@ -79,7 +79,7 @@ def _imported(path: Path) -> Iterator[str]:
 
 
 def arrows(module: str) -> set[str]:
-    """The modules of the package that ``module`` imports."""
+    """Return the modules of the package that ``module`` imports."""
     found = set()
     for name in imported(MODULES[module]):
         if name == "vipetsc":

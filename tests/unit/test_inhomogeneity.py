@@ -111,7 +111,7 @@ def test_a_variation_is_read_only_and_of_all_cells():
 
 
 def damped_table(lattice: dict[str, Any] | None = None, **cell: Any) -> dict[str, Any]:
-    """The table of a case with dashpots of each kind; ``lattice`` and ``cell`` update it."""
+    """Return the table of a case with dashpots of each kind; ``lattice`` and ``cell`` update it."""
     damped_cell = {
         "masses": [0.01, 0.02],
         "springs": [

@@ -27,7 +27,7 @@ TABLE = {"name": "t", "lattice": FOUR_BAND, "contacts": {"sites": 0}}
 
 
 def case_with(**sections: dict[str, Any]) -> Case:
-    """A lattice of 24 cells without contacts, with these sections."""
+    """Return the case of a lattice of 24 cells without contacts, with these sections."""
     return Case.from_table(TABLE | sections)
 
 
@@ -238,7 +238,7 @@ def put_branch(path: Path, size: float = 1e-4) -> None:
 
 @pytest.fixture
 def branch(tmp_path):
-    """The file of a branch with two orbits."""
+    """Return the file of a branch with two orbits."""
     path = tmp_path / "branch-a.h5"
     put_branch(path)
     return path

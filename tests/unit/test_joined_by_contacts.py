@@ -24,7 +24,7 @@ APART = {"clearance": 1e-5, "precompression": None, "side": None}
 
 
 def table(**sections: dict[str, Any]) -> dict[str, Any]:
-    """Four grains with resonators, pressed together; ``sections`` update the table, and None removes a key."""
+    """Return the table of four grains with resonators, pressed together; ``sections`` update it, None removes a key."""
     given: dict[str, Any] = {
         "lattice": {"cells": 4, "ends": "free", "cell": {"masses": [4e-3, 2e-3], "springs": [INSIDE]}},
         "contacts": {"stiffness": 1e7, "pair": [1, 1], "next_cell": True, "sites": [1, 2, 3]} | PRESSED,
@@ -174,7 +174,7 @@ def test_bodies_are_what_springs_and_pressed_contacts_hold_together():
 
 
 def modes_case(modes: list[int], contacts: dict[str, Any] | None = None, ends: str = "free") -> dict[str, Any]:
-    """The table of branches of a whole lattice of grains."""
+    """Return the table of branches of a whole lattice of grains."""
     given = table(contacts=contacts or {}, lattice={"ends": ends}, nnm={"system": "chain", "modes": modes})
     return {name: given[name] for name in ("lattice", "contacts", "nnm")}
 
@@ -236,7 +236,7 @@ def test_the_reduced_model_of_a_cell_may_be_free(springs, mode, is_still):
 
 
 def response(**sections: dict[str, Any]) -> dict[str, Any]:
-    """The table of a frequency response of grains."""
+    """Return the table of a frequency response of grains."""
     nfrc = {"source": "force", "range": [0.1, 1.0], "harmonics": 5} | sections.pop("nfrc", {})
     return table(nfrc=nfrc, **sections)
 

@@ -17,7 +17,7 @@ CHAIN = Chain(four_band(), 100, sites=(3,), clearances=(1e-3,))
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """The user's cache in a temporary folder."""
+    """Put the user's cache into a temporary folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     module._kept.cache_clear()
     yield kept.cache_folder()

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def page() -> Figure:
-    """A laid-out figure of a map with its colour bar, logarithmic axes, twins and small numbers under titles."""
+    """Return a figure with a map and its colour bar, logarithmic axes, twin axes, small numbers and titles."""
     figure = new_figure(4.0, 3.0)
     left, middle, right = figure.subplots(1, 3)
     image = left.imshow(np.arange(12.0).reshape(3, 4))

@@ -27,7 +27,7 @@ KAPPA = np.linspace(0, np.pi, 41)
 
 @st.composite
 def cells(draw):
-    """A connected cell: a line of masses, and one or two springs to the next cell."""
+    """Draw a connected cell: a line of masses, and one or two springs to the next cell."""
     n = draw(st.integers(2, 5))
     positive = st.floats(0.1, 10)
     mass = st.integers(0, n - 1)

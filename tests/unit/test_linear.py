@@ -1,4 +1,4 @@
-"""A linear run shows how near a member comes to its stops, and a lattice that moves in proportion may be scaled."""
+"""A linear run shows how near a member comes to its stops; motions proportional to the drive are scaled."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def give_back(record: Outer) -> Inner:
     [(replace, ()), (replace_without_references, ()), (replace_argument, (4,)), (choose, (True,)), (choose, (False,))],
 )
 def test_values_are_those_of_python(function, arguments):
-    """The compiled function returns the values, and leaves the counts in the tuples' arrays, that Python does."""
+    """The compiled function has the results of Python: its values, and the counts in the tuples' arrays."""
     results = []
     for call in (function, function.py_func):
         records = [outer(3.0, 5)]

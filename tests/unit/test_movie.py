@@ -98,7 +98,7 @@ def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
 
 @pytest.mark.slow
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
-    """A site lights up in the one frame whose time since the last holds an onset, and fades by FADE a frame."""
+    """A site lights up in the frame that follows its onset, and fades by the factor FADE a frame."""
     # A frame stands for 1.5 ms.
     content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))
 

@@ -17,7 +17,7 @@ def measured() -> xr.Dataset:
     variables = {
         "time": variable("time", [0.0, 0.5, 1.0], "s", "time"),
         "cell": variable("cell", [3, 7], "1", "cell, counted from 1"),
-        # A lattice without sites has dimensions of length zero, which HDF5 treats apart.
+        # A lattice without sites has dimensions of length zero, a special case in HDF5.
         "site": variable("site", np.zeros(0, int), "1", "contact site"),
         "velocity": variable(("time", "cell"), np.arange(6.0).reshape(3, 2), "m/s", "velocity"),
         "sites/cell": variable("site", np.zeros(0, int), "1", "cell of the site"),

@@ -82,7 +82,7 @@ def test_what_is_kept_is_not_drawn_and_not_half(tmp_path):
 
 
 def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
-    """A note adds a strip below a picture, in which something stands, and leaves the picture as it is."""
+    """A note adds a strip with text below a picture and leaves the picture as it is."""
     with rc_style():
         figure = new_figure(2, 1)
         figure.subplots().plot([0, 1])

@@ -44,7 +44,7 @@ class Motion(NamedTuple):
     t: float
 
     def at(self, cell: int, mass: int) -> np.ndarray:
-        """Displacement and velocity of a mass; those of ground, mass -1, are zero."""
+        """Return displacement and velocity of a mass; those of the ground, mass -1, are zero."""
         if mass < 0:
             return np.zeros(2)
         cell = cell % CELLS
@@ -101,7 +101,7 @@ def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[floa
 
 
 def accelerations(model: Model, motion: Motion) -> np.ndarray:
-    """Accelerations (cell, dof) by springs, dashpots, contacts and drives, in m/s^2."""
+    """Return accelerations (cell, dof) by springs, dashpots, contacts and drives, in m/s^2."""
     chain = model.chain
     u = motion.u.ravel()
     v = motion.v.ravel()
@@ -278,7 +278,7 @@ def test_an_engine_that_keeps_no_ledger_of_dashpots_has_the_components_of_drives
 
 
 def undamped_cell() -> UnitCell:
-    """``CELL`` without its dashpots."""
+    """Return ``CELL`` without its dashpots."""
     springs = tuple(replace(spring, damping=0.0) for spring in SPRINGS)
     return replace(CELL, springs=springs, grounding=())
 

@@ -50,7 +50,7 @@ def generation_sizes(sampler, function, generations):
 
 
 def test_cma_es_finds_the_least_and_stays_in_the_cube():
-    """Sixty generations of eight points come near the least without leaving the cube."""
+    """Sixty generations of eight points come near the minimum without leaving the cube."""
     points, losses = search_with(cma(), bowl, 60)
 
     assert len(points) == 60 * 8

@@ -72,7 +72,10 @@ def test_grid_equals_a_direct_loop(found, reading, row, column):
 
 @pytest.mark.parametrize("reading", READINGS)
 def test_out_of_phase_wherever_the_resonator_alone_is_slower_than_the_band_edge(found, reading):
-    """u3/u2 = k3/(k3 - m3 omega^2) < 0 above sqrt(k3/m3); with u2 at rest at kappa = pi, an edge is sqrt(k2/m)."""
+    """A cell is out of phase if sqrt(k3/m3) is below the edge sqrt(k2/m) at kappa = pi, where u2 is at rest.
+
+    The resonator has u3/u2 = k3/(k3 - m3 omega^2), which is negative above sqrt(k3/m3).
+    """
     alone = GRID[:, None] * SPRING[reading] / (0.005 * GRID[None, :-1])
     edge = 1e4 / 0.005
     clear = np.abs(alone - edge) > 1e-6 * edge

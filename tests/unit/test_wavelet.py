@@ -143,7 +143,7 @@ def test_padding_keeps_periodic_images_apart():
 
 
 def moving_packet(times=21):
-    """Return a packet of the four-band lattice's drive, 5 pi/9, that moves by ten cells from time to time."""
+    """Return a packet (time, cell) at the paper's wavenumber 5 pi/9 that moves by ten cells from time to time."""
     return np.array([packet(5 * np.pi / 9, centre=200 + 10 * t, phase=3 * t) for t in range(times)])
 
 
@@ -192,7 +192,7 @@ def test_partition_accounts_for_its_energies():
 
 
 def test_neighbouring_bins_share_much_of_a_packet():
-    """The bins overlap at kc = 6: the energies of the parts leave out most of the whole."""
+    """The bins overlap at kc = 6: cross terms of the parts are 40 to 80 % of the energy."""
     cross_terms = partition(moving_packet(), 1.0).cross_share
     assert np.all((cross_terms > 0.4) & (cross_terms < 0.8))
 
