@@ -106,7 +106,7 @@ def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
 
 
 def engines() -> dict:
-    """How runs differ: by the two engines, and with linear stops of the same stiffness; episodes and ledger errors."""
+    """Differences between runs by the two engines and with linear stops, the numbers of episodes, and ledger errors."""
     linear_stops = STOPS | {"law": "bilinear"}
     del linear_stops["parameters"]
     stepped, by_ts = stopped_run("ts", STOPS)

@@ -176,6 +176,7 @@ def test_the_end_that_is_chosen_keeps_its_bound():
 
 @pytest.mark.slow
 def test_both_ends_absorb_what_each_of_them_gets():
+    """Two equal ends reflect the same fraction of all sent energy as one; for a force at a wall it is much smaller."""
     one, both = (
         case({"cells": 300, "absorbing": {"end": end, "cells": 20, "strength": 200.0}}, BURST | {"cell": 150})
         for end in ("right", "both")

@@ -25,11 +25,13 @@ def found(tmp_path_factory) -> dict:
 
 
 def test_the_law_on_arrays_and_its_compiled_twin_are_the_formula(found):
+    """The law on arrays and the compiled one have the force k x (1 + b x^2), its slope, energy and impacts."""
     assert found["twins"] == pytest.approx(0, abs=1e-12)
     assert found["duration"] == pytest.approx(0, abs=1e-7)
 
 
 def test_both_engines_follow_the_same_trajectory(found):
+    """Both engines follow one trajectory with hardening stops, to 1e-6 of the largest velocity, with closed ledgers."""
     assert found["episodes"][0] == found["episodes"][1] > 4
     assert found["engines"] < 1e-6
     assert max(found["ledgers"]) < 1e-7
@@ -40,10 +42,12 @@ def test_both_engines_follow_the_same_trajectory(found):
 # The condensed method may leave out harmonics of 1e-4 of the motion: its error is larger than that of shooting.
 @pytest.mark.parametrize(("method", "error"), [("shooting", 1e-8), ("condensed", 1e-5)])
 def test_normal_modes_have_the_period_of_the_energy_integral(found, method, error):
+    """A mass between hardening stops has the period 4 int dx/sqrt(2 (E - V(x))/m), by shooting and condensed."""
     assert found["reached"][method] > 0.5
     assert found["periods"][method] < error
 
 
 def test_a_steady_state_is_a_periodic_orbit(found):
+    """A steady state of ``nfrc`` has the largest |w| of the periodic orbit by SciPy and Newton's method."""
     assert found["steady_hardens"] > 0.01
     assert found["steady"] < 1e-3

@@ -117,6 +117,7 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
 
 @pytest.mark.parametrize("floor", [0.0, 1e-4, 1e-2])
 def test_floor_is_part_of_the_divisors_fit(floor):
+    """The divisor of a transfer slope/divisor + floor is found for any given floor."""
     slope = branch()
     divisor = 4e3
     work, transfer = exact_transfer(divisor, floor)
@@ -127,6 +128,7 @@ def test_floor_is_part_of_the_divisors_fit(floor):
 
 
 def test_divisor_is_the_least_squares_one():
+    """The fitted divisor has the least sum of squares of logarithms: 1 % more or less gives a larger one."""
     slope = branch()
     floor = 1e-3
     work, transfer = exact_transfer(4e3, floor)

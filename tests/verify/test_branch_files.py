@@ -342,7 +342,7 @@ def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
 
 
 def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
-    """The lower part goes on from the point at which it failed, though no write was due there when the kill came."""
+    """The lower part goes on from the point at which it failed, although no write was due at that point."""
     follow(tmp_path / "whole", **BOTH)
     parts = tmp_path / "parts"
 

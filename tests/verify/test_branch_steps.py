@@ -116,7 +116,7 @@ def turns_too_far(problem: Shooting, points: list[Point]) -> list[int]:
 # tip, where it passes c = 1, and none of its orbits repeats another one.
 @pytest.mark.slow
 def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
-    """With the guard on turns the branch turns back at the tip, and neither check reports anything."""
+    """With the guard on turns the in-phase branch comes back from the tip, and no check reports anything."""
     problem, points = in_phase_hertz()
 
     assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
@@ -127,7 +127,7 @@ def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
 
 @pytest.mark.slow
 def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one():
-    """Without the guard on turns the branch jumps to the out-of-phase one, and the checks say where.
+    """Without the guard on turns the in-phase branch jumps to the out-of-phase one, and the checks say where.
 
     After the jump each point is an out-of-phase orbit passed three times.
     """

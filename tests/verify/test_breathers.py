@@ -29,6 +29,7 @@ from vipetsc.modes.system import System
     ],
 )
 def test_branches_from_modes_are_those_of_shooting(system, mode, energy, truncation):
+    """Condensed branches from linear modes have the orbits of shooting, with cubic springs and with contacts."""
     _, points = branch = condensed_branch(system, mode, energy, truncation=truncation, points=12)
     assert system.springs or points[-1].episodes
     assert_orbits_of_shooting(system, *branch)
@@ -36,6 +37,7 @@ def test_branches_from_modes_are_those_of_shooting(system, mode, energy, truncat
 
 @pytest.mark.slow
 def test_a_branch_from_a_describing_function_is_that_of_shooting():
+    """A condensed branch that begins in contact, by a describing function, has the orbits of shooting."""
     system = reduced_model("bilinear")
     problem = condensed_problem(system, truncation=1e-7, points=2)
     start = problem.in_gap(3200.0, np.array([1.0]))
@@ -68,6 +70,7 @@ def assert_orbits_of_shooting(system, problem, points) -> None:
 
 @pytest.mark.slow
 def test_a_breather_returns_after_a_period_in_its_chain():
+    """A breather by harmonic balance in Bloch waves returns after its period in the flow of a chain of 12 cells."""
     chain = Chain(four_band("calibrated"), 12, "fixed", (5,), (CLEARANCE,))
     problem, point = condensed_breather(12, 6, 1600.0, 2e-9, max_newton=12)
     state = state_of(problem, point, chain.cell.dofs)

@@ -33,6 +33,7 @@ def damped_wave(cell: UnitCell, band: int) -> tuple[complex, np.ndarray]:
 
 @pytest.mark.parametrize("band", [0, 1, 3])
 def test_a_bloch_wave_decays_as_the_complex_dispersion_says(band):
+    """The propagator moves a damped wave as Re(u exp(i kappa n + s t)) with the complex rate s at a real kappa."""
     model = unlike_lattice("periodic", CELLS, "none", dashpots=0.02)
     chain = model.chain
     layout = Layout(model, MPI.COMM_SELF)

@@ -41,6 +41,7 @@ def test_degenerate_tangent_is_named():
 
 @pytest.mark.slow
 def test_without_guards_the_branch_jumps_and_the_detector_finds_it():
+    """Without guards a branch jumps to another one, and the detector finds the jump; with guards it finds none."""
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
     start = linear_start(problem, IN_PHASE, 3e-3)
     control = NnmTable(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0, turn_relative=0))

@@ -47,6 +47,7 @@ def test_rayleigh_damping_has_its_closed_form(cell):
 
 @pytest.mark.parametrize("cell", [four_band(), diatomic()])
 def test_waves_of_a_real_frequency_solve_the_bloch_equation(cell):
+    """Waves at a frequency of a band satisfy (K(kappa) - omega^2 M) u = 0, where exp(i kappa) is the wave's factor."""
     _, frequency, _ = max_group_velocity(cell, 2)
 
     waves = damped_waves(cell, frequency)
@@ -119,7 +120,7 @@ def test_an_absorbing_end_reflects_alike_on_either_side():
     """A mirrored end reflects as much as the original, since a diatomic cell is its own mirror image."""
     omega = max_group_velocity(diatomic(), 2)[1]
     right = absorber(diatomic(), "fixed", 10, 400.0)
-    # The same dashpots in the opposite order.
+    # The left end has the same dashpots in the opposite order.
     left = replace(right, variation=Variation(grounding=right.variation.grounding[::-1]))
     computed = reflection(right, omega, 10)
     # A wrong reflection could be 0 or 1 on either side: this one is neither.
@@ -170,6 +171,7 @@ def test_an_absorbing_end_is_refused_where_it_cannot_be():
 
 
 def test_profiles_defects_and_scatter_of_a_case():
+    """Values of profiles are exact, and scattered quantities have their deviation, drawn anew for another seed only."""
     cells = {
         "masses[1]": {"relative": 0.02},
         "springs[3].stiffness": {"absolute": 50.0},
@@ -265,6 +267,7 @@ def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
 
 
 def test_a_loss_by_bands_is_resolved_to_dashpots():
+    """A loss by bands becomes dashpots of the resolved case, and a warning gives the loss where it cannot be met."""
     case = small_case(
         lattice={"damping": {"loss": {"2": 0.02}}, "profiles": {"masses[1]": {"cells": [3], "factor": 2.0}}}
     )

@@ -127,6 +127,7 @@ def test_cells_that_do_not_differ_give_the_bits_of_those_alike():
 
 
 def test_the_ledger_closes_with_dashpots():
+    """The ledger of a damped lattice with impacts closes to 1e-9, and the energy lost in dashpots never decreases."""
     run, result = simulated(damped_case())
     statistics = result.statistics
     assert statistics["episodes"] > 0

@@ -80,6 +80,7 @@ def by_transfer_function(case: Case) -> np.ndarray:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_chirp_meets_the_transfer_function(engine):
+    """The response to a chirp is the inverse transform of the lattice's transfer function times that of the force."""
     chirp = {"waveform": "chirp", "amplitude": 5.0, "frequency": 700.0, "bandwidth": 900.0, "duration": 0.02}
     time = {"end": 0.03, "engine": engine, "sample_interval": 1.2e-4, "rtol": 1e-11}
     case = case_of(chirp | {"cell": 4, "mass": 2}, time=time)
@@ -164,6 +165,7 @@ def test_drives_superpose(engine, error):
     ],
 )  # fmt: skip
 def test_every_waveform_has_its_ledger(engine, drive):
+    """The energy ledger closes under every waveform, also with ramps, a duration and moved ends."""
     run = run_of(case_of({"waveform": "samples", "amplitude": 0.01} | drive, engine=engine))
 
     assert np.abs(run["energy/work"].values).max() > 0

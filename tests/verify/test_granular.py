@@ -87,6 +87,7 @@ def test_a_pressed_chain_has_the_dispersion_of_its_linearised_contacts(tmp_path,
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_a_struck_chain_is_that_of_an_independent_solver(tmp_path, engine):
+    """A struck chain of beads moves as by SciPy from the equations of Hertz contacts, to 1e-8 m/s."""
     n = 8
     v = np.append(0.1, np.zeros(n - 1))
     run = beads(tmp_path, u=np.zeros(n), v=v, end=4e-4, samples=11, rtol=1e-11, engine=engine)

@@ -32,6 +32,7 @@ def effective_restitution(r: float) -> float:
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 @pytest.mark.parametrize("restitution", [0.95, 0.7, 0.3])
 def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
+    """An isolated impact has the effective restitution e of its law, and the loss mu v^2 (1 - e^2)/2."""
     # The springs are so soft that they do not matter during one impact.
     soft = 1e-9
     springs = [{"start": 1, "end": 1, "stiffness": soft, "next_cell": True}, {"start": 1, "end": 2, "stiffness": soft}]
@@ -83,6 +84,7 @@ def test_clipped_contacts_never_pull():
 
 
 def test_a_floor_on_the_approach_velocity_is_counted():
+    """The statistics count the impacts whose approach velocity is below the floor."""
     run, result = simulated(small_case(contacts={"approach_floor": 0.3}))
 
     slow = np.abs(run["impacts/approach_velocity"].values) < 0.3
@@ -107,6 +109,7 @@ def clipped_run(request) -> tuple[xr.Dataset, Result]:
 
 
 def test_a_clipped_contact_loses_its_elastic_energy(clipped_run):
+    """A contact that is clipped loses its elastic energy, so that the balance closes and no energy ever returns."""
     run, result = clipped_run
     force = run["sites/force"].values
     # In a clipped phase the masses are pressed together without a force.
@@ -140,7 +143,7 @@ def test_many_conservative_hertzian_contacts_keep_the_energy():
     _, result = simulated(case)
 
     assert result.statistics["switches"] > 400
-    # The error would be 3.2e-8 if the first step of each contact had equal parts of time and not of its square root.
+    # The error would be 3.2e-8 if the first step of each contact were taken in time and not in its square root.
     assert result.statistics["ledger_error"] < 1e-8
 
 

@@ -183,6 +183,7 @@ CLIPPED = {"adhesion": "clip", "restitution": 0.0, "stiffness": 1e4, "clearance"
 
 @pytest.mark.parametrize("law", [{}, CLIPPED])
 def test_the_engines_agree_from_closed_contacts_on(law):
+    """Both engines agree from closed contacts on, and keep the balance of the initial energy."""
     contacts = {"sites": [19, 20, 21, 30], "clearance": 1e-3, "restitution": 0.7, "stiffness": 1e6} | law
     stepped = run(moving(CLOSED, contacts=contacts, time={"engine": "ts", "end": 0.004}))
     exact = run(moving(CLOSED, contacts=contacts, time={"engine": "propagator", "end": 0.004}))
@@ -265,6 +266,7 @@ def breather(tmp_path_factory) -> tuple[dict[str, Any], Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_breather_comes_back_after_its_period(engine, breather):
+    """A run that begins with a breather returns after its period, with opposite displacements after half of it."""
     table, path = breather
     period = 2 * np.pi / 1600
     time = {"engine": engine, "end": period, "sample_interval": period / 16, "rtol": 1e-13}

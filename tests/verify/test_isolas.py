@@ -71,6 +71,7 @@ def state_of(states: SteadyStates, point: Response) -> np.ndarray:
 
 
 def test_an_isolated_curve_is_closed_and_has_a_file_of_its_own(curves):
+    """The isolated curve ends at its first state, lies apart from the main curve, and has a file and a picture."""
     folder, (main, isola) = curves
     assert main.ending.startswith("reached the end")
     assert (isola.name, isola.ending) == (f"{main.name}-isola-1", "closed: it has come back to its first state")
@@ -281,6 +282,7 @@ def test_at_resonance_the_force_makes_up_for_the_loss(sign):
 
 
 def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
+    """A search by breathers finds the same isolated curve, with the same folds."""
     _, (main, isola) = curves
     put_main(curves, tmp_path)
     other = follow_all(absorber(isola_search=["breathers"]), tmp_path, MPI.COMM_SELF, resume=True)
@@ -293,7 +295,7 @@ def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
 
 @pytest.mark.parametrize("periods", [10, 40])
 def test_slow_sweeps_pass_near_steady_states(periods):
-    """The motion in a sweep of ``periods`` per step differs from the steady state by less than 1.5/``periods``.
+    """The motion in a sweep of ``periods`` between two places differs from a steady state by less than 1.5/``periods``.
 
     The difference is what the steady state changes while the motion settles.
     """

@@ -46,6 +46,7 @@ def runs():
 
 @pytest.mark.slow
 def test_engines_agree(runs):
+    """Both engines give the same motion, impacts and losses of the laboratory's lattice."""
     by_ts, result = runs["ts"]
     by_propagator, _ = runs["propagator"]
 
@@ -107,6 +108,7 @@ def test_an_analysis_in_blocks_measures_the_same(runs):
 
 
 def test_a_site_is_of_the_masses_of_its_cell():
+    """A contact's reduced mass is 1/(1/m1 + 1/m2) with the masses of its own cell, or the mass against the ground."""
     chain = laboratory().model().chain
     masses = chain.variation.masses[list(chain.sites)]
     assert chain.reduced_masses() == pytest.approx(1 / (1 / masses[:, 1] + 1 / masses[:, 2]))

@@ -71,6 +71,7 @@ def linearise(flow: LatticeFlow, start: np.ndarray, change: np.ndarray) -> Linea
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_without_contact_the_multipliers_are_those_of_the_linear_modes(ends):
+    """The linearisation over a time T without contact has the multipliers exp(+-i omega_j T) of all modes j."""
     flow = lattice_flow((5,), four_band_contact(), ends)
     arc = flow.arc(irregular_motion((5,), w=0.0, speed=0.0), PERIOD)
     assert arc.episodes == 0

@@ -73,6 +73,7 @@ def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cell
 
 
 def test_the_spectrum_of_a_burst_is_its_transform():
+    """The spectrum of a tone burst is the integral of F(t) exp(-i w t) dt."""
     burst = ToneBurst(3.0, 100.0, 5)
     # The burst begins and ends at zero, so that a plain sum is the trapezoidal rule.
     t, dt = np.linspace(0, burst.duration, 200_001, retstep=True)
@@ -83,6 +84,7 @@ def test_the_spectrum_of_a_burst_is_its_transform():
 
 
 def test_speeds_of_a_packet_are_those_of_its_frequency():
+    """The speeds of a packet enclose the group velocity at its frequency, more narrowly the longer its burst is."""
     cell = four_band("calibrated")
     ((number, _, speed),) = waves_at(cell, 900.0)
 
@@ -104,6 +106,7 @@ def test_the_largest_value_between_samples():
 
 @pytest.mark.parametrize("lattice", LATTICES)
 def test_fractions_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path):
+    """All energy is transmitted below the onset; above it some is reflected, and the fractions sum to one."""
     runs = make_runs(tmp_path, law_case(lattice))
     transmitted = 2 * runs.setting.band
     reflected = transmitted + 1
@@ -125,6 +128,7 @@ def test_fractions_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_p
 
 
 def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
+    """The fractions of a lossy site sum to one with the dissipated one."""
     (row,) = fractions(make_runs(tmp_path, law_case(contacts={"restitution": 0.6})), 1.5)
 
     assert row.sum() == pytest.approx(1, abs=1e-7)
@@ -132,6 +136,7 @@ def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
 
 
 def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
+    """With bilinear stops motions scale with the clearance: fractions depend on amplitude over clearance alone."""
     # With Hertz's law the fractions would differ between clearances of which one is thirty times the other.
     near = law_case(contacts={"law": "bilinear", "clearance": 1e-3})
     far = law_case(contacts={"law": "bilinear", "clearance": 3e-2})
@@ -143,6 +148,7 @@ def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
 
 
 def test_longer_distances_do_not_change_the_fractions(tmp_path):
+    """Fractions are the same after twice the wait for waves to have passed."""
     contacts = {"restitution": 0.7}
     short = make_runs(tmp_path / "short", law_case(law=COARSE | {"settle": 2.0}, contacts=contacts))
     long = make_runs(tmp_path / "long", law_case(law=COARSE | {"settle": 4.0}, contacts=contacts))
@@ -260,6 +266,7 @@ def law_by_hand() -> ScatteringLaw:
 
 
 def test_between_points_the_law_is_linear_in_log_z():
+    """The law is linear in log z between its points, constant beyond the last, and has no contact below the first."""
     law = law_by_hand()
     assert set(ScatteringOutcome._fields) == set(POINT_LAYOUT)
 

@@ -64,6 +64,7 @@ def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(s
 
 
 def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
+    """The work of members without contact is proportional to the square of the amplitude; their shares are equal."""
     _, ensemble, _ = sweep
     amplitude = ensemble["amplitude"].values[:2]
     work = ensemble["work"].values[:2]
@@ -202,6 +203,7 @@ def test_an_unforeseen_linear_run_is_simulated_where_it_is_needed(sweep, tmp_pat
 
 
 def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
+    """Modal energies at the end of a member sum to the work less the losses, if no site is in contact then."""
     margins, ensemble, _ = sweep
     energy = ensemble["bands/modal_energy"]
     work = ensemble["work"].values

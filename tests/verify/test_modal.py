@@ -64,6 +64,7 @@ def test_modal_energies_of_the_built_in_run(builtin):
 @pytest.mark.slow
 @pytest.mark.parametrize(("time", "share"), [(0.3, 0.1113), (0.4, 0.2351), (0.5, 0.3365), (0.6, 0.3385)])
 def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
+    """The share of the upper bands in the work of the built-in run has the values of SPEC section 12 at four times."""
     run, analysis = builtin
     model = Case.of(run).model()
     sample = int(np.searchsorted(run["time"].values, time - 1e-9))
@@ -95,7 +96,7 @@ def test_transfers_close_the_ledger_of_every_cluster(builtin):
 def test_work_of_the_drive_is_no_transfer():
     """The work that the drive does during a cluster of contacts is not part of the cluster's transfers.
 
-    The sites are so far from the driven cell that contacts and drive act at the same time.
+    The burst still lasts when waves reach the sites.
     """
     run = run_of(small_case(time={"engine": "propagator", "end": 0.08}))
     model = Case.of(run).model()
@@ -119,6 +120,7 @@ def test_work_of_the_drive_is_no_transfer():
 
 
 def test_without_contacts_all_is_work_of_the_drive():
+    """Without contacts every part's energy is the work of the drive on it, and there are no transfers."""
     run = run_of(small_case(contacts={"sites": 0}, time={"engine": "propagator", "end": 0.08}))
     model = Case.of(run).model()
     analysis = analyse(run, ("modal", "transfers"))

@@ -60,6 +60,7 @@ def test_the_breather_is_the_one_of_the_specification(breather):
 
 
 def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
+    """The largest multipliers, found without matrices, are eigenvalues of the dense map of a period."""
     problem, point = breather
     flow = problem.flow
     # By symmetry both halves of the period have the same map, whose square is that of the period.
@@ -80,6 +81,7 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
 
 
 def test_the_product_is_the_derivative_of_the_residual(breather):
+    """The product of the Jacobian with a vector is the central difference of the residual along that vector."""
     problem, point = breather
     frame = problem.frame(point)
     change = np.random.default_rng(4).standard_normal(len(point.x) + 1)
@@ -90,6 +92,7 @@ def test_the_product_is_the_derivative_of_the_residual(breather):
 
 
 def test_a_linear_mode_is_continued_as_by_the_dense_method():
+    """The first orbit on a linear mode is that of shooting with dense matrices."""
     dense = Shooting(Dop853Flow(System.from_chain(breather_chain(), STOPS)), MAPS["quarter"])
     point = linear_start(lattice_shooting(), 3, 1e-6)
     expected = linear_start(dense, 3, 1e-6)

@@ -30,6 +30,7 @@ ONE_MASS: dict[str, Any] = TWO_MASSES | {
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_a_run_is_that_of_an_oscillator(engine):
+    """A run is the motion of u'' = F - 1.5 u - 0.06 u' - 20 max(u - 0.4, 0) by SciPy."""
     drive = {"waveform": "harmonic", "amplitude": 0.5, "frequency": 1.2, "cell": 1, "ramp": 5.0}
     time = {"end": 40.0, "sample_interval": 0.1, "engine": engine}
     run = run_of(Case.from_table(ONE_MASS | {"drive": drive, "time": time}))
@@ -47,12 +48,14 @@ def test_a_run_is_that_of_an_oscillator(engine):
 
 
 def test_its_only_mode():
+    """The only mode of one mass has the frequency sqrt(1.5) rad/s."""
     modes = linear_modes(Case.from_table(ONE_MASS).model().chain)
     assert modes.frequency == pytest.approx([np.sqrt(1.5)])
     assert np.abs(modes.vectors) == pytest.approx(np.ones((1, 1)))
 
 
 def test_dashpots_alone_resist_a_motion_of_equal_masses_together():
+    """A common motion of all masses, kappa = 0, has no stiffness: one of its two rates, 0 and -0.06, is given."""
     cell = Case.from_table(ONE_MASS).model().chain.cell
     assert damped_bloch(cell, 0.0).rate == pytest.approx([0.0], abs=1e-12)
     # A long wave is overdamped: s^2 + 0.06 s + omega^2 = 0 has two real rates, of which the slower one is given.
@@ -63,6 +66,7 @@ def test_dashpots_alone_resist_a_motion_of_equal_masses_together():
 
 @pytest.mark.slow
 def test_its_frequency_response_comes_back_after_a_period(tmp_path):
+    """States return after a period by SciPy and are stable as their multipliers are; at a fold a multiplier is 1."""
     contacts = ONE_MASS["contacts"] | {"clearance": 0.8}
     states, points = followed(NfrcCase.from_table(ONE_MASS | {"contacts": contacts}), tmp_path / "one")
     assert [point.kind for point in points].count("fold") == 2

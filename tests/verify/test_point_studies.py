@@ -57,7 +57,7 @@ def swept(tmp_path_factory):
 def test_members_have_the_measures_of_single_runs(swept):
     """A member, simulated or scaled from the linear run, has the measures of a run of its case."""
     plan, folder, result = swept
-    # Both kinds of members occur.
+    # Some members were simulated and some were scaled.
     assert {COMPLETE, SCALED} == set(result.status.ravel().tolist())
     ensemble = open_ensemble(folder)
     of_points = {name for name in measures_of(["base", "tip"], [("base", "tip")]) if "base" in name or "tip" in name}

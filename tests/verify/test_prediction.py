@@ -81,6 +81,7 @@ def test_energy_is_whole_and_no_fraction_is_negative(prediction):
 
 
 def test_below_the_onset_the_run_is_linear(prediction):
+    """Below the onset the predicted energies of bands are those of the run, and nothing is dissipated."""
     data = prediction.data
     # The first amplitude is below the onset, all others above.
     assert data["amplitude"][0] < data.attrs["onset_amplitude"] < data["amplitude"][1]
@@ -101,6 +102,7 @@ def test_the_small_prediction_is_near_the_simulation(prediction):
 
 @pytest.mark.parametrize(("factor", "touches"), [(0.9999, False), (1.0001, True)])
 def test_the_first_contact_is_exact(prediction, factor, touches):
+    """A run has no contact at 0.9999 of the predicted onset amplitude, and contact at 1.0001 of it."""
     table = prediction.case.model_dump(by_alias=True, exclude_none=True)
     # The table of a run has no sections of other verbs.
     del table["law"]

@@ -88,6 +88,7 @@ def exact_linear(case: Case) -> np.ndarray:
     ],
 )
 def test_a_linear_run_is_the_modal_solution(ends, lattice, drive, time):
+    """A linear run is the superposition of modes under the drive's three sinusoids, to 1e-11."""
     table = {
         "lattice": {"cells": 50, "ends": ends} | lattice,
         "contacts": {"sites": []},
@@ -232,6 +233,7 @@ def test_the_builtin_run_takes_the_steps_it_needs():
 
 
 def test_tolerance_keeps_its_promise():
+    """The relative error of velocities is less than ten times the tolerance."""
     velocity = {}
     for rtol in (1e-6, 1e-8, 1e-12):
         run, _ = simulated(small_case(time={"rtol": rtol, "engine": "propagator"}))
@@ -398,6 +400,7 @@ def cases(draw) -> Case:
 @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 @given(cases())
 def test_both_engines_agree_on_random_lattices(case):
+    """Both engines agree on random lattices up to the fifth impact, or the propagator refuses them with a note."""
     theirs, _ = simulated(with_engine(case, "ts", rtol=1e-11))
     ours, result = simulated(with_engine(case, "propagator"))
 

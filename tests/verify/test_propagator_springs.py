@@ -50,6 +50,7 @@ def difference(case: Case) -> float:
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_both_engines_agree(ends):
+    """Both engines give the same motion with nonlinear springs in a few cells, which differs from the linear one."""
     case = sprung(lattice={"ends": ends})
     assert difference(case) < 1e-9
     assert (

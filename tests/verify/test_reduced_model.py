@@ -62,6 +62,7 @@ def test_bilinear_folds_and_stability(bilinear):
 
 
 def test_folds_do_not_depend_on_the_steps(bilinear):
+    """A branch with other steps has its folds at the same energies and frequencies."""
     again = follow(reduced_model(), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.1], largest_step=0.05, chart="relative")
 
     for fold, other in zip(bilinear.of_kind("fold-energy"), again.of_kind("fold-energy"), strict=True):

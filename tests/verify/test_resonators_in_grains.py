@@ -109,6 +109,7 @@ def test_a_struck_chain_is_that_of_an_independent_solver(engine, clearance, cell
 
 
 def test_both_engines_lose_the_same_in_the_same_impacts():
+    """Both engines have the same impacts of lossy grains, with the same losses."""
     lossy = {"clearance": 2e-6, "restitution": 0.8}
     first, second = (run_of(grains(engine, contacts=lossy)) for engine in ("ts", "propagator"))
     assert len(first["impacts/onset"]) == len(second["impacts/onset"]) >= 5
@@ -142,6 +143,7 @@ def test_on_stiff_springs_resonators_are_part_of_their_grains(engine):
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_light_resonators_do_not_matter(engine):
+    """Resonators with a millionth of the grains' mass change the motion by less than 1e-5."""
     plain = grains(engine, cell={"masses": [GRAIN], "springs": []}, time=FINE)
     expected = run_of(plain)["displacement"].values[:, :, 0]
     light = grains(engine, cell={"masses": [GRAIN, 1e-6 * GRAIN], "springs": [INSIDE | {"stiffness": 1e4}]}, time=FINE)

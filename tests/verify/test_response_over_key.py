@@ -85,7 +85,7 @@ def test_newtons_method_converges_quadratically():
         frame = states.frame(start)
         attempt = frame.correct(start.xi + 0.05 * start.tangent + 1e-2 * np.sin(np.arange(len(start.xi))), 0.05)
         assert attempt.converged
-        # The first residuals, in which quadratic terms are not yet the largest, are left out.
+        # Residuals above 0.1, in which terms of third order matter, are left out.
         first, second, third, *_ = (residual for residual in attempt.history if residual < 0.1)
         # The linear term is the error of the column by differences.
         assert second < 30 * first**2 + 1e-9 * first

@@ -115,6 +115,7 @@ def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, ground
 
 
 def test_without_dashpots_it_is_that_of_bloch_waves():
+    """Without dashpots the compliance by poles is that by Bloch waves, and real."""
     cell = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 0.5)), host=0, resonator=1)
     chain = Chain(cell, 9, "free", sites=(2, 6), clearances=(1.0, 1.0))
     omega = np.array([0.0, 0.31, 1.27, 2.9])
@@ -174,6 +175,7 @@ def test_errors_fall_as_harmonics_are_added(two_masses):
 
 
 def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
+    """Below contact a wall moved by U gives the first harmonic (K + i omega C - omega^2 M)^-1 k U."""
     states, points = two_masses
     quiet = [point for point in points if not point.measured.episodes]
     assert quiet

@@ -81,6 +81,7 @@ def test_its_first_harmonic_is_that_of_duffings_oscillator(duffing):
 
 
 def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(duffing):
+    """States of Duffing's oscillator return after a period by SciPy, and have its number of multipliers beyond 1."""
     _, states, points = duffing
     assert [point.kind for point in points].count("fold") == 2
     unstable = set()
@@ -131,6 +132,7 @@ def test_chains_come_back_after_a_period(count, spring, omega, amplitude):
 
 
 def test_a_stop_beside_a_nonlinear_spring():
+    """A state with a nonlinear spring and a stop returns after a period by SciPy."""
     options = {"over": "amplitude", "range": [0.3, 0.4], "fixed": [0.8], "harmonics": 41}
     case = NfrcCase.from_table(chain_of(2, {"cubic": 1.0}, **options) | {"contacts": STOP})
     states = SteadyStates(case, 1.0, 0.8)

@@ -58,6 +58,7 @@ def multipliers_at(states, point) -> np.ndarray:
     [(PAIR, "neimark-sacker", 2), (FLIP, "period-doubling", 2), (UNEVEN, "branch-point", 1)],
 )
 def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tmp_path, request):
+    """SciPy's period map at a special point has the multiplier of its kind: -1, 1, or a pair on the unit circle."""
     if changes is PAIR:
         states, points = request.getfixturevalue("with_pair")
     else:

@@ -135,6 +135,7 @@ def test_the_motion_of_identification_is_that_of_scipy(run, exact):
 
 
 def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
+    """The spring energy is the sum of k z^2/2 + q z^3/3 + c z^4/4, and the energy of the run is conserved."""
     u = run["displacement"].values.reshape(len(run["time"]), -1)
     energies = np.array([forces_and_energy(row)[1] for row in u])
     stiffness = changed().model().chain.stiffness_matrix()
@@ -147,6 +148,7 @@ def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
 
 
 def test_points_accelerate_by_the_springs_that_they_have(run):
+    """The acceleration of a point is the force of its springs over its mass."""
     u = run["displacement"].values.reshape(len(run["time"]), -1)
     forces = np.array([forces_and_energy(row)[0] for row in u])
     # The points are mass 2 of cell 6 and mass 1 of cell 12.
@@ -209,6 +211,7 @@ def test_what_is_linear_is_that_of_equal_cells():
 
 
 def test_the_system_of_normal_modes_has_the_springs():
+    """The forces and the energy of the system for normal modes are those of all springs."""
     nnm = {"system": "chain", "modes": [1], "energy": [0.0, 1.0]}
     table = {key: TABLE[key] for key in ("name", "lattice", "contacts")}
     system = System.from_case(NnmCase.from_table(table | {"nnm": nnm}))

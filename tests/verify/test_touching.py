@@ -131,6 +131,7 @@ def difference(run: xr.Dataset, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("side", ["plus", "minus"])
 @pytest.mark.parametrize("pair", [[1, 2], [0, 1]], ids=["masses", "ground"])
 def test_a_stop_without_clearance_is_that_of_an_independent_solver(engine, law, side, pair):
+    """A lattice with a stop that touches at rest moves as by SciPy, for both laws and sides, and against the ground."""
     run = run_complete(sprung_case(engine, **law, side=side, pair=pair))
     # Mass 0 is the ground.
     host, resonator = (2 * (SITE - 1) + mass - 1 if mass else -1 for mass in pair)
@@ -142,6 +143,7 @@ def test_a_stop_without_clearance_is_that_of_an_independent_solver(engine, law, 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_touching_beads_of_two_masses_are_those_of_an_independent_solver(engine):
+    """Beads of two masses that touch at rest, within and between them, move as by SciPy."""
     case = bead_case(engine)
     run = run_complete(case)
     n = 2 * case.lattice.cells

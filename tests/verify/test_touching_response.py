@@ -75,6 +75,7 @@ def test_below_twice_its_resonance_a_motion_of_twice_the_period_grows():
 
 
 def test_it_is_proportional_to_the_drive(tmp_path):
+    """Forces of a bilinear stop that touches at rest scale with the motion: states are proportional to the drive."""
     _, points = followed(touching(over="amplitude", range=[0.1, 5.0], fixed=[1.5], largest_step=1.0), tmp_path / "two")
     first, last = (point.measured for point in (points[0], points[-1]))
     np.testing.assert_allclose(last.harmonics, 50 * first.harmonics, atol=1e-8)

@@ -159,6 +159,7 @@ def test_agrees_with_an_independent_integration(lattice, contacts, drive, end):
 
 @pytest.mark.slow
 def test_diatomic_agrees_with_an_independent_integration():
+    """Velocities and the number of impacts of a diatomic lattice are those of SciPy's integrator."""
     table = {
         "lattice": {"preset": "diatomic", "cells": 30},
         "contacts": {"sites": [8, 15], "clearance": 4e-5},
@@ -319,6 +320,7 @@ def mirrored_table() -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_a_mirrored_lattice_gives_the_mirrored_answer():
+    """A lattice with left and right exchanged, its drive and sites included, moves as the mirror image."""
     straight = run_of(Case.from_table(mirror_table()))
     mirrored = run_of(Case.from_table(mirrored_table()))
 

@@ -67,6 +67,7 @@ def test_the_ends_of_a_ring_do_not_join_an_infinite_lattice():
 
 
 def test_the_relative_motions_of_a_wave_are_differences_of_its_field():
+    """A wave's relative motion at a contact is the difference of its field at the two masses, and 1 at the first."""
     chain = Chain(CELL, 1000, "fixed", SITES, (1e-4,) * 4, pairs=PAIRS)
     wave = WaveCompliance(chain, infinite=True).incident(1000.0, 1, -1)
     field = wave.field(range(chain.cells)).ravel()
