@@ -45,6 +45,7 @@ WRITERS = {
 @pytest.mark.parametrize("limit", [0, 1000])
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_leaves_the_earlier_file_and_names_it(tmp_path, name, limit):
+    """A write that finds no space raises OSError with the file's name; the earlier file stays, and no temporary one."""
     path = tmp_path / name
     path.write_text("earlier")
 
@@ -81,6 +82,7 @@ def test_only_temporary_files_of_processes_that_have_ended_are_removed(tmp_path,
 
 
 def test_temporary_names_are_not_those_of_another_host_process_or_call(tmp_path, monkeypatch):
+    """Temporary names differ between hosts, processes and calls."""
     names = set()
     # Folders are shared between hosts; a thread of the same process may write the same file at once.
     for host, process in (("one", 7), ("two", 7), ("two", 8), ("two", 8)):
@@ -109,6 +111,7 @@ def open_and_close_run(path: Path) -> None:
     ],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path, name, read, content):
+    """An empty file, one of another kind and a missing one raise OSError with the file's name."""
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
@@ -118,6 +121,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, name, read, content):
 
 @pytest.mark.parametrize(("name", "read"), [("a.npy", load_arrays), ("a.h5", lambda path: open_netcdf(path, "run"))])
 def test_a_file_cut_in_the_middle_is_named(tmp_path, name, read):
+    """A file of which the second half is missing raises OSError with its name."""
     path = tmp_path / name
     WRITERS[name](path)
     whole = path.read_bytes()

@@ -54,6 +54,7 @@ def share() -> Figure:
 
 @pytest.mark.parametrize("make", [prediction, law, parts, share])
 def test_bands_have_their_colours_by_name(make):
+    """Curves with the name of a band have the band's colour in every picture."""
     with style.rc_style():
         figure = make()
     lines = [line for axes in figure.get_axes() for line in axes.lines if line.get_label().startswith("band ")]
@@ -99,6 +100,7 @@ def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
 
 
 def test_the_amplitude_of_first_contact_is_apart_from_the_frame():
+    """The axis of amplitudes extends beyond its values, so that a line at the first of them is not on the frame."""
     with style.rc_style():
         low, high = prediction().get_axes()[0].get_xlim()
     assert low < 0.99 * X[0]

@@ -75,6 +75,7 @@ def test_a_value_outside_the_bracket_gives_a_better_estimate():
 
 
 def test_a_value_outside_that_is_no_number_is_not_used():
+    """A NaN outside the bracket does not change the result."""
     assert abs(bracketed_root(smooth, 0.0, 1.0, TOLERANCE, {-1.0: math.nan}) - ROOT) <= TOLERANCE
 
 

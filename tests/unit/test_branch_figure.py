@@ -113,6 +113,7 @@ def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
 
 
 def test_a_branch_file_names_its_kind():
+    """The kind of a branch is the one that its file states; an unknown kind is one of a later version."""
     for kind in branch_kinds.BRANCH_KINDS:
         # The stated kind decides, although the variable ``share`` would stand for responses.
         branch = branch_of(share=[1.0]).assign_attrs(branch_kind=kind)
@@ -148,6 +149,7 @@ def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
     ],
 )
 def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
+    """The label of the parameter's axis names the amplitude of a wave or a force, or the frequency, with its unit."""
     case = NfrcCase.from_table({"lattice": {"preset": "four-band"}, "contacts": {"sites": 1}, "nfrc": options})
     branch = xr.Dataset(attrs={"over": case.nfrc.over, "case": case.to_toml()})
     assert nfrc.parameter_label(branch) == label

@@ -255,6 +255,7 @@ def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
 
 @pytest.mark.slow
 def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
+    """A branch stopped after its first point and resumed has the energies of a branch that was not stopped."""
     stop = StopRequest()
     # The stop is requested before the branch begins: the first point is kept, and no other one follows.
     stop.requested = True
@@ -280,6 +281,7 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
 
 
 def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
+    """At 2200 rad/s, in the gap but without a breather, the error names the key to change."""
     with pytest.raises(ContinuationError, match=r"no breather starts at 2200 rad/s: .*change nnm.start_frequency"):
         condensed_breather(300, 100, 2200.0)
 
@@ -308,6 +310,7 @@ def test_bad_values_of_a_condensed_case_are_refused(change, key):
     ],
 )
 def test_start_sites_of_a_shot_lattice_are_there_and_begin_breathers(nnm, message):
+    """Start sites must exist and need a start frequency."""
     lattice = {"preset": "four-band", "cells": 14}
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table({"lattice": lattice, "contacts": {"sites": [6]}, "nnm": {"system": "chain"} | nnm})

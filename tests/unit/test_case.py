@@ -86,6 +86,7 @@ def test_every_case_file_is_sound_and_survives_a_round_trip(path):
 
 
 def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
+    """A case keeps its model; changed copies and pickled cases have none."""
     case = Case.load()
     model = case.model()
     assert case.model() is model
@@ -138,10 +139,12 @@ def test_tolerances_scale_with_the_drive():
 
 
 def test_tolerances_of_the_paper_are_a_billionth_of_its_amplitude():
+    """``time.atol = "paper"`` is 1e-9 times 24.33, the number of the paper's force."""
     assert Case.load(overrides=["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
 
 
 def test_unknown_keys_name_the_nearest():
+    """An unknown key is refused with the nearest valid key."""
     found = problems({"lattice": {"cels": 3}, "contcts": {}, "drive": {"amplitud": 1.0}})
     assert "did you mean lattice.cells?" in found["lattice.cels"]
     assert "did you mean contacts?" in found["contcts"]
@@ -155,6 +158,7 @@ def test_a_misspelt_choice_and_an_unknown_section_name_the_nearest():
 
 
 def test_a_value_of_no_type_of_its_key_is_refused_with_all_types():
+    """A value of a wrong type is refused with all types that its key may have."""
     assert "must be a number or 'traverse'" in problems({}, "time.end='foo'")["time.end"]
     scaled = problems({}, "time.atol='scale'")["time.atol"]
     assert "must be a number or 'scaled' or 'paper'; did you mean 'scaled'?" in scaled
@@ -182,6 +186,7 @@ def test_a_check_that_rests_on_an_invalid_key_is_left_out():
 
 
 def test_samples_are_counted_and_held_against_the_bands():
+    """A number of samples that resolves the bands is taken; one that does not is refused."""
     assert "too coarse" in problems({"time": {"samples": 20}})["time.samples"]
     assert Case.from_table({"time": {"samples": 5000}}).model().samples == 5000
 
@@ -192,6 +197,7 @@ def test_automatic_sample_intervals_are_round():
 
 
 def test_the_identity_of_a_case_stays_what_folders_on_disk_bear():
+    """The hash of a case does not change between versions, and differs between cases."""
     # With another identity the program would not recognise finished runs in users' folders and would run them again.
     assert case_id(Case.from_table(PLAIN)) == "7b0b028bc7785b85"
     assert case_id(Case.from_table(PLAIN, ["drive.amplitude=2.0"])) != case_id(Case.from_table(PLAIN))
@@ -203,6 +209,7 @@ def test_a_result_names_its_case():
 
 
 def test_the_design_searches_eta_below_one():
+    """The default grid of eta ends below 1, where the host would have no mass."""
     eta = DesignCase.load().design.eta.values()
     assert len(eta) == 36
     assert eta.max() == 0.975
@@ -239,6 +246,7 @@ def test_the_design_searches_eta_below_one():
     ],
 )
 def test_impossible_values_name_their_key(override, key):
+    """An impossible value is refused with its key alone."""
     found = problems({"lattice": {"preset": "four-band"}}, override)
     assert key in found
     # Without a wavenumber the drive has no frequency either.
@@ -246,6 +254,7 @@ def test_impossible_values_name_their_key(override, key):
 
 
 def test_values_that_contradict_each_other_are_named():
+    """Values that contradict each other are refused with one of their keys."""
     assert "shorter than one sample" in problems({"time": {"end": 1e-5, "sample_interval": 1e-4}})["time.end"]
     assert "give one of" in problems({"drive": {"frequency": 900.0, "band": 2}})["drive.band"]
     with pytest.raises(CaseError, match=r"must be above design\.eta\.first = 0\.1"):
@@ -273,6 +282,7 @@ def test_a_frequency_in_a_gap_is_a_warning_only():
 
 
 def test_errors_travel_between_ranks():
+    """A CaseError is the same after pickling."""
     with pytest.raises(CaseError) as caught:
         Case.load(overrides=["lattice.cels=3"])
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)

@@ -87,6 +87,7 @@ def test_a_rise_is_measured_between_neighbouring_amplitudes(steps, ratio):
 
 
 def test_a_growth_ends_at_the_first_value_that_is_high_enough():
+    """The growth is the ratio of the first amplitude at 0.5 or more to the last one before it at 0.1 or less."""
     curve = contactless_curve([1.0, 2.0, 4.0, 8.0, 16.0], [0.3, 0.01, 0.6, 0.8, 1.0])
     assert curve.growth_ratio(0.1, 0.5) == 2.0
 
@@ -168,6 +169,7 @@ CRITERIA = [(claim, criterion) for claim, spec in CLAIMS.items() for criterion i
 
 
 def test_thresholds_are_those_specified():
+    """Quantities, comparisons and thresholds of all claims are those of SPEC.md, each with its source."""
     expected = set()
     for line in SPECIFIED.strip().splitlines():
         claim, quantity, comparison, bounds = line.split(" | ")
@@ -185,6 +187,7 @@ def test_thresholds_are_those_specified():
 
 
 def test_constants_inside_of_quantities_are_those_specified():
+    """Constants within the definitions of quantities are those of SPEC.md."""
     assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE) == (0.95, 0.9)
     assert (FEWEST, constants.SEVERAL) == (4, 3)
     assert (constants.QUIET, constants.PEAK, constants.HIGH) == (0.1, (0.9, 1.8), 10.0)

@@ -148,6 +148,7 @@ def test_bands_add_up_only_where_the_split_is_right(tmp_path, velocity, change, 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_runs_of_one_law_that_do_not_add_up_are_enough(tmp_path, law):
+    """Claim C13 fails if the energies of one contact law do not add up."""
     put_bands(tmp_path, in_two_bands, overlapping, laws=[law])
     assert measure("C13", tmp_path).verdict == FAILS
 

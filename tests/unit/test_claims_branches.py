@@ -58,6 +58,7 @@ def put_branch(
 
 
 def test_branches_with_folds_and_limits_hold(tmp_path):
+    """Claim C15 holds for branches that meet all its criteria, and is unmeasured in a reading without files."""
     for law in ("hertz", "bilinear"):
         put_branch(tmp_path, law)
     found = measure("C15", tmp_path, "printed")
@@ -107,6 +108,7 @@ def test_the_in_phase_branch_is_held_against_what_it_should_pass(tmp_path):
 
 
 def test_a_hertz_branch_without_fold_holds_in_part_and_is_named(tmp_path):
+    """Claim C15 holds in part, with both reasons, if Hertz's branch has no fold and the bilinear limit is 10 % off."""
     put_branch(tmp_path, "bilinear", limit=0.9)
     put_branch(tmp_path, "hertz", folds=0, multiplier=1.0)
     found = measure("C15", tmp_path, "printed")

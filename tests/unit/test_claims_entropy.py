@@ -102,6 +102,7 @@ def decaying(finished_sweeps, tmp_path):
 
 @pytest.mark.slow
 def test_entropies_that_decay_as_powers_hold_everywhere(decaying):
+    """Claims C7 to C9 hold for entropies that jump at the first contact and decay as a power, with growing errors."""
     rows = {claim: measure(claim, decaying) for claim in ("C7", "C8", "C9")}
     for found in rows.values():
         assert found.verdict == HOLDS, found
@@ -117,6 +118,8 @@ def test_entropies_that_decay_as_powers_hold_everywhere(decaying):
 
 @pytest.mark.slow
 def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
+    """Claim C7 holds in part if half of the configurations have no power law, and C9 fails with constant errors."""
+
     def ragged(case: Case) -> float:
         amplitude = case.drive.amplitude
         if amplitude < ONSET or len(case.contacts.sites) < 5:
@@ -136,6 +139,7 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
 
 @pytest.mark.slow
 def test_entropies_that_only_rise_do_not_decay(tmp_path):
+    """Claims C8 and C9 are not met by entropies that grow with the amplitude; reasons name what is missing."""
     put_entropies(
         tmp_path,
         entropy=lambda case: 1 + 0.1 * case.drive.amplitude,

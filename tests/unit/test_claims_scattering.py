@@ -101,6 +101,7 @@ def put_scattering(
 
 @pytest.mark.slow
 def test_scattering_as_the_paper_has_it_holds(tmp_path):
+    """Claims C1 to C6 hold for fractions of the energy as in the paper, with the prescribed values."""
     put_scattering(tmp_path)
     claims = {name: measure(name, tmp_path) for name in ("C1", "C2", "C3", "C4", "C5", "C6")}
     for found in claims.values():
@@ -122,6 +123,7 @@ def test_partitions_that_miss_more_than_one_per_cent_do_not_reconstruct(tmp_path
 
 @pytest.mark.slow
 def test_a_linear_medium_run_scatters_nothing(tmp_path):
+    """Claims C3 and C4 fail if the medium run has no contact."""
     put_scattering(tmp_path, new=(0.0, 0.0, 0.1), reflected=(0.0, 0.0, 0.2))
     scattered = measure("C3", tmp_path)
     assert scattered.verdict == FAILS
@@ -131,6 +133,7 @@ def test_a_linear_medium_run_scatters_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_scattering_off_the_branches_holds_in_part(tmp_path):
+    """Claim C3 holds in part if 30 % of the medium run's spectrum is off the Bloch branches."""
     put_scattering(tmp_path, new=(0.0, 0.5, 0.6), off_branches=0.3)
     found = measure("C3", tmp_path)
     assert found.verdict == IN_PART
@@ -141,6 +144,7 @@ def test_scattering_off_the_branches_holds_in_part(tmp_path):
 
 @pytest.mark.slow
 def test_a_low_run_with_contacts_is_not_linear(tmp_path):
+    """Claim C2 fails, and C1 is unmeasured, if the run of low amplitude has contacts."""
     put_scattering(tmp_path, new=(0.2, 0.5, 0.1))
     assert measure("C2", tmp_path).verdict == FAILS
     assert measure("C1", tmp_path).verdict == UNMEASURED

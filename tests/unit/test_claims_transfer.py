@@ -75,6 +75,7 @@ def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
 
 @pytest.mark.slow
 def test_transfer_as_the_paper_has_it_holds(tmp_path):
+    """Claims C11 and C14 hold for a transfer as in the paper; the floor without the record's ends is a fiftieth."""
     put_transfer(tmp_path)
 
     onset = measure("C11", tmp_path)

@@ -215,6 +215,7 @@ def test_kernels_that_were_used_longest_ago_make_room(tmp_path, monkeypatch):
 
 
 def test_tables_of_numbers_come_with_the_package():
+    """All tables and examples of the package are among the files that its installation copies."""
     project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())
     declared = project["tool"]["setuptools"]["package-data"]
     shipped = {path for package in ("vipetsc", "vipetsc.modes.shooting") for pattern in declared[package]
@@ -236,6 +237,7 @@ assert not {"numba", "petsc4py", "mpi4py"} & sys.modules.keys()
 
 
 def test_every_kernel_is_kept_so():
+    """No module but ``compiled`` uses numba's own decorators, whose cache does not follow called kernels."""
     for path in ROOT.rglob("*.py"):
         if path.name == "compiled.py":
             continue

@@ -211,6 +211,7 @@ def test_short_arcs_are_not_missed():
 
 
 def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
+    """An arc of cos above its value at the first sample ends with the period, 2 pi, and has the length 0.6."""
     theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
     motion = np.stack([np.cos(theta), -np.sin(theta), -np.cos(theta)], axis=1)
     ((start, end),) = arcs(motion, motion[0, 0])
@@ -219,6 +220,7 @@ def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
 
 
 def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_refused_else():
+    """A contact closed all the time has the force k (w - D); with losses it is refused."""
     z = np.array([[3.0, 1.0]], complex)
     series = SiteForces([Stops.both(CONSERVATIVE[0], 1.0)]).series(z, OMEGA)
     assert series.forces[0] == pytest.approx([6.0, 3.0, 0.0], abs=1e-13)
@@ -326,6 +328,7 @@ def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(mo
 
 
 def test_harmonics_with_which_newtons_method_fails_are_told_with_its_reason(monkeypatch):
+    """If Newton's method fails, the error has its reason and the keys to change."""
     gap = gap_motions()
     solve = HarmonicFrame.solve
 

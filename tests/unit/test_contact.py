@@ -219,6 +219,7 @@ def landing_at(length: float) -> search.Landing:
 
 
 def test_a_landing_on_a_root_converges():
+    """Newton's method on exp(s) - 2 lands on log 2."""
     attempt = landing_at(0.4)
     # Newton's method on exp(s) - 2 from 0.4 takes five steps.
     for _ in range(8):
@@ -349,6 +350,7 @@ def test_the_contact_time_is_that_of_an_integrated_impact(law):
 
 @pytest.mark.slow
 def test_the_log_takes_any_number_of_episodes():
+    """The log has all of 18 episodes in their order, with onset, separation and site."""
     tracker = ImpactTracker(create_contacts(Contact("hertz", STIFFNESS), [CLEARANCE] * 2, MASS), (7, 3))
     for k in range(9):
         tracker.start[:] = CLEARANCE, 0.1, 0.0
@@ -362,6 +364,7 @@ def test_the_log_takes_any_number_of_episodes():
 
 
 def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
+    """A site beyond its clearance is closed, whatever the sign of w', and does not count as grazing."""
     tracker = ImpactTracker(create_contacts(Contact("hertz", STIFFNESS), [CLEARANCE], MASS), (0,))
     tracker.start[0] = 1.01 * CLEARANCE, -0.1, 0.0
     assert tracker.switch(0.0, np.zeros(1)) == 1

@@ -53,6 +53,7 @@ def test_the_exact_damping_returns_what_is_asked(law, asked):
 
 
 def test_the_exact_damping_meets_every_restitution():
+    """The exact damping has the effective restitution asked for, from 0.05 to 1."""
     asked = np.linspace(0.05, 1, 200)
     found = [Contact("hertz", STIFFNESS, restitution, factor="exact").effective_restitution for restitution in asked]
     assert found == pytest.approx(asked, abs=1e-7)
@@ -60,6 +61,7 @@ def test_the_exact_damping_meets_every_restitution():
 
 @pytest.mark.parametrize(("factor", "asked"), [("flores", 0.05), ("flores", 0.052), ("flores", 0.06)])
 def test_the_strongest_damping_parts_the_masses_where_its_force_vanishes(factor, asked):
+    """With Flores's damping and a small restitution the effective one is close to 1/c, where g = 0."""
     contact = Contact("hertz", STIFFNESS, asked, factor=factor)
     c = 1.6 * (1 - asked) / asked
     # With 1 - c e = exp(-q) the equation for the effective restitution e has the root q = c + 1 - log(1 + c), up to
@@ -69,6 +71,7 @@ def test_the_strongest_damping_parts_the_masses_where_its_force_vanishes(factor,
 
 
 def test_the_manual_has_a_table_of_effective_restitutions():
+    """The manual's table has the effective restitutions of the paper's damping, rounded to three digits."""
     lines = (Path(vipetsc.__file__).parent / "manual/case-file.md").read_text(encoding="utf-8").splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("| restitution"))
 

@@ -18,6 +18,7 @@ A = Departure(middle=0.03, length=0.1)
     ],
 )
 def test_symmetries_keep_the_length_and_move_by_half_a_period(image):
+    """A departure's image by half a period, by reversal of time, by both or by a period is in its family."""
     assert families([A, image]) == {2: 1}
 
 

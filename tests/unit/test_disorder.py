@@ -73,6 +73,7 @@ def test_different_quantities_are_drawn_independently():
 
 
 def test_a_deviation_of_zero_leaves_the_case_as_it_is_without_the_section():
+    """Deviations of zero give the text of the nominal case."""
     quantities = ("clearance", "masses", "springs", "restitution", "stiffness")
     zero = {name: {"relative": 0.0} for name in quantities}
     assert draw(**zero, sites={"absolute": 0.0}).to_toml() == draw().to_toml()
@@ -103,6 +104,7 @@ def test_the_resolved_case_holds_what_was_drawn():
 
 
 def test_sites_move_by_whole_cells():
+    """Drawn sites are whole cells near the nominal ones."""
     case = draw({"sites": [10, 30], "clearance": CLEARANCE}, seed=2, sites={"absolute": 2.0})
     assert case.contacts.sites != [10, 30]
     # The bound is three deviations.
@@ -137,6 +139,7 @@ def test_samples_of_contacts_alone_have_one_linear_run():
     ],
 )  # fmt: skip
 def test_what_cannot_be_drawn_is_refused(disorder, message):
+    """A wrong section [disorder], or an impossible drawn number, is refused with one problem."""
     with pytest.raises(CaseError) as error:
         Case.from_table(BASE | {"contacts": TEN_SITES, "disorder": disorder})
     assert message in str(error.value)
@@ -249,6 +252,7 @@ def test_a_count_of_seeds_is_an_axis_of_samples():
 
 
 def test_the_disorder_of_a_sweep_is_that_of_its_first_seed():
+    """``disorder_of`` of a sweep yields the disorder with the first seed, the nominal case and the drawn one."""
     disorder, nominal, drawn = disorder_of(None, ["disorder.clearance.relative=0.02", "sweep.disorder.seed=[7, 1]"])
     assert disorder.seed == 7
     assert nominal.contacts.clearance != drawn.contacts.clearance

@@ -40,6 +40,7 @@ def test_wavenumbers_in_pi():
 
 
 def test_a_drive_in_a_gap_has_no_wave():
+    """The wave of a drive in a gap has the band 0; one in a band has band and wavenumber."""
     in_gap = {"lattice": {"preset": "diatomic", "cells": 20}, "drive": {"frequency": 600.0}, "time": {"end": 0.1}}
     assert DrivenWave.of(Case.from_table(in_gap)).band == 0
 

@@ -62,6 +62,7 @@ def pretend_packages(monkeypatch, packages: set[str]) -> None:
     ],
 )
 def test_the_first_direct_solver_that_petsc_has_is_taken(monkeypatch, ranks, packages, solver):
+    """The direct solver is the first of a list, for one rank or several, that PETSc was built with."""
     pretend_packages(monkeypatch, packages)
     transformation = RecordingTransformation(ranks)
     eigen._solve_directly(transformation)
@@ -133,6 +134,7 @@ def record_searches(monkeypatch) -> list[int]:
 
 
 def test_further_copies_are_sought_one_at_a_time_until_none_is_nearer(monkeypatch):
+    """Copies of the modes found are searched for one at a time until a search finds none that is nearer."""
     wanted = record_searches(monkeypatch)
     matrices = matrices_of("periodic")
     modes_near(matrices, 3, 0.0)

@@ -62,6 +62,7 @@ def folder(tmp_path):
 
 
 def test_warnings_that_differ_in_numbers_alone_are_one():
+    """Warnings that differ in numbers alone are merged, with the number of members that have them."""
     warnings = ["deep: 0.0052 m", "deep: 5.3e-03 m", "lost 2 of 5", "deep: 0.0052 m", "lost 2 of 5", "alone"]
     assert summarise(warnings) == [
         "3 members, for instance: deep: 5.3e-03 m",
@@ -219,6 +220,7 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
 
 
 def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
+    """The linear run of a case is found by the case, and another case has none."""
     case = Case.load()
     run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
     RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(case)))
@@ -273,6 +275,7 @@ def scaled_record(name: str, site: int, work: float, warnings: list[str]) -> dic
 
 
 def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tmp_path):
+    """A member without contact has the measures of the linear run from its first site on."""
     # Members with equal values are one.
     sweep = Sweep.from_table(SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0, 1.0]}}})
     one, two = sweep.ids()[:2]

@@ -103,6 +103,7 @@ def test_fewer_cells_have_the_entropy_that_they_have_among_all(stride):
 
 @pytest.mark.parametrize("stride", [2, 3])
 def test_long_waves_keep_their_weight_at_fewer_cells(stride):
+    """A wave of 63 cells has the same weight at every second or third cell as at all."""
     signal = packet(300.0, kappa=0.1)[None]
     _, whole_weight = local_entropy(signal)
     _, weight = local_entropy(signal, stride)
@@ -134,6 +135,7 @@ def test_one_long_transform_gives_the_same_packet():
 @settings(max_examples=15)
 @given(st.integers(0, 99), st.integers(-200, 200))
 def test_a_power_of_two_leaves_the_bits_of_the_entropy(seed, power):
+    """A factor 2^n changes no bit of the entropy, and the weight by 2^(2n)."""
     signal = noise((3, 40), seed)
     plain = entropy(signal)
     scaled = entropy(np.ldexp(signal, power))
@@ -154,6 +156,7 @@ def test_the_entropy_does_not_depend_on_the_amplitude(seed, factor):
 
 
 def test_the_entropy_moves_with_the_field():
+    """The local entropy of a shifted packet is shifted with it."""
     local, weight = local_entropy(packet(250.0)[None])
     moved_local, moved_weight = local_entropy(packet(310.0)[None])
     # The packet has moved by sixty cells.
@@ -162,6 +165,7 @@ def test_the_entropy_moves_with_the_field():
 
 
 def test_snapshots_do_not_see_each_other():
+    """The local entropy of a snapshot has the same bits with and without earlier snapshots."""
     signal = scattering_run()
     local, weight = local_entropy(signal)
     # Snapshots are transformed in chunks: the first one has various places in a chunk here.
@@ -201,12 +205,14 @@ def test_averages_are_those_of_their_definitions():
 
 
 def test_the_mask_leaves_out_where_the_run_grows_quiet():
+    """Snapshots with 1e-4 of the weight do not change the masked average."""
     signal = scattering_run()
     signal[8:] *= 0.01
     assert entropy(signal).masked == pytest.approx(entropy(signal[:8]).masked)
 
 
 def test_scattering_raises_every_average():
+    """Two packets of different wavenumbers have a larger entropy than one, in every average."""
     before = entropy(packet(200.0)[None])
     after = entropy((packet(200.0) + packet(220.0, kappa=1.1))[None])
     for name in AVERAGES:

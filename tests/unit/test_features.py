@@ -88,6 +88,7 @@ def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> se
 @pytest.mark.parametrize("feature", sorted(FEATURES))
 @pytest.mark.parametrize("kind", DRIVEN, ids=lambda kind: kind.verb)
 def test_a_feature_is_refused_by_verbs_that_give_a_reason(kind, feature):
+    """A verb refuses a feature under its key if and only if its class gives a reason."""
     changes, key = CHANGES[feature]
     assert (key in refused_keys(kind, changes)) == (feature in kind.refuses)
 

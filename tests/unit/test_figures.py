@@ -186,6 +186,7 @@ def assert_not_blank(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", figure_names("run"))
 def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypatch):
+    """Every figure is drawn from every shape of run, whole and not blank, unless a reason is known."""
     folder, shape = measured
     # A lower resolution changes no layout: text that is cut off in a fine picture is cut off in a coarse one.
     monkeypatch.setattr(style, "SCREEN", 100)
@@ -201,6 +202,7 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypat
 
 
 def test_what_cannot_be_drawn_is_said(measured):
+    """Figures that cannot be drawn have their reasons, and others have none."""
     folder, shape = measured
     # The reasons are exactly these: a further one would keep a picture from being drawn.
     assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
@@ -219,6 +221,7 @@ def test_all_of_a_picture_can_be_read(tmp_path):
 
 
 def test_the_analysis_names_what_it_left_out(measured):
+    """The analysis has the measures that the record allows, and names those left out."""
     folder, shape = measured
     with h5py.File(folder / "analysis.h5") as file:
         assert ("dispersion" in file) == (shape not in ("single cell", "no velocity"))
@@ -230,6 +233,7 @@ def test_the_analysis_names_what_it_left_out(measured):
 
 @pytest.mark.slow
 def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
+    """xarray reads the analysis with dimensions and units; energies are those of the run; parts sum to the total."""
     xarray = pytest.importorskip("xarray")
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)

@@ -65,6 +65,7 @@ def test_a_new_folder_gets_its_marker(tmp_path, kind):
 
 
 def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
+    """``--force`` replaces neither a file nor a folder of another kind or without a marker."""
     (tmp_path / "file").touch()
     assert_refused("is a file", tmp_path / "file", RUN, OLD, force=True)
     assert_refused("of this kind", tmp_path, RUN, OLD, force=True)
@@ -80,6 +81,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
 
 
 def test_the_same_case_is_resumed_and_nothing_is_touched(run):
+    """A claim with the case of the folder goes on with its results and does not write its case file again."""
     # The time of the last change would differ if the file were written again with the same bytes.
     before = (run / "case.toml").stat()
     for resume in (False, True):
@@ -103,6 +105,7 @@ def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
 
 
 def test_the_caller_decides_which_cases_differ(tmp_path):
+    """A function of the caller says in which way an earlier case differs; if in none, the new text is written."""
     folder = tmp_path / "nnm"
     with claim(folder, BRANCHES, OLD):
         pass

@@ -29,10 +29,12 @@ def test_a_pair_that_stays_complex_crosses_none():
 
 
 def test_a_pair_that_collides_within_the_step_may_cross():
+    """A pair that is complex at one point and real at the next may cross a level."""
     assert real_half_traces(point(0.9 - 0.1j, 0.9 + 0.1j), point(0.95, 1.1)) == [0, 1]
 
 
 def test_a_half_trace_is_measured_from_its_level_by_its_real_part():
+    """The distance of a half-trace from a level is that of its real part."""
     assert HalfTraceAbove(1, -1.0)(point(0.3, -0.75 + 0.1j)) == pytest.approx(0.25)
 
 

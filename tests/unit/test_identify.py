@@ -118,6 +118,7 @@ def test_unknowns_are_checked(tmp_path, unknown, key, part):
 
 
 def test_contacts_are_not_sought_in_silence_nor_where_they_touch(tmp_path):
+    """Contact parameters are refused for records without contact and for contacts that touch at rest."""
     record = record_in(written(tmp_path))
     problems = problems_of(record | {"contact": False})
     assert "says nothing about its contacts" in problems["identify.unknowns[1].quantity"]
@@ -252,6 +253,7 @@ def test_sites_without_a_stop_on_the_side_minus_keep_their_numbers(tmp_path):
 
 
 def test_coordinates_and_values_are_inverse(tmp_path):
+    """A parameter's value and coordinate are inverse maps, whose derivative agrees with central differences."""
     plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
     for parameter in plan.parameters:
         z = parameter.to_coordinate(parameter.start)

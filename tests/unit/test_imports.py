@@ -101,6 +101,7 @@ def run_python(code: str) -> str:
 
 
 def test_every_part_has_its_floor():
+    """The parts of the package are those in FLOORS."""
     assert {part(module) for module in MODULES} == set(FLOORS)
 
 
@@ -157,6 +158,7 @@ def test_sources_name_neither_petsc_nor_mpi(name):
 
 @pytest.mark.slow
 def test_importing_them_loads_neither_petsc_nor_mpi():
+    """Importing all modules of the serial parts loads no PETSc, SLEPc or MPI."""
     modules = [f"vipetsc.{module}" for module in MODULES if part(module) in SERIAL]
     assert len(modules) > 15
     code = f"import sys, importlib\nfor m in {modules!r}: importlib.import_module(m)\n"
@@ -165,6 +167,7 @@ def test_importing_them_loads_neither_petsc_nor_mpi():
 
 
 def test_figures_wait_with_matplotlib():
+    """Importing ``vipetsc.figures`` does not load matplotlib."""
     assert run_python("import sys, vipetsc.figures; print('matplotlib' in sys.modules)") == "False"
 
 

@@ -88,6 +88,7 @@ def test_cells_that_differ_from_the_reference_are_marked():
 
 
 def test_a_chain_is_damped_by_a_dashpot_anywhere():
+    """A chain with one dashpot to the ground is damped; one with dashpots of zero is not."""
     grounding = np.zeros((CELLS, 4))
     grounding[3, 1] = 0.1
     assert Chain(four_band(), CELLS, variation=Variation(grounding=grounding)).is_damped
@@ -103,6 +104,7 @@ def test_variations_are_equal_by_what_they_hold():
 
 
 def test_a_variation_is_read_only_and_of_all_cells():
+    """The arrays of a variation cannot be written and must have the number of cells of the chain."""
     chain = scattered_chain()
     with pytest.raises(ValueError, match="read-only"):
         chain.variation.masses[0, 0] = 1.0

@@ -85,6 +85,7 @@ def test_modes_of_a_long_chain_are_those_in_closed_form(ends, number):
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_a_case_may_name_the_mode_near_a_frequency(ends):
+    """``near`` selects the mode whose frequency is nearest, also among 20,000."""
     spring = {"start": 1, "end": 1, "stiffness": STIFFNESS, "next_cell": True}
     case = case_with(
         lattice={"cell": {"masses": [MASS], "springs": [spring]}, "cells": LONG, "ends": ends},
@@ -143,6 +144,7 @@ def test_without_a_drive_the_frequency_and_the_cell_are_those_of_the_motion():
 
 
 def test_a_drive_acts_in_addition_to_the_motion():
+    """A case may have a drive and an initial motion, and its scale is larger than without the drive."""
     driven = case_with(initial=PACKET, drive={"amplitude": 5.0})
     assert (driven.drive.amplitude, driven.drive.cell) == (5.0, 1)
     assert driven.model().scale > case_with(initial=PACKET).model().scale
@@ -196,6 +198,7 @@ def test_tolerances_of_the_paper_are_for_its_drive():
 
 
 def test_a_rigid_motion_is_no_mode_to_begin_with():
+    """The mode 1 of a free lattice, with the frequency 0, is refused as an initial motion."""
     with pytest.raises(CaseError, match="frequency of this mode is 0"):
         case_with(lattice=FOUR_BAND | {"ends": "free"}, initial={"kind": "mode", "number": 1, "amplitude": 1e-3})
 
@@ -214,6 +217,7 @@ def test_scattering_laws_begin_at_rest():
     ],
 )
 def test_searches_say_what_a_free_motion_does_not_have(initial, search, sentence):
+    """Searches with an initial motion refuse a matched start, bands of struck masses, and energy above the top band."""
     contacts = {"sites": [6], "clearance": 1e-3}
     search = {"variables": {"clearance": [1e-4, 1e-2]}} | search
     table = TABLE | {"initial": initial, "contacts": contacts, "time": {"end": 0.1}, "optimise": search}

@@ -44,12 +44,14 @@ def problem_of(kind: type, **sections: dict[str, Any]) -> tuple[str, str]:
 
 
 def test_springs_within_cells_join_none():
+    """A cell joins its neighbours only by a spring to the next cell."""
     assert four_band().joins_cells
     assert not CELL.joins_cells
     assert not UnitCell((1.0,), (), 0, 0).joins_cells
 
 
 def test_a_cell_alone_has_modes_and_no_waves():
+    """Cells without springs between them have the modes of one cell, at 0 and (k (1/m1 + 1/m2))^(1/2), and no bands."""
     assert modes_of_a_cell(CELL) == pytest.approx([0.0, LOCAL], rel=1e-12)
     assert wave_bands(CELL) == ()
     assert fastest_speed(CELL) == 0
@@ -59,6 +61,7 @@ def test_a_cell_alone_has_modes_and_no_waves():
 
 
 def test_bands_say_what_there_is():
+    """The verb ``bands`` lists the modes of a cell in place of bands."""
     assert f"each cell has the modes 0.00, {LOCAL:.2f} rad/s for itself" in without_bands(CELL)
     numbers = bands_table(CELL)
     assert numbers["bands"] == numbers["gaps"] == []
@@ -136,6 +139,7 @@ def test_a_struck_grain_has_the_faster_of_its_spring_and_its_contact(speed):
 
 
 def test_a_law_of_waves_is_none_of_contacts():
+    """A scattering law is refused where no linear wave can arrive."""
     key, remedy = problem_of(LawCase, law={"clearance": 1e-5}, contacts=APART)
     assert key == "lattice.cell.springs" and "no linear wave arrives" in remedy
 
@@ -222,6 +226,7 @@ def test_modes_of_a_pressed_chain_are_those_of_masses_in_masses():
     ],
 )
 def test_the_reduced_model_of_a_cell_may_be_free(springs, mode, is_still):
+    """The reduced model refuses its rigid motion as mode 1 if no spring holds the pair."""
     cell = {"masses": [4e-3, 2e-3, 1e-3], "springs": springs}
     given = {
         "lattice": {"cell": cell, "cells": 4},

@@ -60,6 +60,7 @@ def test_another_lattice_has_modes_of_its_own(other, folder):
 
 
 def test_sites_make_no_difference(folder, monkeypatch):
+    """Chains that differ in sites alone use the same kept modes."""
     kept_modes(CHAIN)
     in_a_later_run(replace(CHAIN, sites=(5,)), monkeypatch)
 
@@ -86,6 +87,8 @@ def test_a_damaged_file_is_computed_again(damage, folder):
 
 
 def test_the_folder_is_bounded_and_keeps_what_was_used_last(folder, monkeypatch):
+    """Beyond its largest size the folder drops the arrays that were used longest ago."""
+
     def keep(name: bytes) -> None:
         kept.kept_arrays("test", [name], lambda: {"x": np.zeros(128)})
 

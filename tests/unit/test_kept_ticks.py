@@ -86,6 +86,7 @@ def test_ticks_are_placed_anew_where_something_moves(change):
 
 
 def test_nothing_is_left_behind():
+    """After the context axes have matplotlib's own methods."""
     figure = page()
     with kept_ticks(figure):
         axis = figure.get_axes()[0].xaxis

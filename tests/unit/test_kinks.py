@@ -105,6 +105,7 @@ def test_a_substep_without_a_kink_is_not_repeated(monkeypatch):
 
 @pytest.mark.parametrize(("factor", "is_cut"), [(0.99, False), (1.01, True)])
 def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut):
+    """A substep is cut at a kink only if its length stays above the shortest one."""
     fraction = factor * SHORTEST / 0.4
     loop = SubstepsOnKinks(monkeypatch, [fraction])
     expected = fraction * 0.4 if is_cut else 0.4
@@ -112,6 +113,7 @@ def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut
 
 
 def test_repetitions_end_although_each_substep_has_a_kink(monkeypatch):
+    """A substep is repeated at most MOST_ATTEMPTS times."""
     # Rounding could keep a kink just inside of every substep.
     loop = SubstepsOnKinks(monkeypatch, [0.9] * (MOST_ATTEMPTS + 5))
     assert loop.end(0.4).length == pytest.approx(0.4 * 0.9**MOST_ATTEMPTS)

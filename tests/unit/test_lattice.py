@@ -64,6 +64,7 @@ def test_diatomic_bands_have_their_closed_form():
     ],
 )
 def test_pass_bands_and_gaps_are_the_published_ones(cell, edges):
+    """Edges of bands and gaps are those published for the three cells of the paper."""
     found = pass_bands(cell)
     # The published edges have two decimals.
     assert np.ravel([(band.low, band.high) for band in found]) == pytest.approx(edges, abs=0.006)
@@ -71,6 +72,7 @@ def test_pass_bands_and_gaps_are_the_published_ones(cell, edges):
 
 
 def test_published_drive_frequencies_and_speeds():
+    """Frequencies and group velocities of the paper's drives are the published ones."""
     # The paper drives the wavenumber 5 pi/9.
     optical = bloch(diatomic(), 5 * np.pi / 9)
     assert optical.frequency[1] == pytest.approx(5520.026, abs=1e-3)
@@ -175,6 +177,7 @@ def test_fixed_ends_are_free_ones_with_springs_to_walls(cell, n):
 
 
 def test_a_springs_slope_and_energy_are_derivative_and_integral_of_its_force():
+    """The nonlinear part of a spring has the force dE/dz and the slope dF/dz, by central differences."""
     spring = Spring(0, 1, 1e3, quadratic=3e4, cubic=-2e6)
     z = np.linspace(-2e-3, 2e-3, 9)
     h = 1e-6
@@ -255,6 +258,7 @@ def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_a_contacts_force_is_the_slope_of_its_potential(law):
+    """The force of a contact is the derivative of its potential; it begins as x^(3/2) or x."""
     contact = Contact(law, 1e6)
     d = 2e-3
     # Elongations in m beyond either stop, just beyond it, and between the stops.

@@ -41,6 +41,7 @@ def test_a_member_comes_as_near_as_its_smaller_clearance_permits(contacts, expec
 
 
 def test_a_linear_lattice_with_one_drive_is_scaled():
+    """A linear lattice with one drive is run at 1 N and its motion scaled by the amplitude."""
     case = small_case()
     assert is_proportional(case)
     assert factor(case) == abs(case.drive.amplitude)
@@ -66,6 +67,7 @@ def cubic_springs() -> Case:
 
 @pytest.mark.parametrize("build", [two_drives, cubic_springs])
 def test_a_lattice_that_does_not_move_in_proportion_is_not_scaled(build):
+    """With two drives or nonlinear springs the linear run has the case's own amplitudes and no contacts."""
     case = build()
     assert not is_proportional(case)
     assert factor(case) == 1.0

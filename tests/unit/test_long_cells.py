@@ -28,6 +28,7 @@ def test_bands_of_a_folded_chain(masses):
 
 @pytest.mark.slow
 def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
+    """The fastest speed needs solutions at fewer wavenumbers than three grids, for 41 bands."""
     solved = []
     original = bands.bloch
     monkeypatch.setattr(bands, "bloch", lambda cell, kappa: solved.append(np.size(kappa)) or original(cell, kappa))

@@ -169,6 +169,7 @@ def test_words_and_lists_are_curves_and_panels_with_their_values():
 
 
 def test_categories_alone_are_ticks():
+    """A measure over categories alone has a point and a tick for each."""
     (axes,) = panels(only(ensemble_of(SITES)))
     assert [text.get_text() for text in axes.get_xticklabels()] == ["[9]", "[9, 20]", "[4, 30]"]
     # A line between categories would suggest values between them.
@@ -186,6 +187,7 @@ def test_keys_that_vary_together_are_named_together():
 
 
 def test_what_does_not_vary_stands_nowhere():
+    """Keys with one value are neither in names nor in titles of pages."""
     # An axis of one value distinguishes no page from another.
     figure = drawn(ensemble_of({"contacts.law": ["hertz"]}, {"lattice.reading": ["printed"]}, AMPLITUDES))
     (stem,) = figure
@@ -228,6 +230,7 @@ def test_bands_are_curves_of_their_own_and_other_parts_stay_out():
 
 
 def test_samples_are_a_mean_and_a_band():
+    """A page over samples shows the mean and the band of 5 to 95 % quantiles."""
     ensemble = with_samples(AMPLITUDES)
     figure = only(ensemble)
     (axes,) = panels(figure)
@@ -278,6 +281,7 @@ def test_what_cannot_be_drawn_has_a_reason():
 
 
 def test_measures_are_what_is_measured_of_every_member():
+    """Measures with pages are those with a value, or values of bands, for every member."""
     ensemble = ensemble_of(LAWS, AMPLITUDES, parts=3)
     # A fit has no value for every member, and a history has several for each: neither is a measure with a page.
     ensemble["fits/ibtet/exponent"] = ("law", [1.0, 2.0])
@@ -390,6 +394,7 @@ def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path
 
 
 def test_roles_do_not_depend_on_equal_sizes():
+    """Three keys with equal numbers of values have the roles x, y and panels in the order of the case."""
     same = [{"drive.frequency": [1.0, 2.0, 3.0]}, {"drive.ramp": [1.0, 2.0, 3.0]}, {"drive.duration": [1.0, 2.0, 3.0]}]
     roles = Roles.of(Measure.of(ensemble_of(*same), "ibtet").axes)
     assert roles.y is not None

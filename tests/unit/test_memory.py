@@ -53,6 +53,7 @@ def test_memory_grows_with_cells_and_sites_of_a_rank_but_not_with_samples_times_
     ],
 )
 def test_what_takes_most_is_named_with_a_remedy(folder, monkeypatch, key, sections):
+    """The error names the key that takes most memory, and how to reduce it."""
     monkeypatch.setattr(memory, "memory_available", lambda: 2**10)
     with pytest.raises(CaseError, match=f"{key}.* need .* per rank, but only .*; fewer .* reduce it"):
         simulate(small_case(**sections), folder / "run")
@@ -71,6 +72,7 @@ def test_a_run_too_large_is_refused_with_what_it_needs(folder):
 
 
 def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(folder, monkeypatch):
+    """A state of more than 2^31 - 1 numbers is refused with a hint at PETSc with 64-bit indices."""
     case = small_case(lattice={"cells": 300_000_000}, contacts={"sites": [6], "clearance": 1e-4})
     message = r"lattice.cells = 300000000: results in a state of 2400000002 numbers, .*2147483647 .*64-bit-indices"
     monkeypatch.setattr(memory.PETSc, "IntType", np.int32)
@@ -95,6 +97,7 @@ def test_ranks_windows_and_writers_divide_what_is_needed():
 
 
 def test_the_limit_of_the_process_counts(monkeypatch):
+    """The available memory is at most the limit of the process less its present size."""
     assert 2**26 < memory_available() < 2**50
     used = int(np.fromfile("/proc/self/statm", sep=" ")[0]) * resource.getpagesize()
     limit = used + 2**20

@@ -48,6 +48,7 @@ class BentValley:
 
 @pytest.mark.parametrize("side, places", [("below", [-1.5, -3.0]), ("above", [0.0, 1.5, 3.0])])
 def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
+    """A profile along the bent valley has the costs a^2, without the jump, and few solutions are needed."""
     windows = BentValley()
     profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
     costs = profile_costs(windows, np.zeros(2), profile, 0, side)

@@ -120,6 +120,7 @@ def test_inverse_iteration_gives_the_modes_of_a_dense_solution(name):
 
 
 def test_chains_that_differ_in_contacts_alone_share_their_modes():
+    """Modes are computed once for chains that differ in contacts alone."""
     chain = Chain(CELLS["diatomic"], 20)
     assert linear_modes(replace(chain, sites=(3,), clearances=(1e-3,))) is linear_modes(chain)
 
@@ -220,11 +221,13 @@ def test_episodes_that_touch_between_the_same_samples_are_one_cluster():
 
 
 def test_an_episode_that_begins_after_the_sample_at_which_another_has_ended_is_apart():
+    """Two episodes with a sample between them are two clusters."""
     bounds, _ = cluster_samples(ONSET[[1, 3]], SEPARATION[[1, 3]], TIME)
     assert bounds.tolist() == [[1, 2], [2, 3]]
 
 
 def test_clusters_are_joined_to_a_coarser_grid_of_samples():
+    """Bounds of clusters are multiples of the stride, and clusters that then overlap are joined."""
     bounds, cluster = cluster_samples(ONSET, SEPARATION, TIME, 4)
     assert bounds.tolist() == [[0, 4], [4, 8], [8, 10]]
     assert cluster.tolist() == [0, 0, 1, 0, 1, 2, 2]

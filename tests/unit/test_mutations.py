@@ -135,4 +135,5 @@ def test_every_key_of_every_verb_is_spoilt(kind):
 
 
 def test_every_verb_that_reads_a_case_has_its_case_among_them():
+    """The verbs of the command line read exactly the cases in VERB_CASES."""
     assert {verb.case for verb in study_verbs()} == {*VERB_CASES}

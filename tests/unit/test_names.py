@@ -24,10 +24,12 @@ from vipetsc.modes.branches.lattices import LatticeMethod
     ],
 )
 def test_numbers_that_differ_have_names_that_differ(numbers, names):
+    """Each number is written with six digits, or with as many as distinguish it from the others."""
     assert distinct(numbers) == names
 
 
 def test_curves_that_agree_in_six_digits_have_files_of_their_own():
+    """Curves whose frequencies and restitutions agree in six digits have different names."""
     curves = nfrc_case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
     assert len({name for name, *_ in curves}) == 4
     assert curves[0] == ("r0.7-1023.27", 0.7, 1023.27)
@@ -35,5 +37,6 @@ def test_curves_that_agree_in_six_digits_have_files_of_their_own():
 
 @pytest.mark.parametrize(("method", "options"), [(CondensedMethod, {"system": "condensed"}), (LatticeMethod, {})])
 def test_breathers_that_agree_in_six_digits_have_files_of_their_own(method, options):
+    """Breathers whose frequencies agree in six digits have different names."""
     of = breather_case(start_frequency=[1600.0, 1600.001], **options)
     assert [method(of, MPI.COMM_SELF).name(job) for job in (0, 1)] == ["breather-1600", "breather-1600.001"]

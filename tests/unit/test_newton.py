@@ -54,6 +54,7 @@ def meets_the_circle(newton) -> bool:
 @pytest.mark.parametrize("make, names", [dense, krylov])
 @pytest.mark.parametrize("error", [ZeroDivisionError("no such orbit"), KeyboardInterrupt("stop")])
 def test_what_the_equations_raise_comes_out(make, names, error):
+    """An exception of the equations is raised by ``solve`` as the same object, and the solver works afterwards."""
     newton = make()
     for name in names:
         for evaluations in (0, 1):
@@ -65,6 +66,7 @@ def test_what_the_equations_raise_comes_out(make, names, error):
 
 @pytest.mark.parametrize("make, names", [dense, krylov])
 def test_leaving_the_domain_is_an_attempt_that_failed(make, names):
+    """A FlowError ends the attempt at its guess, with its text as the reason, and the solver works afterwards."""
     newton = make()
     for name in names:
         for evaluations in (0, 1):
@@ -78,6 +80,7 @@ def test_leaving_the_domain_is_an_attempt_that_failed(make, names):
 
 
 def test_a_null_vector_that_cannot_be_computed_raises():
+    """A FlowError during the search for a null vector is raised, and the solver works afterwards."""
     newton = KrylovNewton([0, 2], MPI.COMM_SELF, 20)
     with pytest.raises(FlowError, match="no flow"):
         newton.null_vector(Circle({"product": 0}, FlowError("no flow")), GUESS, ROW)
@@ -85,6 +88,7 @@ def test_a_null_vector_that_cannot_be_computed_raises():
 
 
 def test_an_error_that_petsc_makes_of_it_does_not_hide_it(petsc_options):
+    """An exception of the equations is raised, not the PETSc error that follows from it."""
     petsc_options(nnm_snes_error_if_not_converged=True)
     newton = DenseNewton(2, 20)
     with pytest.raises(ZeroDivisionError):
@@ -92,6 +96,7 @@ def test_an_error_that_petsc_makes_of_it_does_not_hide_it(petsc_options):
 
 
 def test_errors_of_petsc_itself_pass(petsc_options):
+    """An error of PETSc that no exception of the equations has caused is raised."""
     petsc_options(nnm_snes_error_if_not_converged=True)
     newton = DenseNewton(2, 1)
     with pytest.raises(PETSc.Error):
@@ -101,6 +106,7 @@ def test_errors_of_petsc_itself_pass(petsc_options):
 @pytest.mark.parametrize("make, names", [dense, krylov])
 @pytest.mark.parametrize("residual", [np.nan, np.inf])
 def test_a_residual_that_is_not_finite_ends_the_attempt(make, names, residual):
+    """A residual of NaN or infinity ends the attempt without convergence."""
     newton = make()
     # Most versions of PETSc check the residual themselves before they call the convergence test.
     assert newton._test(newton._snes, 1, (0.8, 0.1, residual)) < 0

@@ -65,6 +65,7 @@ def history(amplitudes: list[float], episodes: list[float]):
     ],
 )
 def test_contact_begins_between_a_member_without_and_one_with_it(episodes, onset):
+    """The dotted line is at the geometric mean of the last amplitude without contact and the first one with it."""
     dotted = [line for line in history(AMPLITUDES, episodes).lines if line.get_linestyle() == ":"]
     assert [line.get_ydata()[0] for line in dotted] == pytest.approx([] if onset is None else [onset])
 

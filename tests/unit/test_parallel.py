@@ -65,6 +65,7 @@ def test_what_has_nothing_to_save_ends_at_once():
 
 
 def test_what_has_nothing_to_save_does_not_begin_after_a_request():
+    """Work that has nothing to save ends before it begins if a stop was requested before."""
     with StopRequest().listening() as stop:
         signal.raise_signal(signal.SIGUSR1)
         with pytest.raises(EndedError), stop.at_once():
@@ -121,11 +122,13 @@ def test_a_signal_in_a_destructor_ends_such_work_without_a_trace():
 
 
 def test_errors_of_such_work_are_reported_where_nobody_asked_to_stop():
+    """Without a request an error within ``at_once`` is raised as it is."""
     with StopRequest().listening() as stop, pytest.raises(KeyError), stop.at_once():
         raise KeyError(0)
 
 
 def test_such_work_goes_on_after_a_part_of_it_that_says_the_same():
+    """After an inner ``at_once`` a signal still ends the work of the outer one."""
     with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
         with stop.at_once():
             pass
@@ -134,6 +137,7 @@ def test_such_work_goes_on_after_a_part_of_it_that_says_the_same():
 
 
 def test_after_such_work_a_request_is_kept_again():
+    """After ``at_once`` a signal is a request and raises nothing."""
     with StopRequest().listening() as stop:
         with stop.at_once():
             pass

@@ -24,6 +24,7 @@ def alone(monkeypatch):
 
 
 def test_a_process_alone_starts_mpi_without_daemon_and_network():
+    """A process without a launcher has the settings ALONE while MPI starts."""
     with quick_start():
         assert os.environ.items() >= ALONE.items()
 
@@ -36,6 +37,7 @@ def test_processes_started_later_do_not_inherit_it():
 
 
 def test_what_a_user_has_set_stays(monkeypatch):
+    """A setting of the user stays while MPI starts and afterwards."""
     name = "OMPI_MCA_pml"
     monkeypatch.setenv(name, "ucx")
     with quick_start():
@@ -45,6 +47,7 @@ def test_what_a_user_has_set_stays(monkeypatch):
 
 @pytest.mark.parametrize("name", RANKS)
 def test_a_rank_of_a_job_starts_mpi_as_its_launcher_says(name, monkeypatch):
+    """A rank of a launcher has none of the settings ALONE."""
     monkeypatch.setenv(name, "0")
     with quick_start():
         assert not ALONE.keys() & os.environ.keys()

@@ -43,6 +43,7 @@ def problem_of(table: dict[str, Any], overrides: tuple[str, ...] = ()) -> tuple[
     ],
 )
 def test_a_key_of_a_stop_that_does_nothing_is_refused(contacts, key):
+    """A precompression below the clearance, or a clearance on a side without a stop, is refused."""
     stops = {"sites": [4, 9], "clearance": 3e-5, "restitution": 1.0}
     with pytest.raises(CaseError) as error:
         small_case(contacts=stops | contacts)
@@ -50,12 +51,14 @@ def test_a_key_of_a_stop_that_does_nothing_is_refused(contacts, key):
 
 
 def test_a_clearance_of_the_side_minus_is_taken_where_one_site_has_a_stop_there():
+    """``clearance_minus`` is accepted if at least one site has a stop on that side."""
     case = small_case(contacts={"sites": [4, 9], "clearance": 3e-5, "clearance_minus": 1e-5,
                                 "each": {"side": ["plus", "both"]}})  # fmt: skip
     assert case.model().gaps[1] == (3e-5, 1e-5)
 
 
 def test_what_follows_in_other_lines_of_an_override_is_refused():
+    """An override with a second assignment in another line is refused, with a hint at a second ``--set``."""
     key, remedy = problem_of(Case.builtin_table, ("drive.amplitude=2.0\ntime.end=5",))
     assert key == "--set" and "--set each" in remedy
 
@@ -66,6 +69,7 @@ def test_an_override_may_be_a_list_over_lines():
 
 
 def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_too():
+    """An impulse of the duration T has the frequency pi/T, also in a lattice without springs."""
     case = Case.from_table(unsprung_table())
     assert case.drive.frequency == pytest.approx(3.141592653589793e5)
 
@@ -90,6 +94,7 @@ def test_a_lattice_without_springs_begins_with_no_mode_and_no_packet(motion):
 
 
 def test_stops_are_described_by_what_they_are():
+    """A stop is described by its clearances, as touching, or by its precompression, with the side."""
     gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
     expected = ["touches on side -", "precompressed by 0.002 mm on side +", "+0.2 mm -0.3 mm"]
     assert describe_stops(gaps, (0.0, 0.0, 2e-4)) == expected
@@ -97,6 +102,7 @@ def test_stops_are_described_by_what_they_are():
 
 
 def test_a_drive_without_an_end_is_said_to_go_on():
+    """The table of ``validate`` gives the end of a burst, and says that a harmonic drive has none."""
     case = small_case(drive={"waveform": "harmonic", "cycles": 30})
     rows = dict(run_rows(case, 1))
     assert rows["drive, end"] == "no end, 0.05 s"
@@ -104,6 +110,7 @@ def test_a_drive_without_an_end_is_said_to_go_on():
 
 
 def test_beads_have_no_bands_and_no_waves():
+    """The table of ``validate`` has no bands, gaps and waves for beads without springs."""
     rows = dict(run_rows(Case.from_table(unsprung_table()), 1))
     assert rows["pass bands"].startswith("none")
     assert not rows["gaps"]
@@ -115,6 +122,7 @@ def test_beads_have_no_bands_and_no_waves():
     [(3, 500.0, "3 cells are fewer than the 9"), (60, 2e5, "is too long for 3e+05 rad/s")],
 )
 def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, reason):
+    """The propagator refuses lattices shorter than its reach and sample intervals too long for their frequencies."""
     springs = [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}]
     case = Case.from_table({
         "lattice": {"cell": {"masses": [1e-3], "springs": springs}, "cells": cells},

@@ -27,6 +27,7 @@ class Formulas:
 
 
 def test_a_sound_law_has_no_defect():
+    """A law with the force k x^1.5, its derivative and its integral passes the check."""
     law = Formulas(lambda x: 2e6 * x**1.5, lambda x: 3e6 * x**0.5, lambda x: 0.8e6 * x**2.5, 1.5)
     assert check_law(law) == ""
 
@@ -40,6 +41,7 @@ def test_a_sound_law_has_no_defect():
     ],
 )
 def test_formulas_that_contradict_each_other_are_named(slope, energy, exponent, defect):
+    """A slope, an energy or an exponent that does not belong to the force is named."""
     law = Formulas(lambda x: 2e6 * x**1.5, lambda x: slope * x**0.5, lambda x: energy * x**2.5, exponent)
     assert defect in check_law(law)
 

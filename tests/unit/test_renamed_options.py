@@ -17,6 +17,7 @@ def in_database() -> dict[str, str]:
 
 
 def test_a_case_stores_the_earlier_name():
+    """A case with the later names of options equals the case with the earlier names, which it stores."""
     later = small_case(petsc={"ts_time_step": 1e-5, "ts_max_step_rejections": 3})
     assert later == small_case(petsc={"ts_dt": 1e-5, "ts_max_reject": 3})
     assert later.petsc.model_dump() == {"ts_dt": "1e-05", "ts_max_reject": "3"}
@@ -36,11 +37,13 @@ def test_either_name_is_an_option_of_time_stepping(capfd, name):
 @pytest.mark.parametrize("name", ["ts_dt", "ts_time_step"])
 @pytest.mark.parametrize("value", ["0", "-1e-5", "nan", "inf"])
 def test_a_step_that_is_not_positive(name, value):
+    """A first step that is not a positive number is refused under the earlier name."""
     with pytest.raises(CaseError, match=r"petsc\.ts_dt = .*must be positive"):
         check_options(small_case(petsc={name: value}))
 
 
 def test_the_database_has_the_name_of_its_version():
+    """Before PETSc 3.25 the options have their earlier names, and from then on the later ones."""
     assert name_in_petsc("ts_dt", version=(3, 24, 5)) == "ts_dt"
     assert name_in_petsc("ts_dt", version=(3, 25, 0)) == "ts_time_step"
     assert name_in_petsc("ts_max_reject", version=(3, 26, 1)) == "ts_max_step_rejections"

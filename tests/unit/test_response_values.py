@@ -37,6 +37,7 @@ def test_the_largest_value_between_points_converges():
 
 
 def test_the_largest_value_is_that_of_the_range_and_of_all_parts():
+    """The largest value includes the ends of the range and all parts of a curve; without points it is NaN."""
     p = np.linspace(-1, 1, 401)
     whole = part(p, resonance(p))
     assert largest_response([whole], -1, 0.0123) == pytest.approx(abs(resonance(0.0123)), abs=5e-5)

@@ -265,6 +265,7 @@ def test_a_rank_writes_only_to_what_it_owns():
 
 
 def test_an_engine_that_keeps_no_ledger_of_dashpots_has_the_components_of_drives_and_sites_alone():
+    """Without dashpots the state has no ledger of them, and the rates of the other ledgers are the same."""
     model = lattice("fixed")
     motion = random_motion(model)
     with_ledger = evaluate(model, motion)

@@ -195,6 +195,7 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     ],
 )
 def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, message):
+    """A wrong variable is refused with one problem at the path of its key."""
     with pytest.raises(CaseError) as error:
         plan_of(variables)
     # No other check reports the same problem or one that follows from it.

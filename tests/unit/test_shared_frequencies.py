@@ -42,10 +42,12 @@ def test_multiples_are_companions_of_the_lower_mode_alone():
 
 @pytest.mark.parametrize("near", [1e-9, -1e-9])
 def test_frequencies_that_differ_are_none(near):
+    """Frequencies that differ by 1e-9 of their size are no companions."""
     assert companions(oscillators(1.0, 1.0 + near), 0) == []
 
 
 def test_motions_that_are_nowhere_linear_are_left_to_their_equations():
+    """A system with smooth springs is not refused for equal frequencies, since its motions are nowhere linear."""
     assert why_not_alone(oscillators(1.0, 1.0, cubic=1.0), 0) == ""
 
 
@@ -69,6 +71,7 @@ def ring(**nnm) -> NnmCase:
 
 
 def test_waves_around_a_ring_are_refused_before_anything_is_written(tmp_path):
+    """A mode of a ring with the frequency of another one is refused by its number, and no folder is created."""
     with pytest.raises(CaseError) as refused, claim_branches(ring(modes=[2, 4]), tmp_path / "out", MPI.COMM_SELF):
         pass
     (problem,) = refused.value.problems
@@ -80,6 +83,7 @@ def test_waves_around_a_ring_are_refused_before_anything_is_written(tmp_path):
 
 @pytest.mark.parametrize("method", ["shooting", "condensed"])
 def test_a_branch_in_memory_ends_with_the_same_reason(method):
+    """A branch that is followed in memory ends with the reason for which a folder would be refused."""
     alone, shared = follow_all(ring(modes=[4, 3], method=method), None, MPI.COMM_SELF)
     assert "2 points reached" in alone.ending
     assert "mode 3 has the frequency of mode 2" in shared.ending

@@ -157,6 +157,7 @@ def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkey
 
 
 def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
+    """A single member has a page with its key and value in the name, and its own warning."""
     (page,) = dispersions(monkeypatch, member_of("a", 10, 0.5))
     assert page.stem.endswith("contacts.restitution-0.5")
     figure = page.draw()
@@ -216,12 +217,14 @@ def test_a_warning_below_a_series_names_its_amplitude(monkeypatch):
 
 
 def test_a_picture_of_the_medium_amplitude_has_its_warnings_alone(monkeypatch):
+    """A picture of the medium amplitude has the warnings of that run and no others."""
     medium = from_series(medium_alone=True)(lambda series: Figure())
     assert lines_below(medium, series_of_three("no contact", "", ""), monkeypatch) == []
     assert lines_below(medium, series_of_three("", "no contact", "of 20 N"), monkeypatch) == ["no contact"]
 
 
 def test_many_members_of_one_warning_are_counted():
+    """A warning names up to four members that have it and counts the others."""
     shown = [Shown(f"{number} N", [xr.Dataset(attrs={"warnings": '["beware"]'})]) for number in range(1, 8)]
     assert warning_lines(shown) == ["1 N, 2 N, 3 N, 4 N and 3 others: beware"]
     assert warning_lines(shown[:1]) == ["beware"]

@@ -143,6 +143,7 @@ def test_a_part_of_a_spring_may_vanish():
     ],
 )
 def test_impossible_trial_cases_are_refused_as_those_that_are_read(name, contacts, quantity, valid, wrong):
+    """An impossible trial has the problems of the case that is read from its table."""
     base = base_of(name)
     if contacts:
         base = base.varied(contacts=contacts | {"restitution": 0.9})
