@@ -138,7 +138,7 @@ def test_xarray_opens_a_branch(branch, tmp_path):
 @pytest.mark.slow
 def test_a_picture_is_drawn_from_the_file(branch, tmp_path):
     """A branch's file alone is enough for its picture."""
-    # Loads matplotlib, which no other test here needs.
+    # This import loads matplotlib, which no other test here needs.
     from vipetsc.figures.registry import draw
 
     write_branch(branch, tmp_path, {})

@@ -34,7 +34,7 @@ def test_degenerate_tangent_is_named():
     frame = problem.relative_frame(np.array([1.0, 0.5]), 2 * np.pi)
     attempt = frame.solve(frame.xi, np.array([1.0, 0.0, 0.0]), frame.xi[0])
 
-    # E = (1^2 + 0.5^2)/2.
+    # The amplitudes 1 and 0.5 have the energy E = (1^2 + 0.5^2)/2.
     with pytest.raises(ContinuationError, match=r"degenerate tangent at E = 0.625 J"):
         Continuation(problem, frame.measures(attempt), NnmTable())
 

@@ -29,7 +29,7 @@ def damped(cell, alpha=0.0, beta=0.0, extra=(0.0, 0.0, 0.0, 0.0)):
 
 @pytest.mark.parametrize("cell", [four_band(), diatomic()])
 def test_rayleigh_damping_has_its_closed_form(cell):
-    """zeta = (alpha/omega + beta omega)/2, and a wave of real frequency decays over v_g/(zeta omega) cells."""
+    """Damped waves have zeta = (alpha/omega + beta omega)/2, and at a real frequency decay over v_g/(zeta omega)."""
     alpha = 20.0
     beta = 2e-5
     omega = bloch(cell, KAPPA).frequency
@@ -152,7 +152,7 @@ def test_a_packet_comes_back_as_computed():
 
 
 def test_an_absorbing_end_is_found_for_the_drive():
-    """A case that asks for a reflection alone gets the cells and the strength that keep it over the drive's lobe."""
+    """A case that gives only a reflection gets the cells and the strength of an end that keeps it for its drive."""
     case = small_case(lattice={"cells": 90, "absorbing": {"reflection": 1e-4}}, drive={"cycles": 30})
     end = case.lattice.absorbing
     drive = case.drive
@@ -199,7 +199,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
 
-    # Another seed scatters anew, and leaves what profiles give.
+    # Another seed draws other values, and leaves those of profiles.
     other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
     assert np.all(other.masses[:, 0] != varied.masses[:, 0])
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])

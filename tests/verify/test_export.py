@@ -1,4 +1,4 @@
-"""Results in other programs: XDMF by its references into run.h5, CSV, ``vipetsc.open``, plain xarray."""
+"""Results for other programs: XDMF files with references into run.h5, CSV tables, ``vipetsc.open``, plain xarray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Branches that a stiff contact ends where it grazes say so, name the contact, and go on with the keys they name."""
+"""A branch that ends where a stiff contact grazes names the contact and the keys with which it can go on."""
 
 from typing import Any
 

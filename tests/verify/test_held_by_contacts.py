@@ -153,7 +153,7 @@ def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, 
 def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
     """The compliance between two unconnected masses, of which a dashpot brakes one, is the sum of their compliances.
 
-    Both modes have frequency 0; any combination of them is a mode, and only those of one mass each are uncoupled.
+    Both modes have frequency 0, and so has any combination. The dashpot couples all modes but those of one mass each.
     """
     cell = UnitCell((1.0, 2.0), (), 0, 1, grounding=(0.3, 0.0))
     chain = Chain(cell, 1, "free", sites=(0,), clearances=(0.1,))

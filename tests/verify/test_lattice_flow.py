@@ -61,7 +61,7 @@ class Linearised(NamedTuple):
 
 
 def linearise(flow: LatticeFlow, start: np.ndarray, change: np.ndarray) -> Linearised:
-    # Rounding and the third derivative then both leave some 1e-8.
+    # With this step the errors of rounding and of the third derivative are both about 1e-8.
     step = 1e-6
     ahead = flow.arc(start + step * change, PERIOD).end
     behind = flow.arc(start - step * change, PERIOD).end

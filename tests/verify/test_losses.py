@@ -228,7 +228,7 @@ def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(meth
 @pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.02, 0.005])
 def test_the_force_holds_a_steady_state_in_quadrature(damping):
-    """The force that holds a steady state a quarter of a period behind it, near the free motion, is the branch's."""
+    """A steady state near the free motion that lags its force by a quarter of a period needs the branch's force."""
     lattice = TWO_MASSES["lattice"] | {"damping": {"mass": damping}}
     nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
     nnm |= {"points": 14, "largest_step": 0.2, "first_step": 0.05, "tolerance": 1e-11, "harmonics": 63}

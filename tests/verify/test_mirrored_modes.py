@@ -146,7 +146,7 @@ def test_so_do_those_of_condensed_motions():
 def test_so_do_those_of_orbits_shot_without_matrices():
     """The left half of an in-phase orbit shot without matrices is an orbit of the left half lattice with a free end.
 
-    SciPy's flow integrates that half, which is at rest again after half a period.
+    The compiled flow integrates that half, which is at rest again after half a period.
     """
     table = CHAIN | {"nnm": CHAIN["nnm"] | {"shooting": "krylov"}}
     (branch,) = branches(table).values()

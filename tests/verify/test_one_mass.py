@@ -55,7 +55,7 @@ def test_its_only_mode():
 
 
 def test_dashpots_alone_resist_a_motion_of_equal_masses_together():
-    """A common motion of all masses, kappa = 0, has no stiffness: one of its two rates, 0 and -0.06, is given."""
+    """A common motion of all masses, kappa = 0, has no stiffness: of its two rates, 0 and -0.06 1/s, 0 is given."""
     cell = Case.from_table(ONE_MASS).model().chain.cell
     assert damped_bloch(cell, 0.0).rate == pytest.approx([0.0], abs=1e-12)
     # A long wave is overdamped: s^2 + 0.06 s + omega^2 = 0 has two real rates, of which the slower one is given.

@@ -180,7 +180,7 @@ def test_histories_of_velocities_fit_twice_into_the_memory_of_whole_ones(monkeyp
 
 @pytest.mark.slow
 def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
-    """A member's results do not depend on the other members, on what the sweep stores, or on a run by itself."""
+    """A member has the same bits with other members, with stored fields, and as a run of its own."""
     amplitudes = [1.0, 30.0, 40.0, 50.0]
     folders = {"all": amplitudes, "some": amplitudes[1:], "fields": amplitudes[1:]}
     records = {}

@@ -44,7 +44,7 @@ def shaken(engine: str) -> Case:
 def steady_run(request):
     """The run of ``shaken`` by either engine."""
     run = run_of(shaken(request.param))
-    # A refused engine would be replaced by the other one.
+    # An engine that refuses the case would be replaced by the other one.
     assert json.loads(json.dumps(run.attrs["statistics"]))["engine"] == request.param
     return run
 
@@ -266,7 +266,7 @@ def test_velocities_change_by_the_accelerations(table):
 
 
 def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypatch):
-    """Records of points do not change with a window and strides, nor other records with points, nor any by a stop."""
+    """Records of points do not depend on windows and strides, nor others on points, and a stop changes no bit."""
     time = {"end": 0.03, "engine": "propagator"}
     whole = small_case(time=time, output=IMPACTS["output"])
     # Points outside the window and between its cells are recorded as well.

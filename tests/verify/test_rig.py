@@ -58,7 +58,7 @@ TEN_CELLS["contacts"]["each"] = {
 @pytest.fixture(scope="module")
 def two_masses(tmp_path_factory):
     """The steady states of the rig of two masses, and the points of its curve."""
-    # The range contains the first resonance, with two folds and a pair of multipliers that exceeds 1.
+    # The range contains the first resonance, with two folds and a pair of multipliers that leaves the unit circle.
     first = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"range": [1.0, 1.5]}}
     return followed(NfrcCase.from_table(first), tmp_path_factory.mktemp("rig") / "two")
 

@@ -166,6 +166,6 @@ def test_a_period_doubled_orbit_is_off_its_parent(short_branch):
     assert repetitions(doubled_problem, first) == 1
     assert first.energy == pytest.approx(point.energy, rel=1e-3)
     assert first.period == pytest.approx(2 * point.period, rel=1e-3)
-    # The parent itself repeats itself twice in the doubled period.
+    # The doubled period passes the parent twice.
     parent = replace(first, x=point.x, period=2 * point.period)
     assert repetitions(doubled_problem, parent) == 2

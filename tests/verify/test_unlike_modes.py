@@ -33,8 +33,8 @@ from vipetsc.modes.system import ContactPair, System
 MASS = 2.0
 SPRING = 3.0
 STOP = 40.0
-# A frequency in rad/s in the lowest gap. At higher ones a stop on one side has no breather at small amplitudes, since
-# the mean of its force moves the site away.
+# A frequency in rad/s in the lowest gap. At higher ones no breather begins at a stop on one side, since the mean of its
+# force moves the site away.
 OMEGA = 640.0
 SIDES = [(0.1, np.inf), (np.inf, 0.1), (0.1, 0.13)]
 
