@@ -64,7 +64,7 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
     clearance = 0.1
     slow = np.sqrt(k / m)
     fast = np.sqrt((k + kc) / m)
-    pair = ContactPair(None, 0, clearance, Contact("bilinear", kc))
+    pair = ContactPair(host=None, resonator=0, clearance=clearance, law=Contact("bilinear", kc))
     system = System.assemble([m], [(None, 0, k)], [pair])
 
     problem, points = condensed_branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=6)
@@ -118,14 +118,14 @@ def test_the_slope_of_the_energy_is_that_between_points():
 @pytest.mark.parametrize("omega", [1450.0, 1600.0, 1800.0, 2000.0, 3700.0, 4000.0, 5000.0])
 def test_the_built_in_lattice_has_breathers_in_its_gaps(omega):
     """A breather of every gap, and above all bands, has the frequency asked for and a small residual."""
-    _, point = condensed_breather(300, 100, omega, 1e-6)
+    _, point = condensed_breather(cells=300, site=100, omega=omega, truncation=1e-6)
     assert point.residual < 1e-11
     assert point.frequency == pytest.approx(omega / (2 * np.pi), rel=1e-14)
 
 
 def test_the_breather_of_the_specification_has_its_amplitude_and_energy():
     """The breather at 1600 rad/s has 1.286 clearances and 0.0203 J."""
-    _, point = condensed_breather(300, 100, 1600.0, 1e-6)
+    _, point = condensed_breather(cells=300, site=100, omega=1600.0, truncation=1e-6)
     assert point.elongations[0] / CLEARANCE == pytest.approx(1.286, abs=5e-4)
     assert point.energy == pytest.approx(0.0203, abs=5e-5)
 
@@ -283,7 +283,7 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
 def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
     """At 2200 rad/s, in the gap but without a breather, the error names the key to change."""
     with pytest.raises(ContinuationError, match=r"no breather starts at 2200 rad/s: .*change nnm.start_frequency"):
-        condensed_breather(300, 100, 2200.0)
+        condensed_breather(cells=300, site=100, omega=2200.0)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def contactless_curve(amplitude: list[float] | np.ndarray, value: list[float] | 
 def test_a_criterion_is_met_within_its_bounds_alone(low, width, value):
     """A value meets a criterion from its lower to its upper bound; NaN does not."""
     high = low + width
-    criterion = Criterion("x", "within", (low, high), "", "")
+    criterion = Criterion(quantity="x", comparison="within", threshold=(low, high), unit="", source="")
     # Bounds have a tolerance of 1e-9, so that rounding does not decide.
     assert criterion.met(value) == (low - 1e-9 <= value <= high + 1e-9)
     assert not criterion.met(float("nan"))

@@ -184,14 +184,14 @@ def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
 def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envelope():
     """A linear run yields the time of the largest |v| of the hosts in each cell, and the envelope of w.
 
-    The envelope is (max |w|^2 + (max |w'|/omega)^2)^(1/2); times the amplitude and over the clearance it says how near
+    The envelope is the largest (w^2 + (w'/omega)^2)^(1/2); times the amplitude and over the clearance it says how near
     a member comes to its stops.
     """
     case = Case.load(overrides=["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
     peak = 0.2 + 0.02 * np.arange(30)
     data = linear_wave(case, peak)
 
-    wave = LinearRun.of(data, {"work": 0.0}, (), ())
+    wave = LinearRun.of(data, statistics={"work": 0.0}, sites=(), names=())
 
     # The sampling interval is 5 ms, and the bound is half of it.
     assert wave.arrival == pytest.approx(peak, abs=0.0026)
@@ -210,7 +210,7 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
     assert np.array_equal(envelope_squares(data, [1]), envelope_squares(first, [1]))
     assert envelope_squares(first, [1]).any()
 
-    # The envelope of w is that of an oscillation with the largest w and the largest w'.
+    # The displacement w of 4 mm is constant here, so that the envelope is largest where w' is.
     velocity = data["velocity"].values
     cell = four_band()
     rate = np.abs(velocity[..., cell.resonator] - velocity[..., cell.host]).max(axis=0)
@@ -222,7 +222,12 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
 def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
     """The linear run of a case is found by the case, and another case has none."""
     case = Case.load()
-    run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
+    run = LinearRun(
+        envelope=np.array([1.0, 2.0]),
+        arrival=np.array([0.1, 0.2]),
+        statistics={"work": 3.0},
+        measures={7: {"ibtet": 0.1}},
+    )
     RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(case)))
     assert read_linear(folder, Sweep.from_table(SWEEP).case(0)) is None
     again = read_linear(folder, case)
@@ -232,7 +237,12 @@ def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
 
 def test_records_of_another_version_count_as_missing(folder, monkeypatch):
     sweep = Sweep.from_table(SWEEP)
-    run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
+    run = LinearRun(
+        envelope=np.array([1.0, 2.0]),
+        arrival=np.array([0.1, 0.2]),
+        statistics={"work": 3.0},
+        measures={7: {"ibtet": 0.1}},
+    )
     RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(Case.load())))
     results = Results(sweep, folder)
     assert not (results.status == MISSING).any()
@@ -286,7 +296,8 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
     assert (Results(sweep, tmp_path).status == MISSING).all()
 
     measures = {9: {"ibtet": 0.1}, 5: {"ibtet": 0.2, "entropy/history": [1.0], "entropy/snapshot": [0.0]}}
-    file.append(LinearRun(np.zeros(40), np.zeros(40), {}, measures).record("wave"))
+    linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures=measures)
+    file.append(linear.record("wave"))
     _, warnings = conclude(Results(sweep, tmp_path))
 
     assert warnings == ["3 members: seen", "1 member: alone"]

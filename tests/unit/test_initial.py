@@ -99,7 +99,7 @@ def test_a_case_may_name_the_mode_near_a_frequency(ends):
 
 def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
     """A packet with the width s has the envelope exp(-x^2/(2 s^2)): its square has the deviation s/sqrt(2)."""
-    packet = gaussian_packet(four_band(), 2, 1.2, 500, 20.0)
+    packet = gaussian_packet(four_band(), band=2, kappa=1.2, centre=500, width=20.0)
     u, v = packet.on(Chain(four_band(), 1000), 0, 1000)
     envelope = np.hypot(u, v / bloch(four_band(), 1.2).frequency[1]).max(axis=1)
     x = np.arange(1000) - 500
@@ -111,7 +111,7 @@ def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
 
 def test_a_packet_is_the_same_in_parts_and_on_a_ring():
     """A packet has the same bits computed for parts of the cells, and the same values on a ring."""
-    packet = gaussian_packet(four_band(), 2, 1.2, 500, 20.0)
+    packet = gaussian_packet(four_band(), band=2, kappa=1.2, centre=500, width=20.0)
     chain = Chain(four_band(), 1000)
     u, _ = packet.on(chain, 0, 1000)
     parts = [packet.on(chain, first, last)[0] for first, last in ((0, 490), (490, 1000))]

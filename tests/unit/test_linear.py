@@ -35,7 +35,7 @@ CUBIC_CELL = {
 )
 def test_a_member_comes_as_near_as_its_smaller_clearance_permits(contacts, expected):
     """A member reaches the amplitude times the envelope over the smaller clearance; unknown distances are infinite."""
-    run = LinearRun(np.full(24, 1e-4), np.zeros(24), {}, {})
+    run = LinearRun(envelope=np.full(24, 1e-4), arrival=np.zeros(24), statistics={}, measures={})
     case = small_case(contacts={"sites": [6]} | contacts, drive={"amplitude": 2.0})
     assert run.reached(case) == pytest.approx(expected)
 

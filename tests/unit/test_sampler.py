@@ -32,12 +32,13 @@ def two_bowls(points):
 
 def cma():
     """Return CMA-ES in four dimensions from the middle of the cube, with its default generations of 8 points."""
-    return CmaEs(np.full(4, 0.5), np.zeros(4), np.eye(4), 0.2, seed=3, population=None)
+    start = np.full(4, 0.5)
+    return CmaEs(start, steps=np.zeros(4), directions=np.eye(4), step=0.2, seed=3, population=None)
 
 
 def nsga():
     """Return NSGA-II in four dimensions from the middle of the cube."""
-    return Nsga2(np.full(4, 0.5), 0.2, 3, 8)
+    return Nsga2(np.full(4, 0.5), step=0.2, seed=3, population=8)
 
 
 def generation_sizes(sampler, function, generations):
@@ -91,7 +92,8 @@ def test_where_nothing_differs_generations_stay_within_bounds():
 
 def test_the_step_of_a_whole_number_does_not_vanish():
     """The step of a whole number stays large enough for its neighbours when the steps of other variables contract."""
-    sampler = CmaEs(np.full(2, 0.52), np.array([0.0, 0.02]), np.eye(2), 0.2, 5, None)
+    steps = np.array([0.0, 0.02])
+    sampler = CmaEs(np.full(2, 0.52), steps, directions=np.eye(2), step=0.2, seed=5, population=None)
 
     points, _ = search_with(sampler, lambda p: ((p - 0.5) ** 2).sum(axis=1, keepdims=True), 30)
 
@@ -124,7 +126,8 @@ def test_nsga_ii_finds_the_front_of_two_bowls():
     def squared_distances(points):
         return ((points[:, None] - ends) ** 2).sum(axis=2)
 
-    points, losses = search_with(Nsga2(np.full(3, 0.5), 0.2, 3, 20), squared_distances, 50)
+    sampler = Nsga2(np.full(3, 0.5), step=0.2, seed=3, population=20)
+    points, losses = search_with(sampler, squared_distances, generations=50)
 
     best = points[front(losses)]
     # Most of a generation of 20 points lie on the front, along most of the line and near it.

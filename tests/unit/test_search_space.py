@@ -128,8 +128,8 @@ def test_names_are_keys_of_the_case():
 
 def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
     """Every choice has the same part of the range; whole numbers are the nearest ones; ends of the cube are inside."""
-    choice = Variable("law", "contacts.law", 1, 3, "choice", 1, choices=("a", "b", "c"))
-    whole = Variable("cycles", "drive.cycles", 2, 5, "whole", 3)
+    choice = Variable("law", "contacts.law", low=1, high=3, kind="choice", start=1, choices=("a", "b", "c"))
+    whole = Variable("cycles", "drive.cycles", low=2, high=5, kind="whole", start=3)
     grid = np.linspace(0, 1, 3001)
     # A fine grid, so that the parts are measured to 1/3000.
     numbers = np.array([choice.from_unit(x) for x in grid])
@@ -146,9 +146,9 @@ def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
 def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     """A function of a real number, a whole number and a choice, with a given least value, is minimised."""
     kinds = [
-        Variable("x", "x", 1e-3, 1e3, "log", 1e-2),
-        Variable("n", "n", 1, 30, "whole", 3),
-        Variable("c", "c", 1, 5, "choice", 1, choices=(5, 3, 0, 4, 9)),
+        Variable("x", "x", low=1e-3, high=1e3, kind="log", start=1e-2),
+        Variable("n", "n", low=1, high=30, kind="whole", start=3),
+        Variable("c", "c", low=1, high=5, kind="choice", start=1, choices=(5, 3, 0, 4, 9)),
     ]
     space = SearchSpace({}, kinds)
     steps = np.array([variable.step for variable in kinds])

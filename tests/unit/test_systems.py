@@ -56,8 +56,9 @@ def test_forces_are_the_energy_gradient():
 
 def test_gaps_are_those_to_the_stop_on_the_side_of_the_motion():
     """A contact with two clearances is beyond the nearer stop on one side, and within the other on the other side."""
-    pairs = (ContactPair(None, 0, 0.1, LINEAR_STOP, 0.13), ContactPair(None, 0, 0.1, LINEAR_STOP, np.inf))
-    system = System.assemble([1.0], [(None, 0, 1.0)], pairs)
+    two_sided = ContactPair(None, 0, clearance=0.1, law=LINEAR_STOP, clearance_minus=0.13)
+    one_sided = ContactPair(None, 0, clearance=0.1, law=LINEAR_STOP, clearance_minus=np.inf)
+    system = System.assemble([1.0], [(None, 0, 1.0)], (two_sided, one_sided))
 
     assert system.gaps(np.array([[0.12], [-0.12]])) == pytest.approx(np.array([[0.02, 0.02], [-0.01, -np.inf]]))
     assert not system.odd
