@@ -323,6 +323,7 @@ TOUCHING = {"sites": [3], "stiffness": 1e6, "next_cell": True, "side": "minus", 
     ("the cell has none", {"lattice": BEADS, "drive": {"end": "left"}}),
 ])  # fmt: skip
 def test_nonsense_has_one_message(key, sections):
+    """Each wrong case is refused with one message, which names its key."""
     table = {"lattice": {"preset": "four-band", "cells": 60}, "contacts": {"sites": [20, 30], "clearance": 1e-4}}
     if sections.get("lattice", {}).get("cell"):
         times = {

@@ -45,11 +45,18 @@ def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: 
     """Displacements and velocities (2, n) a period after ``start`` (2, n) at the phase ``PHASE``, by SciPy."""
     chain = states.case.model().chain
     n = len(chain.masses())
-    stops = tuple(Stop(3, 2, CLEARANCE, 1e7, 1.5, RESTITUTION, side) for side in (1, -1))
+    stops = tuple(
+        Stop(resonator=3, host=2, gap=CLEARANCE, stiffness=1e7, exponent=1.5, restitution=RESTITUTION, side=side)
+        for side in (1, -1)
+    )
     push = np.zeros(n)
     push[0] = amplitude
     lattice = ScipyLattice(
-        chain.masses(), chain.stiffness_matrix().toarray(), np.zeros((n, n)), stops, lambda t: push * np.cos(omega * t)
+        masses=chain.masses(),
+        stiffness=chain.stiffness_matrix().toarray(),
+        damping=np.zeros((n, n)),
+        stops=stops,
+        force=lambda t: push * np.cos(omega * t),
     )
     # The integrator begins with open stops, hence at a phase without contact.
     times = (PHASE + np.array([0.0, 2 * np.pi])) / omega

@@ -62,6 +62,7 @@ def ending(table: dict[str, Any], **nnm: Any) -> str:
 
 @pytest.mark.parametrize("table", [AT_START, AT_END])
 def test_a_branch_that_ends_at_a_touch_names_the_contact(table):
+    """A branch that ends at the grazing of contact 2 names it, and goes on with smaller steps and a wider guard."""
     assert "contact 2 grazes there" in ending(table)
     assert "points reached" in ending(table, smallest_step=1e-18, guards={"corrector": 0.5})
 

@@ -130,7 +130,7 @@ def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
 
     matrices = chain_matrices(count, stiffness, 0.0, ground=3.0)
     stops = tuple(
-        Stop(resonator, host, gap, 3e8, 1.5, 0.75, side)
+        Stop(resonator, host, gap, stiffness=3e8, exponent=1.5, restitution=0.75, side=side)
         for resonator, host, gap, side in ((1, 0, 2e-4, 1), (1, 0, 1.5e-4, -1), (2, -1, 6e-4, 1), (2, -1, 3e-4, -1))
     )
     lattice = ScipyLattice(np.full(count, mass), *matrices, stops, force)

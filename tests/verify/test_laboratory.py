@@ -121,6 +121,7 @@ def test_a_site_is_of_the_masses_of_its_cell():
 
 @pytest.mark.slow
 def test_an_absorbing_end_is_that_of_all_drives():
+    """An absorbing end is chosen, and its reflection stated, for the waves of all drives, none of which acts in it."""
     ends = {"cells": 90, "absorbing": {"cells": 10, "strength": 400.0}}
     with pytest.raises(CaseError, match=r"lattice\.absorbing\.end.*cell 85, which is in the absorbing end"):
         small_case(lattice=ends, drive={"more": [{"frequency": 1500.0, "cell": 85}]})

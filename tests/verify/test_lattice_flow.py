@@ -61,6 +61,7 @@ class Linearised(NamedTuple):
 
 
 def linearise(flow: LatticeFlow, start: np.ndarray, change: np.ndarray) -> Linearised:
+    """The change of an arc's end along ``change`` (2 dof, cell), by the linearisation and by a central difference."""
     # With this step the errors of rounding and of the third derivative are both about 1e-8.
     step = 1e-6
     ahead = flow.arc(start + step * change, PERIOD).end

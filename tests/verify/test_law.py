@@ -202,6 +202,7 @@ def refined(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_law_is_refined_to_its_onset(refined):
+    """The points of a law are as dense as asked for where transmission drops, and the law is drawn from its file."""
     case, law, folder = refined
     transmitted = law.mean.transmitted
 
@@ -262,7 +263,17 @@ def law_by_hand() -> ScatteringLaw:
         separation=times,
         release=times,
     )
-    return ScatteringLaw(z, mean, mean, 1, 1e-3, 1e-4, np.zeros(1), np.zeros(1), {})
+    return ScatteringLaw(
+        z,
+        mean=mean,
+        scatter=mean,
+        drive_band=1,
+        clearance=1e-3,
+        peak=1e-4,
+        linear_time=np.zeros(1),
+        linear_envelope=np.zeros(1),
+        about={},
+    )
 
 
 def test_between_points_the_law_is_linear_in_log_z():

@@ -148,6 +148,7 @@ def test_the_spectrum_at_any_frequency_is_the_transform():
 
 @pytest.mark.slow
 def test_the_file_and_the_picture_have_what_dashpots_take(tmp_path):
+    """The fraction that dashpots take completes the sum to one, and is in the summary, the file and the picture."""
     case = damped_case({"mass": 10.0}, largest=1.3, finest=0.5)
     law = make_law(case, tmp_path, MPI.COMM_SELF)
 

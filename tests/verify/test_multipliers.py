@@ -34,7 +34,7 @@ def lattice_shooting() -> LatticeShooting:
     """The shooting problem of a lattice with one contact site, by quarter periods and without dense matrices."""
     chain = breather_chain()
     system = System.from_chain(chain, STOPS, dense=False)
-    return LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 10)
+    return LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, tolerance=1e-12, max_newton=10)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
     map_ = flow.gather(half.move(flow.scatter(np.eye(2 * problem.system.dofs)))).T
     dense = np.linalg.eigvals(map_) ** 2
 
-    found = largest_multipliers(flow, problem.system, True, point.x, point.period, 4)
+    found = largest_multipliers(flow, problem.system, odd=True, u=point.x, period=point.period, wanted=4)
 
     assert len(found) >= 2
     assert found[:, 1].real.max() < 1e-8

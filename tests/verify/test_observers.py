@@ -17,8 +17,15 @@ from vipetsc.dynamics.samples import Block
 def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Block:
     """Samples one second apart with ``work`` done and ``total`` kinetic energy, both (sample,) in J."""
     none = np.zeros(len(work))
-    energies = Energies(np.array(total), none, none, np.array(work), none + dissipated, none)
-    return Block(0, np.arange(len(work)) * 1.0, energies, None, None)
+    energies = Energies(
+        kinetic=np.array(total),
+        spring=none,
+        contact=none,
+        work=np.array(work),
+        dissipated=none + dissipated,
+        dissipated_by_damping=none,
+    )
+    return Block(first=0, times=np.arange(len(work)) * 1.0, energies=energies, samples=None, state=None)
 
 
 def begun(kind: type[Observer]) -> Observer:

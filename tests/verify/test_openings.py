@@ -75,6 +75,7 @@ def pair(request):
 
 
 def test_the_contacts_are_those_of_the_whole_run(pair):
+    """A run that begins linearly has the contacts of the run from rest, and the same counts of steps."""
     case, (whole, statistics, _), (begun, numbers, samples) = pair
     first = whole["impacts/onset"].values.min()
     assert whole.sizes["episode"] > 3
@@ -89,6 +90,7 @@ def test_the_contacts_are_those_of_the_whole_run(pair):
 
 
 def test_every_variable_is_that_of_the_whole_run(pair):
+    """Every variable of a run that begins linearly is that of the run from rest, to 1e-9 of its largest value."""
     _, (whole, _, _), (begun, _, samples) = pair
     assert begun.variables.keys() == whole.variables.keys()
     for name, variable in whole.variables.items():
@@ -152,6 +154,7 @@ def test_a_run_that_may_touch_at_once_begins_at_rest():
     ],
 )
 def test_members_begin_from_a_linear_run_that_several_have_in_common(sweep, sections, begins):
+    """Members begin linearly if at least three of them differ only in what leaves the linear run as it is."""
     plan = Sweep.from_table(with_sections(TABLE, sections) | {"sweep": sweep})
     assert begins_linearly(plan, plan.case(0)) == begins
 

@@ -23,6 +23,7 @@ PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 @pytest.mark.slow
 @pytest.mark.parametrize("sections", [{}, PART, {"output": {"fields": []}}])
 def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
+    """A run has the same bits with chunks of any length."""
     case = small_case(**sections, time={"end": 0.04})
     simulate(case, folder / "long")
 

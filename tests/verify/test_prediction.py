@@ -69,6 +69,7 @@ def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[
 
 @pytest.mark.slow
 def test_energy_is_whole_and_no_fraction_is_negative(prediction):
+    """Predicted energies of bands and the loss sum to one, and no energy of a band is negative."""
     data = prediction.data
 
     predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
@@ -150,6 +151,7 @@ def test_without_loss_nothing_is_lost(prediction):
 
 
 def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
+    """The prediction is the same for sites that the case lists in another order."""
     linear, answers = prediction.records()
     # This lattice is the same, with its sites in another order.
     swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
@@ -161,6 +163,7 @@ def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
 
 
 def test_a_site_that_nothing_reaches_changes_nothing(prediction):
+    """A site with a clearance of a metre leaves the prediction as it is."""
     linear, answers = prediction.records()
     # A clearance of a metre is never closed.
     more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})

@@ -163,6 +163,7 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
     ],
 )
 def test_agrees_with_the_time_stepper(lattice, contacts, drive, time):
+    """Both engines give the same motion, impacts and energies, for many ends, laws, losses, drives and intervals."""
     case = small_case(lattice=lattice, contacts=contacts, drive=drive, time=time)
 
     # The runs have contacts, and are not linear.
@@ -197,6 +198,7 @@ def test_agrees_on_contacts_of_any_pair(lattice, contacts):
 
 @pytest.mark.slow
 def test_agrees_on_other_cells():
+    """Both engines agree on a diatomic lattice and on cells of three masses."""
     diatomic = {
         "lattice": {"preset": "diatomic", "cells": 31},
         "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
@@ -217,11 +219,13 @@ def test_agrees_on_other_cells():
 
 @pytest.mark.slow
 def test_agrees_on_half_of_the_builtin_run():
+    """Both engines agree on the built-in run up to 0.44 s."""
     assert assert_engines_agree(Case.load(None, ["time.end=0.44"]))["episodes"] > 80
 
 
 @pytest.mark.slow
 def test_the_builtin_run_takes_the_steps_it_needs():
+    """The built-in run takes one step from each sample to the next, and few substeps."""
     _, result = simulated(with_engine(Case.load(), "propagator"))
     statistics = result.statistics
 
@@ -253,6 +257,7 @@ def test_tolerance_keeps_its_promise():
 )
 @pytest.mark.parametrize("engine", ["auto", "propagator"])
 def test_what_does_not_suit_it_is_stepped_and_noted(sections, reason, engine):
+    """A case that the propagator refuses is run by ``ts``, and a note gives the reason."""
     _, result = simulated(small_case(**sections, time={"end": 0.002, "engine": engine}))
 
     assert result.statistics["engine"] == "ts"
@@ -260,6 +265,7 @@ def test_what_does_not_suit_it_is_stepped_and_noted(sections, reason, engine):
 
 
 def test_auto_takes_it_where_it_suits():
+    """The engine "auto" is the propagator for a case that the propagator does not refuse."""
     _, result = simulated(small_case(time={"end": 0.002, "engine": "auto"}))
 
     assert result.statistics["engine"] == "propagator"
@@ -270,6 +276,7 @@ def test_auto_takes_it_where_it_suits():
     ("looks", "contacts", "damping"), [(0, {}, {}), (2, {}, {}), (4, {}, {"mass": 10.0}), (3, PRESSED, {})]
 )
 def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts, damping):
+    """A run that is stopped between blocks of samples is resumed to the bits and counts of the whole run."""
     # The run of 251 samples has six blocks of at most 49 samples, and can stop between them.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
     # One site is at the driven end, one stands alone, and two are neighbours, whose contacts are solved together.

@@ -158,4 +158,5 @@ def test_many_springs_go_to_ts():
 
 
 def test_variations_are_those_of_linear_springs():
+    """The engine that moves variations refuses lattices with nonlinear springs."""
     assert "quadratic or cubic" in (TangentPropagator.refusal(sprung().model()) or "")

@@ -66,6 +66,7 @@ def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_pr
 
 
 def test_the_format_of_a_file_is_its_own(tmp_path):
+    """An ensemble's file has the version of its own format, 2."""
     run_sweep(Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0]}}}), tmp_path, MPI.COMM_SELF)
     assert attributes(tmp_path / "ensemble.h5")["format_version"] == 2
 

@@ -70,6 +70,7 @@ def ten_cells(tmp_path_factory):
 
 
 def test_what_follows_from_the_lattice_is_filled_in():
+    """Whether a lattice is infinite and its motion symmetric follows from its ends, dashpots and stops."""
     case = NfrcCase.from_table(TWO_MASSES)
     assert (case.nfrc.infinite, case.nfrc.symmetric) == (False, False)
     plain = NfrcCase.from_table({"nfrc": {"range": [0.9, 1.1]}})

@@ -15,6 +15,7 @@ from vipetsc.io.store import RunMemory
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize("damping", ["exact", "flores"])
 def test_a_law_that_no_site_has_may_have_no_limit(engine, damping):
+    """A run is complete although the common law, which no site has, would have an infinite damping factor."""
     # The damping factors of both names grow without bound as the restitution tends to 0.
     contacts = {"restitution": 0.0, "damping": damping, "each": {"restitution": [0.5, 0.6, 0.7]}}
     case = small_case(contacts=contacts, time={"end": 0.04, "engine": engine})

@@ -236,6 +236,7 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
     ],
 )
 def test_refusals(changes, key, reason):
+    """A wave, too many unknowns, and a linear lattice without contacts are refused with their reasons."""
     table = chain_of(2, {"cubic": 1.0})
     if "source" in changes.get("nfrc", {}) and changes["nfrc"]["source"] == "wave":
         table = table | {"lattice": {name: value for name, value in table["lattice"].items() if name != "damping"}}

@@ -99,6 +99,7 @@ def test_folds_are_no_branch_points(tmp_path):
 
 @pytest.mark.slow
 def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_path):
+    """Only ``special_points = "all"`` locates points between unstable states; regular points are as many either way."""
     changes = {"contacts": {"clearance": 0.05, "side": "both"}, "nfrc": {"range": [1.6, 1.7]}}
     kinds = {}
     for asked in ("stability", "all"):
@@ -113,6 +114,7 @@ def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_pat
 
 @pytest.mark.slow
 def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, tmp_path, monkeypatch):
+    """A pair that cannot be followed is located by the number of multipliers beyond 1, and has no sideband."""
     _, points = with_pair
     at = [point.measured.frequency for point in points if point.kind == "neimark-sacker"]
     monkeypatch.setattr("vipetsc.modes.response.steady.SteadyStates.growing_pairs", lambda self, xi: [])
@@ -201,6 +203,7 @@ def test_signs_and_numbers_give_the_kinds(right, slope, kinds):
 
 
 def test_pairs_come_in_the_order_of_their_growth(monkeypatch):
+    """Complex pairs are given by their members above the real axis, in the order of growth; real ones are left out."""
     zeros = [0.2 + 0.1j, 0.2 - 0.1j, 0.3 + 0j, 0.1 + 0.4j, 0.1 - 0.4j, 0.15 + 0.5j]
     monkeypatch.setattr(Hill, "_beyond", lambda self, series, growth: zeros)
     hill = Hill(None, omega=1.0, order=3, odd=False, finite=True)

@@ -265,6 +265,7 @@ SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
     ],
 )
 def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):
+    """Verbs and drives that need linear springs refuse nonlinear ones, and name the key."""
     table = TABLE | {"contacts": SITES} | sections
     # Each verb's case reads sections of its own. Others are left out, since they would be a problem by themselves.
     readable = {name: value for name, value in table.items() if value is not None and name in kind.keywords()}

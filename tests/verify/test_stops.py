@@ -19,6 +19,7 @@ def differing(engine="propagator", **contacts):
 
 
 def test_sites_that_differ_are_followed_alike_by_both_engines():
+    """Both engines give the same motion and impacts of sites with laws and stops of their own, and energy balances."""
     first = run_of(differing("propagator"))
     second = run_of(differing("ts"))
 

@@ -86,6 +86,7 @@ def entropy_figures(curves):
 
 @pytest.fixture(autouse=True)
 def style():
+    """Draw all figures of the module in the package's style."""
     with rc_style():
         yield
 

@@ -97,6 +97,7 @@ def test_hertzian_stops_that_touch_beside_one_that_does_not():
 
 
 def test_a_wave_is_refused():
+    """A stop that touches at rest is refused under a wave, whose amplitude is counted in clearances."""
     contacts = {"sites": [10], "clearance": 0.0, "side": "plus", "restitution": 1.0}
     with pytest.raises(CaseError, match="counts in clearances") as caught:
         NfrcCase.from_table({"lattice": {"preset": "four-band", "cells": 30}, "contacts": contacts, "nfrc": {}})

@@ -190,7 +190,7 @@ def one_sided():
     stops = [Stops(four_band_contact("hertz"), CLEARANCE, np.inf)]
     system = System.from_chain(chain, stops, dense=False)
     # The map is that of half a period, since a motion with a stop on one side has no symmetry of quarters.
-    problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, 1e-12, 12)
+    problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, tolerance=1e-12, max_newton=12)
     return chain, stops, problem.breather(OMEGA)
 
 
@@ -231,7 +231,7 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
     chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
     system = System.from_chain(chain, stops, dense=False)
-    problem = LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 12)
+    problem = LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, tolerance=1e-12, max_newton=12)
 
     near = problem.breather(1600.0, [1])
     far = problem.breather(1600.0, [2])
