@@ -63,11 +63,19 @@ class HarmonicBalance:
 
     Residual, derivative and energy are those of the compliance shifted by stiffnesses that ``shift`` chooses at a
     frequency: all of them are asked with one choice along a step. ``forces`` without a dependence on velocities, and no
-    load, make a motion conservative.
+    load, make a motion conservative. ``shifted`` is that of other equations with the same compliance, orders and
+    weight, whose values need not be computed again.
     """
 
     def __init__(
-        self, compliance: Compliance, forces: SiteForces, order: int, odd: bool, cosines: bool, weight: float = 1.0
+        self,
+        compliance: Compliance,
+        forces: SiteForces,
+        order: int,
+        odd: bool,
+        cosines: bool,
+        weight: float = 1.0,
+        shifted: ShiftedCompliance | None = None,
     ) -> None:
         self.compliance = compliance
         self.forces = forces
@@ -85,7 +93,9 @@ class HarmonicBalance:
             self._sine_places = slice(0, 0)
         self._sines = np.arange(order + 1)[self._sine_places]
         self.size = forces.pairs * (len(self.orders) + len(self._sines))
-        self.shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
+        if shifted is None:
+            shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
+        self.shifted = shifted
         # Newton's method asks for the same forces several times.
         self._series = LatestValues[tuple[bytes, float], ForceSeries](KEPT_MOTIONS)
 

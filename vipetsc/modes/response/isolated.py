@@ -131,7 +131,7 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
     reach = states.options.isola_reach
     update = {"over": "amplitude", "fixed": [omega], "range": [amplitude / reach, amplitude * reach]}
     case = lattice.case.model_copy(update={"nfrc": lattice.options.model_copy(update=update)})
-    return SteadyStates(case, lattice.restitution, omega, lattice.compliance, lattice.forces)
+    return SteadyStates(case, lattice.restitution, omega, forces=lattice.forces, like=lattice)
 
 
 class ClosingSteps(TurningSteps):

@@ -7,17 +7,15 @@ from dataclasses import replace
 
 from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.problem import FlowError
-from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.steady import SteadyStates
 
 
 class KeyedCase:
     """The lattices of a ``case`` over its key ``nfrc.over``, with a ``restitution`` and an ``amplitude``.
 
-    Keys of ``[contacts]`` leave the linear lattice as it is: its compliance is then computed once. ``amplitude`` is in
-    the unit of the drive (``NfrcTable``).
+    Keys of ``[contacts]`` leave the linear lattice as it is, and what is computed of it serves all their values.
+    ``amplitude`` is in the unit of the drive (``NfrcTable``).
     """
 
     def __init__(self, case: NfrcCase, restitution: float, amplitude: float) -> None:
@@ -38,19 +36,11 @@ class KeyedCase:
         restitution = self.restitution
         if key == "contacts.restitution":
             restitution = value
-        states = SteadyStates(case, restitution, case.nfrc.fixed[0], self._compliance(case))
-        # With the same compliance Hill's method needs the same values of it at the frequencies of perturbations.
-        if self._last is not None:
-            states.adopt(self._last)
-        self._last = states
-        return states
-
-    def _compliance(self, case: NfrcCase) -> WaveCompliance | ModalCompliance:
-        """The compliance of the lattice of a ``case``: the last one if the linear lattice is the same."""
-        last = self._last
-        if last is not None and _without_clearances(last.case) == _without_clearances(case):
-            return last.compliance
-        return compliance_of(case)
+        like = None
+        if self._last is not None and _without_clearances(self._last.case) == _without_clearances(case):
+            like = self._last
+        self._last = SteadyStates(case, restitution, case.nfrc.fixed[0], like=like)
+        return self._last
 
 
 def _without_clearances(case: NfrcCase) -> object:

@@ -49,7 +49,8 @@ class SteadyStates(SteadyEquations):
 
     ``fixed`` is the frequency in rad/s of a curve over the amplitude, the amplitude of one over the frequency
     (``NfrcTable``). ``compliance`` is that of the case, if it has been computed already; ``forces`` take the place of
-    the case's.
+    the case's. ``like`` are equations with the same linear lattice, drive and orders: what they have computed of the
+    lattice, also at the frequencies of perturbations, is not computed again.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class SteadyStates(SteadyEquations):
         fixed: float,
         compliance: WaveCompliance | ModalCompliance | None = None,
         forces: SiteForces | None = None,
+        like: "SteadyStates | None" = None,
     ) -> None:
         options = case.nfrc
         self.case = case
@@ -67,33 +69,42 @@ class SteadyStates(SteadyEquations):
         self.wave = options.source == "wave"
         if forces is None:
             forces = forces_of(case, restitution)
+        if like is not None:
+            compliance = like.compliance
         if compliance is None:
             compliance = compliance_of(case)
         self.forces = forces
         self.points, self.weights = driven_points(case)
-        self.compliance = compliance
+        self.compliance: WaveCompliance | ModalCompliance = compliance
         self.outputs = ResponseOutputs(case, self.compliance, self.forces.contacts)
 
         # Along a curve over the amplitude all states have one linear motion and one Hill's determinant.
         self._motions = LatestValues[float, LinearMotion](KEPT_MOTIONS)
         self._hill: Hill | None = None
         self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
+        shifted = None
+        if like is not None:
+            self._hill = like._hill
+            shifted = like.balance.shifted
+            # The amplitude of a wave counts in clearances, which may be other ones.
+            if not self.wave:
+                self._motions = like._motions
 
         clearance = self._unit()
         super().__init__(
             balance=HarmonicBalance(
-                self.compliance, self.forces, options.harmonics, odd=bool(options.symmetric), cosines=False
+                self.compliance,
+                self.forces,
+                options.harmonics,
+                odd=bool(options.symmetric),
+                cosines=False,
+                shifted=shifted,
             ),
             clearance=clearance,
             parameter=ContinuationParameter(options.over, fixed, self._scale(clearance)),
             tolerance=options.tolerance,
             max_newton=options.max_newton,
         )
-
-    def adopt(self, other: "SteadyStates") -> None:
-        """Take over the compliances at frequencies of perturbations from ``other``, if it has the same compliance."""
-        if other.compliance is self.compliance:
-            self._hill = other._hill
 
     def _unit(self) -> float:
         """Unit of displacements in m: the first clearance that is positive.

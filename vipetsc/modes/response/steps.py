@@ -170,7 +170,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
         springs = [
             replace(one, quadratic=s**4 * one.quadratic, cubic=s**4 * one.cubic) for one in states.forces.springs
         ]
-        return SteadyStates(case, states.restitution, omega, states.compliance, SiteForces(stops, springs))
+        return SteadyStates(case, states.restitution, omega, forces=SiteForces(stops, springs), like=states)
 
     options = case.nfrc.model_copy(update={"range": [0.0, 1.0]})
     weights = StatesOverKey(weighted, "weight of contacts", amplitude, options)
@@ -194,9 +194,8 @@ def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.n
     """
     update = {"over": "amplitude", "range": [1e-3 * amplitude, amplitude], "fixed": [omega]}
     below = states.options.model_copy(update=update)
-    ramp = SteadyStates(
-        states.case.model_copy(update={"nfrc": below}), states.restitution, omega, compliance=states.compliance
-    )
+    case = states.case.model_copy(update={"nfrc": below})
+    ramp = SteadyStates(case, states.restitution, omega, like=states)
     most = max(MOST_RAMP, int(LONGEST_RAMP / states.options.largest_step))
     try:
         points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, most)))
