@@ -178,7 +178,10 @@ def test_fractions_that_are_rounding_have_no_panel():
     ],
 )
 def test_outputs_on_one_page_are_those_that_all_curves_have(monkeypatch, variables, rows):
-    """A page has a row for each variable that all curves have: four of masses, which need the lag, one of forces."""
+    """Rows of a page are those for which all curves have the variables.
+
+    The lag yields four rows, three amplitudes and a phase of masses, and the largest force yields one.
+    """
     curves = [xr.Dataset(dict.fromkeys(names, 1.0)) for names in variables]
     assert bool(response_outputs.without_outputs(curves)) == (rows == 0)
 
@@ -225,7 +228,7 @@ def test_every_contact_and_every_motion_of_a_condensed_branch_has_a_curve(tmp_pa
 
 
 def test_a_branch_without_points_is_no_file(tmp_path):
-    """A branch without points is not drawn but named; where a folder has no other branch, the figure is named."""
+    """A branch without points is named in place of a picture, or the figure is if the folder has no other branch."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
     assert registry.draw(BRANCHES, [tmp_path]) == []
     assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == [registry.BRANCH]

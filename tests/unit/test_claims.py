@@ -64,7 +64,7 @@ def test_a_criterion_of_counts_is_met_from_its_number_on():
 def test_a_claim_holds_by_all_of_its_criteria_and_fails_by_a_decisive_one(values, expected):
     """A claim holds if all criteria are met, fails if a decisive one or all are missed, and else holds in part.
 
-    A criterion without a value is not met; a claim without any values is unmeasured.
+    A criterion without a value is missed; a claim without values is unmeasured.
     """
     criteria = (Criterion("a", "<=", 2, "", "", decisive=True), Criterion("b", "<=", 2, "", ""))
     judgement, _ = verdict(criteria, values)

@@ -210,7 +210,7 @@ def test_what_cannot_be_drawn_is_said(measured):
 
 @pytest.mark.slow
 def test_all_of_a_picture_can_be_read(tmp_path):
-    """No picture of a run has text outside the page or over other text, axes without labels or unnamed panels."""
+    """In every picture of a run texts lie on the page and apart from each other, axes have labels and panels names."""
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with rc_style(), Files() as files:

@@ -29,7 +29,7 @@ NONE = 2.0
         ([-0.2, -1.0], NONE),
         ([0.2, 1.0], NONE),
         ([1.2, -1.0], NONE),
-        # Motions that begin on the kink, within 2e-11, have one only where they come back.
+        # A kink within 2e-11 of the beginning does not count; one at 1e-10, or where the motion returns, does.
         ([0.0, 1.0, -2.0], 0.5),
         ([0.0, -1.0, 2.0], 0.5),
         ([0.0, 1.0, 0.0], NONE),
@@ -38,7 +38,7 @@ NONE = 2.0
         ([-2e-11, 1.0, -2.0], 0.5),
         ([1e-10, -1.0, 2.0], 1e-10),
         ([-1e-10, 1.0, -2.0], 1e-10),
-        # The substep ends on the kink, or has two of them inside, or the motion turns before it.
+        # A kink within 2e-11 of the end does not count; the first of two counts; a motion may turn before it.
         ([1.0, -1.0], NONE),
         ([-1.0, 1.0], NONE),
         ([1.0 - 2e-11, -1.0], NONE),

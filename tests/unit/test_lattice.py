@@ -318,7 +318,7 @@ def test_a_fast_separation_pulls_unless_it_is_clipped_or_the_approach_has_a_floo
 
 @pytest.mark.parametrize("cells", [100, 235, 400])
 def test_the_wave_of_a_long_ring_is_that_of_a_short_one(cells):
-    """The scale of a short burst depends neither on the length of a ring nor on the driven cell.
+    """The scale of a short burst is the same for rings of any length and for any driven cell.
 
     The burst decays before it has travelled once along the ring.
     """

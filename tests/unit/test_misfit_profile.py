@@ -34,7 +34,7 @@ class BentValley:
         return np.zeros(2 if abs(self.distance(z)) < WIDTH else 1)
 
     def solve(self, z: np.ndarray, ends: Any, active: list[int], precision: Any) -> np.ndarray:
-        """Return the nearest point of the valley, or ``z`` itself beyond the jump, where no derivative leads back."""
+        """Return the point of the valley at the same a, or ``z`` beyond the jump, where no derivative leads back."""
         assert active == [1]
         self.solutions += 1
         if abs(self.distance(z)) >= WIDTH:

@@ -108,7 +108,7 @@ def test_a_key_can_be_taken_out(tmp_path):
 
 
 def test_a_cell_of_ones_own_needs_no_contacts(tmp_path):
-    """A lattice whose cell is no preset has no sites without a section [contacts]; tests/verify simulates one."""
+    """A lattice with a cell of its own needs no section [contacts] and has no sites then; tests/verify runs one."""
     (case,) = load(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
     assert case.model().chain.sites == ()
 

@@ -223,7 +223,7 @@ def test_an_inset_has_numbers_of_its_own_within_its_axes(tmp_path):
 def test_every_claim_has_a_figure_that_shows_it():
     """Figures show all claims, and are those of the paper, its appendix and its supplement, in their order."""
     shown = {claim for figure in PAPER_FIGURES for claim in figure.claims}
-    # No claim lacks a picture, and no picture shows a claim that does not exist.
+    # Every claim has a picture, and every claim that a picture shows exists.
     assert shown == set(CLAIMS)
 
     paper = [f"Fig. {number}" for number in range(1, 13)]

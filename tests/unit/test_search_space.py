@@ -240,7 +240,7 @@ def test_keys_with_dots_are_found_and_changed():
         "list": [{"a": 6}],
         "new": {"b": {"c": 7}},
     }
-    # An entry beyond a list, a missing table and a key of a list have no value, and are no error.
+    # An entry beyond a list, a missing table and a key of a list yield None.
     assert value_at(table, "list[2].a") is value_at(table, "no.such") is value_at(table, "list.a") is None
 
 
