@@ -54,7 +54,7 @@ def test_a_zero_is_found_with_few_values(function, most):
 
 
 def test_a_value_outside_the_bracket_gives_a_better_estimate():
-    """With a third value the first estimate is the zero of a parabola, exact for a parabola."""
+    """The first estimate from three values is the zero of the parabola through them, which is exact for a parabola."""
 
     def parabola(x):
         return (x - ROOT) * (x + 2.0)

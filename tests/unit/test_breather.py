@@ -281,7 +281,7 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
 
 
 def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
-    """At 2200 rad/s, in the gap but without a breather, the error names the key to change."""
+    """The error for 2200 rad/s, in a gap but without a breather, names the key to change."""
     with pytest.raises(ContinuationError, match=r"no breather starts at 2200 rad/s: .*change nnm.start_frequency"):
         condensed_breather(cells=300, site=100, omega=2200.0)
 

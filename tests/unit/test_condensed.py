@@ -251,7 +251,7 @@ def test_the_solution_does_not_depend_on_the_shift():
 @pytest.mark.parametrize("weight", [0.1, 0.4, 1.0])
 @pytest.mark.parametrize("symmetry", ["odd", "any"])
 def test_a_weight_multiplies_the_compliance_of_harmonics_above_the_first(symmetry, weight):
-    """With a weight the residual has weight times G at all orders above 1, and its Jacobian follows."""
+    """The residual with a weight has weight times G at all orders above 1, and its Jacobian follows."""
     forces = hardening_forces()
     whole = random_balance(forces, 5, symmetry)
     balance = whole.weighted(weight)

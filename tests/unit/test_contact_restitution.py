@@ -61,7 +61,7 @@ def test_the_exact_damping_meets_every_restitution():
 
 @pytest.mark.parametrize(("factor", "asked"), [("flores", 0.05), ("flores", 0.052), ("flores", 0.06)])
 def test_the_strongest_damping_parts_the_masses_where_its_force_vanishes(factor, asked):
-    """With Flores's damping and a small restitution the effective one is close to 1/c, where g = 0."""
+    """The effective restitution with Flores's damping approaches 1/c, where g = 0, if a small one is asked for."""
     contact = Contact("hertz", STIFFNESS, asked, factor=factor)
     c = 1.6 * (1 - asked) / asked
     # With 1 - c e = exp(-q) the equation for the effective restitution e has the root q = c + 1 - log(1 + c), up to

@@ -90,7 +90,7 @@ def matrices_of(ends: str, cells: int = 12) -> LatticeMatrices:
 
 @pytest.mark.parametrize("ends", ["free", "periodic"])
 def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
-    """At the frequency 0 of the rigid motion the matrix of whole numbers is exactly singular; the mode is found."""
+    """The rigid motion is found at its frequency 0, where the matrix of whole numbers is exactly singular."""
     matrices = matrices_of(ends)
     modes = modes_near(matrices, 1, 0.0)
     assert modes.frequency.tolist() == [0.0]

@@ -210,7 +210,7 @@ def test_what_cannot_be_drawn_is_said(measured):
 
 @pytest.mark.slow
 def test_all_of_a_picture_can_be_read(tmp_path):
-    """In every picture of a run texts lie on the page and apart from each other, axes have labels and panels names."""
+    """Texts of every picture of a run lie on the page and apart from each other; axes have labels and panels names."""
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with rc_style(), Files() as files:
@@ -290,7 +290,7 @@ def test_a_figure_that_a_source_does_not_have_is_refused(source, name, message):
 
 
 def test_panels_of_a_large_grid_have_letters_as_far_as_there_are_numerals():
-    """Of fourteen rows of panels, as in a sweep over fourteen wavenumbers, twelve have letters and numerals."""
+    """Twelve of fourteen rows of panels, as in a sweep over fourteen wavenumbers, have letters and numerals."""
     with rc_style():
         grid = new_figure(4, 14).subplots(14, 2)
         for axes in grid.flat:

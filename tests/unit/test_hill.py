@@ -60,7 +60,7 @@ class EqualOscillators:
 
 @pytest.mark.parametrize(("stiffness", "growing"), [(2.3, 1), (0.5, 0)])
 def test_each_of_several_equal_sites_counts(stiffness, growing):
-    """Their zeros coincide, beside the line on which D is followed: D turns by a whole circle between two positions."""
+    """Equal sites, whose zeros coincide, count one by one, though D turns by a whole circle between two positions."""
     for count in (1, 5, 6):
         z = np.zeros((count, 10), complex)
         z[:, 1] = 1.3

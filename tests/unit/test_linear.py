@@ -67,7 +67,7 @@ def cubic_springs() -> Case:
 
 @pytest.mark.parametrize("build", [two_drives, cubic_springs])
 def test_a_lattice_that_does_not_move_in_proportion_is_not_scaled(build):
-    """With two drives or nonlinear springs the linear run has the case's own amplitudes and no contacts."""
+    """The linear run of a case with two drives or nonlinear springs has its own amplitudes and no contacts."""
     case = build()
     assert not is_proportional(case)
     assert factor(case) == 1.0

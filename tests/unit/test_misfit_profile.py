@@ -58,7 +58,7 @@ def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
 
 
 def test_a_contact_that_no_motion_keeps_is_given_up():
-    """For a < -2 the motion has one contact for any b, and the profile has the cost with the jump."""
+    """A profile has the cost with the jump for a < -2, where the motion has one contact for any b."""
 
     class Lost(BentValley):
         def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:

@@ -91,7 +91,7 @@ def test_a_byte_order_mark_is_no_key(tmp_path):
 
 
 def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):
-    """At kappa = pi the group velocity is 0, hence no end of the run follows from it; a given end is accepted."""
+    """A given end of the run is accepted at kappa = pi, where no end follows from the group velocity, 0."""
     (case,) = load(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
     # The frequency is the upper edge of band 2, (k2/m)^(1/2) = (1e4/0.005)^(1/2).
     assert case.drive.frequency == pytest.approx(1414.2136)

@@ -82,7 +82,7 @@ def test_a_search_that_has_contracted_begins_again_with_more():
 
 
 def test_where_nothing_differs_generations_stay_within_bounds():
-    """With equal losses the search starts again at once, and generations grow to at most eight times the first."""
+    """A search with equal losses starts again at once, and generations grow to at most eight times the first."""
 
     def flat(points):
         return np.ones((len(points), 1))

@@ -124,7 +124,7 @@ def test_paper_choice(found):
 
 
 def test_no_cell_is_out_of_phase():
-    """With a stiff spring the resonator follows its host: deflections are negative, and there is no optimum."""
+    """A resonator on a stiff spring follows its host: deflections are negative, and there is no optimum."""
     stiff = search_cells("printed", [5.0, 50.0], [0.3, 0.5], KAPPA)
 
     assert not stiff.out_of_phase.any()

@@ -87,7 +87,7 @@ def test_every_key_has_its_place_in_a_design():
 
 
 def test_the_case_is_the_start_and_survives_the_unit_cube():
-    """At the values of the case the design is the case, and values return from the cube as they were."""
+    """The design with the values of the case is the case, and values return from the cube unchanged."""
     plan = plan_of(
         {
             "clearance": [1e-5, 1e-2],

@@ -59,7 +59,7 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
 @pytest.mark.parametrize("cells", [24, LANES + 12, 3 * LANES + 17])
 @pytest.mark.parametrize("name", ["diatomic", "three-mass", "four-band"])
 def test_every_cell_is_the_same_sum_to_the_last_bit(name, cells):
-    """In a ring every cell gets the sum of the interior stencil in the same order, in vectors of cells or alone."""
+    """Every cell of a ring gets the sum of the interior stencil in the same order, in vectors of cells or alone."""
     case = Case.load(
         f"runs/examples/{name}.toml", [f"lattice.cells={cells}", "lattice.ends=periodic", "contacts.sites=[5]"]
     )

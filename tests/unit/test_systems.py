@@ -26,7 +26,7 @@ def test_reduced_model_of_the_paper():
 
 
 def test_reduced_model_of_another_cell():
-    """In the diatomic cell the host is on two springs of 90 kN/m to its neighbours, and on a third to the resonator."""
+    """The host of the diatomic cell is on two springs of 90 kN/m to its neighbours, and on a third to the resonator."""
     system = System.reduced(diatomic(), Stops.both(LINEAR_STOP, CLEARANCE))
     assert system.stiffness == pytest.approx(np.array([[2 * 9e4 + 9e4, -9e4], [-9e4, 9e4]]))
 

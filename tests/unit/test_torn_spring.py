@@ -31,7 +31,7 @@ def test_a_spring_is_torn_between_the_zeros_of_its_force(elongation, limit):
 
 
 def test_the_spring_farthest_beyond_its_limit_is_named():
-    """Of springs z - z^2, whose force is zero at 1, the one with the largest elongation over this limit is named."""
+    """The spring with the largest elongation over its limit is named; the force z - z^2 has the limit 1."""
     spring = Spring(0, 0, 1.0, next_cell=True, quadratic=-1.0)
     chain = Chain(UnitCell(masses=(1.0,), springs=(spring,), host=0, resonator=0), 4)
 
