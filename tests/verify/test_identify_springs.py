@@ -12,7 +12,7 @@ from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.initial_state import state_of
 from vipetsc.identification.misfit import Misfit
-from vipetsc.identification.motion import MotionCoefficients, no_slopes, respond, stacked_slopes
+from vipetsc.identification.motion import MotionCoefficients, MotionError, no_slopes, respond, stacked_slopes
 from vipetsc.identification.motion_begin import MotionBegin
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.studies.identification import read_records, run_identification
@@ -125,6 +125,24 @@ def test_derivatives_are_differences_of_scipy(record):
     expected = (ends[1] - ends[0]) / (2 * short) * plan.parameters[-1].slope(z[-1])
     error = np.abs(slopes[1:, :, -1] - expected).max(axis=0)
     assert (error < 1e-3 * np.abs(expected).max(axis=0)).all(), error
+
+
+def test_a_motion_that_fails_is_worse_than_a_wrong_one(record, monkeypatch):
+    """Also where the noise that is given is a billionth of the data: the wrong motion has residuals of 1e9 then."""
+    plan = IdentifyCase.from_table(table_of(record, [{"quantity": "spring", "bounds": [1e4, 1e5]}], spring=6e4))
+    misfit = Misfit(plan, read_records(plan))
+    misfit.noise = [1e-9 * size for size in misfit.noise]
+    z = np.array([plan.parameters[0].to_coordinate(plan.parameters[0].start)])
+    wrong = misfit.residuals(z, [1.0])
+    assert np.abs(wrong).max() > 1e9
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise MotionError("no motion")
+
+    monkeypatch.setattr(misfit, "predicted", fail)
+    rejected = misfit.residuals(z, [1.0])
+    assert rejected.shape == wrong.shape
+    assert rejected.min() > 10 * np.abs(wrong).max()
 
 
 @pytest.mark.slow

@@ -104,8 +104,7 @@ class GrowingWindows:
         self._solutions = 0
         self.last = [float(record.times[-1]) for record in misfit.records]
 
-        # A new misfit has the sizes of channels, root mean squares, in the place of their noise.
-        self._sizes = misfit.noise
+        self._sizes = misfit.sizes
         tables = misfit.plan.options.records
         self._is_given = [np.array([sensor.noise is not None for sensor in table.sensors]) for table in tables]
         misfit.noise = []

@@ -25,9 +25,10 @@ from vipetsc.identification.precision import EXACT, Tolerances
 
 # Rows of a response, by the quantity of a sensor; the derivative with respect to time is in the row after it.
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-# Residual of a motion that cannot be computed, in units of the noise: a step that leads there is rejected. Residuals as
-# large as the data themselves are less than this as long as the noise is more than 1e-8 of the data.
+# Residual of a motion that cannot be computed, in units of the noise: a step that leads there is rejected. It is at
+# least so many times the size of the data, which motions that can be computed do not reach however small the noise is.
 REJECTED = 1e8
+REJECTED_SIZE = 1e3
 # Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not
 # depend on the number of ranks that share them, and with the parts all steps and bits are the same on any number. Each
 # part integrates the motion again: seven derivatives in two parts cost 1.3 times as much as in one.
@@ -48,10 +49,10 @@ def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
 class Misfit:
     """Residuals of the ``records`` of a ``plan`` over their noise, (model - measured)/``noise``.
 
-    ``noise`` has one array (sensor,) a record, in SI units; a new misfit has the root mean squares of the channels
-    there. The ``size`` coordinates z (coordinate,) are those of the parameters, then those of the initial states that
-    are estimated, ``states`` by the number of the record. ``watched`` (record) are the masses (sensor,) at which the
-    sensors are. ``compute`` returns the values of jobs that do not depend on each other: ranks may share them.
+    ``noise`` has one array (sensor,) a record, in SI units; a new misfit has the ``sizes`` of the channels there, root
+    mean squares. The ``size`` coordinates z (coordinate,) are those of the parameters, then those of the initial states
+    that are estimated, ``states`` by the number of the record. ``watched`` (record) are the masses (sensor,) at which
+    the sensors are. ``compute`` returns the values of jobs that do not depend on each other: ranks may share them.
     """
 
     def __init__(
@@ -66,7 +67,8 @@ class Misfit:
         self._trials = [plan.trials(number) for number in range(len(records))]
         self._alone = lru_cache(maxsize=KEPT)(self._new_alone)
         self._slopes = [CoefficientSlopes(plan.parameters, trials) for trials in self._trials]
-        self.noise = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
+        self.sizes = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
+        self.noise = list(self.sizes)
         base = plan.base
         dofs = base.lattice.unit_cell().dofs
         self.watched = []
@@ -277,7 +279,8 @@ class Misfit:
         """Residuals (datum,) over the noise at ``z`` (coordinate,), up to times ``ends`` (record,) in s of the records.
 
         Data are ordered by record, sample, sensor; a record with an end of -inf is left out. Residuals of a record are
-        ``REJECTED`` where the model is impossible or its motion cannot be followed.
+        ``REJECTED``, or more if the noise is very small, where the model is impossible or its motion cannot be
+        followed.
         """
 
         def residuals_of(number: int) -> np.ndarray:
@@ -286,7 +289,8 @@ class Misfit:
             try:
                 values, _ = self.predicted(z, number, ends[number], tolerances=tolerances)
             except (CaseError, MotionError):
-                return np.full(measured.size, REJECTED)
+                rejected = np.maximum(REJECTED, REJECTED_SIZE * self.sizes[number] / self.noise[number])
+                return np.broadcast_to(rejected, measured.shape).ravel()
             return np.asarray((values - measured) / self.noise[number]).ravel()
 
         return np.concatenate(self.compute([partial(residuals_of, number) for number in self._used(ends)]))
