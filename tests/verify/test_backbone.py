@@ -13,6 +13,7 @@ from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import RecordFile
+from vipetsc.studies import backbone
 from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
 from vipetsc.studies.linear_run import LinearRun, linear_name
 
@@ -202,6 +203,22 @@ def test_branch_is_read_at_its_regular_points(tmp_path):
     assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)
     assert found.sizes["point"] == slope.sizes["point"] - 1
     assert found.attrs == {"law": "hertz", "reading": "printed"}
+
+
+def test_a_change_in_either_of_two_branches_of_one_name_is_seen(tmp_path):
+    """What was related to folders "a/nnm" and "b/nnm" is stale when either of them has changed."""
+    sweep = tmp_path / "sweep"
+    branches = [tmp_path / parent / "nnm" for parent in "ab"]
+    for folder, name in ((sweep, "ensemble.h5"), *((branch, BRANCH) for branch in branches)):
+        folder.mkdir(parents=True)
+        (folder / name).write_bytes(b"as it was")
+    before = backbone._sources(sweep, branches)
+    assert list(before) == ["sweep", "a/nnm", "b/nnm"]
+    for changed in branches:
+        (changed / BRANCH).write_bytes(b"as it is")
+        after = backbone._sources(sweep, branches)
+        assert after != before
+        before = after
 
 
 def test_folders_without_the_branch_are_refused(tmp_path):

@@ -8,6 +8,7 @@ the drive's work at which contact begins from the linear run, ``align`` scales o
 
 import hashlib
 import json
+import os
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -250,9 +251,13 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of the files from which ``backbone.h5`` is computed, by folder."""
-    files = {folder.name: folder / "ensemble.h5"} | {branch.name: branch / BRANCH for branch in branches}
-    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+    """SHA-256 of the files from which ``backbone.h5`` is computed, by folder within the one that contains them all."""
+    files = {folder.resolve(): "ensemble.h5"} | {branch.resolve(): BRANCH for branch in branches}
+    common = os.path.commonpath([path.parent for path in files])
+    return {
+        path.relative_to(common).as_posix(): hashlib.sha256((path / name).read_bytes()).hexdigest()
+        for path, name in files.items()
+    }
 
 
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
