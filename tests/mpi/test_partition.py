@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
@@ -12,6 +13,7 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, on_two, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.failing_place import _fastest_cell
 from vipetsc.dynamics.observers import Observer
 from vipetsc.dynamics.propagator import engine
 from vipetsc.dynamics.propagator.engine import Forces
@@ -141,6 +143,17 @@ def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
     case = small_case(contacts={"sites": [5]}, time={"engine": "propagator"})
     with pytest.raises(ValueError, match="no room"):
         simulate(case, RunMemory(MPI.COMM_WORLD))
+
+
+@pytest.mark.parallel([1, 2])
+def test_of_cells_that_move_equally_fast_the_first_is_named():
+    """A state that is not finite is so in many cells, of several ranks."""
+    comm = MPI.COMM_WORLD
+    layout = SimpleNamespace(comm=comm, dofs=1, owned=3, start=3 * comm.rank)
+    engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
+    model = SimpleNamespace(chain=SimpleNamespace(sites=(4,)))
+    place = _fastest_cell(SimpleNamespace(layout=layout, engine=engine, model=model))
+    assert place == "cell 2, nearest site 1 in cell 5"
 
 
 @pytest.mark.parallel([2, 3])

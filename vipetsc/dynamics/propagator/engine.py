@@ -251,7 +251,8 @@ class Propagator(OpeningEngine):
         acting = forces.describe(int(progress["cluster"]))
         if acting:
             reason = f"{acting} at {progress['time']:.9g} s"
-        _, reason = min(comm.allgather((int(progress["failed"]), reason)))
+        # Of ranks that fail in one step the first: all have the same reason then, on any number of ranks.
+        _, reason = min(comm.allgather((int(progress["failed"]), reason)), key=lambda of_rank: of_rank[0])
         return FillResult(failed // parts - samples.number + 1, bool(stop), reason)
 
     def _time_after(self, steps: int) -> float:
