@@ -200,6 +200,48 @@ def test_branches_begin_where_a_motion_oscillates(ends, contacts, still):
     assert np.sum(frequencies < 1e-6 * frequencies[-1]) == still
 
 
+@pytest.mark.parametrize("nnm", [{}, {"method": "condensed"}, {"system": "condensed", "start_frequency": [4e3]}])
+def test_a_stop_on_one_side_pushes_loose_grains_apart(nnm):
+    """No unsymmetric motion of grains repeats itself unless they are pressed together."""
+    nnm = {"modes": [8]} | nnm
+    for contacts in (APART | {"side": "minus"}, APART | {"clearance_minus": 2e-5}):
+        given = modes_case([8], contacts)
+        given["nnm"] |= nnm
+        with pytest.raises(CaseError, match="its mean force pushes them apart") as error:
+            NnmCase.from_table(given)
+        assert error.value.problems[0].key == "contacts.clearance"
+    for contacts in (APART, PRESSED):
+        given = modes_case([8], contacts)
+        given["nnm"] |= nnm
+        assert NnmCase.from_table(given)
+
+    # A quadratic spring makes motions unsymmetric, too.
+    given = modes_case([8], APART)
+    given["nnm"] |= nnm
+    given["lattice"]["cell"] = {"masses": [4e-3, 2e-3], "springs": [INSIDE | {"quadratic": 1e6}]}
+    with pytest.raises(CaseError, match="its mean force pushes them apart"):
+        NnmCase.from_table(given)
+
+
+@pytest.mark.parametrize(
+    ("side", "joint", "is_refused"), [("plus", [], True), ("both", [], False), ("plus", [1], False)]
+)
+def test_a_stop_on_one_side_pushes_a_loose_mass_of_ones_own_system_away(side, joint, is_refused):
+    """A spring that is not linear holds the mass as a linear one does."""
+    own = {
+        "masses": [1.0, 1.0],
+        "springs": [{"start": 0, "end": 1, "stiffness": 1.0}],
+        "smooth": [{"start": start, "end": 2, "cubic": 1.0} for start in joint],
+        "contacts": [{"host": 1, "resonator": 2, "clearance": 0.1}],
+    }
+    given = {"contacts": {"stiffness": 10.0, "side": side}, "nnm": {"system": "own", "modes": [2], "own": own}}
+    if not is_refused:
+        assert NnmCase.from_table(given)
+        return
+    with pytest.raises(CaseError, match="its mean force pushes them apart"):
+        NnmCase.from_table(given)
+
+
 def test_modes_of_a_pressed_chain_are_those_of_masses_in_masses():
     """The modes of n pressed grains have kappa = j pi/n with free ends.
 

@@ -218,6 +218,34 @@ def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
     assert orbit.episodes == point.episodes
 
 
+@pytest.mark.parametrize("resonators", [False, True])
+def test_free_grains_condensed_onto_their_contacts_return(resonators):
+    """No force moves a chain that nothing holds as a whole: its static compliance is that of its other modes."""
+    cell = {"masses": [BEAD], "springs": []}
+    if resonators:
+        cell = {"masses": [BEAD, BEAD / 2], "springs": [{"start": 1, "end": 2, "stiffness": 5e3}]}
+    contacts = {"law": "hertz", "stiffness": GRAIN, "sites": [1, 2], "clearance": 0.0, "precompression": PRESSED}
+    table = {
+        "lattice": {"cells": BEADS, "ends": "free", "cell": cell},
+        "contacts": contacts | {"pair": [1, 1], "next_cell": True, "side": "minus"},
+        "nnm": {"system": "chain", "method": "condensed", "modes": [2], "truncation": 1e-6},
+    }
+    case = NnmCase.from_table(table)
+    system = System.from_case(case)
+    motions = Condensed.from_case(case).motions
+    omega, shapes = system.linear_modes()
+    # A third of the energy at which a contact opens: the mean elongation is a hundredth of the amplitude.
+    amplitude = np.sqrt(2 * system.grazing_energy(1) / 3) / omega[1]
+    point = motions.from_mode(system.contact_rows @ shapes[:, 1] * amplitude, float(omega[1]))
+    mean, first = np.abs(motions.balance(point.order).unpack(point.x)[:, :2]).max(axis=0)
+    assert mean > 1e-2 * first
+
+    u = np.concatenate(list(state_of(motions, point, len(cell["masses"])).values()))
+    assert abs(system.masses @ u) < 1e-12 * np.abs(system.masses * u).sum()
+    end = Dop853Flow(system).arc(np.append(u, 0 * u), point.period, point.period).end
+    assert np.abs(end[: len(u)] - u).max() < 1e-5 * np.abs(u).max()
+
+
 def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
     """The highest mode of a ring of grains has omega = 2 sqrt(k/m) with k = (3/2) A d^(1/2), neighbours in antiphase.
 

@@ -1,7 +1,8 @@
 """Masses that move as one body in small motions of a lattice whose cells contacts alone join."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
+from vipetsc.case.case_file import Problem
 from vipetsc.lattice import Chain
 from vipetsc.lattice.cell import connected_groups
 
@@ -29,3 +30,17 @@ def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
     sprung = [(1 + cell * d + s.start, 1 + cell * d + s.end) for cell in range(chain.cells) for s in chain.cell.springs]
     # A node is joined to itself, so that there is a pair where nothing else is joined.
     return connected_groups(1 + chain.cells * d, ((0, 0), *sprung, *pressed))
+
+
+def check_apart(body: Sequence[int], ends: Sequence[tuple[int, int]]) -> Iterator[Problem]:
+    """The problem, in unsymmetric motions, of the first site whose contact joins two bodies.
+
+    ``body`` is that of each mass by its number, 0 of the ground; ``ends`` are the numbers that each site joins.
+    """
+    for number, (host, resonator) in enumerate(ends, 1):
+        if body[host] != body[resonator]:
+            cause = f"site {number} joins masses that neither springs nor pressed contacts join"
+            effect = "in unsymmetric motions its mean force pushes them apart"
+            remedy = "give a precompression, or equal stops on both sides"
+            yield Problem("contacts.clearance", None, f"{cause}: {effect}; {remedy}")
+            return

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from vipetsc.case.bodies import bodies_of, contact_ends
+from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
 from vipetsc.case.case_file import Problem
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import check_cell
@@ -61,7 +61,7 @@ def check_ground(
     # Cells that no springs join must be held together by contacts that are pressed. Springs hold the masses of other
     # lattices together, which only contacts to ground can push away.
     if not (chain.cell.joins_cells or nfrc.infinite):
-        yield from _check_loose(chain, gaps)
+        yield from check_apart(bodies_of(chain, gaps), contact_ends(chain))
         return
     to_ground = any(pair.host < 0 for pair in chain.contact_pairs)
     if not to_ground or has_walls(nfrc, lattice):
@@ -73,21 +73,6 @@ def check_ground(
         reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
         remedy = 'use ends = "fixed", a precompression, or equal stops on both sides'
         yield Problem("contacts.pair", None, f"{reason} holds; {remedy}")
-
-
-def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[Problem]:
-    """The problem of the first contact of loose cells that neither is pressed nor joins what springs or others press.
-
-    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides; () if they are equal.
-    """
-    body = bodies_of(chain, gaps)
-    for number, (host, resonator) in enumerate(contact_ends(chain), 1):
-        if body[host] != body[resonator]:
-            cause = f"site {number} joins masses that neither springs nor pressed contacts join"
-            effect = "in unsymmetric motions its mean force pushes them apart"
-            remedy = "give a precompression, or equal stops on both sides"
-            yield Problem("contacts.clearance", None, f"{cause}: {effect}; {remedy}")
-            return
 
 
 def check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:

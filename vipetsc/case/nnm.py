@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
+from vipetsc.case.bodies import check_apart
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
 from vipetsc.case.contacts import (
     MATERIAL,
@@ -264,6 +265,10 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
         # Node 0 is the ground. Each further group of masses moves as a rigid body.
         group = connected_groups(masses + 1, tuple(joined))
         rigid = len(set(group)) - 1
+        if gaps:
+            smooth = [(spring.start, spring.end) for spring in custom.smooth]
+            body = connected_groups(masses + 1, (*joined, *smooth))
+            yield from check_apart(body, [(pair.host, pair.resonator) for pair in custom.contacts])
     yield from _check_modes(nnm, masses, rigid, wrong)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from vipetsc.case.bodies import bodies_of
+from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
 from vipetsc.case.case_file import Problem, Valid
 from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
@@ -136,6 +136,11 @@ def check_lattice(
         yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
 
     yield from _check_held(lattice, contacts, cell, gaps)
+    is_symmetric = _is_odd(lattice) and all(plus == minus for plus, minus in gaps)
+    # Symmetric motions have no mean forces, and springs that join cells make one body of a lattice.
+    if not (cell.joins_cells or is_symmetric):
+        chain = build_chain(lattice, contacts)
+        yield from check_apart(bodies_of(chain, gaps), contact_ends(chain))
 
 
 def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> Iterator[Problem]:

@@ -50,11 +50,20 @@ class DenseCompliance:
         It is Z (diag(Om_n^2 - omega^2) + k Z^T Z)^-1 Z^T, with the columns z_n in Z and the stiffness k.
         """
         # (1 + k G)^-1 G of the compliance G without springs is the same, but loses digits close to a pole of G.
-        gap = self.squared - np.asarray(omegas)[:, None] ** 2
-        dynamic = np.eye(len(self.squared)) * gap[:, None]
-        dynamic = dynamic + np.asarray(stiffness)[:, None, None] * (self.parts.T @ self.parts)
-        loads = np.broadcast_to(self.parts.T, (len(gap), *self.parts.T.shape))
+        dynamic = self.dynamic_stiffness(omegas, stiffness)
+        loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
         return np.asarray(self.parts @ np.linalg.solve(dynamic, loads))
+
+    def dynamic_stiffness(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
+        """diag(Om_n^2 - omega^2) + k Z^T Z (omega, mode, mode) in (rad/s)^2, of the modes' amplitudes.
+
+        ``omegas`` (omega,) in rad/s; a spring of ``stiffness`` (omega,) in N/m is added at each pair. A mode at rest
+        that no pair moves has 1 on the diagonal in place of 0: its amplitude is then 0, as no force acts on it.
+        """
+        gap = self.squared - np.asarray(omegas)[:, None] ** 2
+        gap = np.where(self._moved | (gap != 0), gap, 1.0)
+        dynamic = np.eye(len(self.squared)) * gap[:, None]
+        return np.asarray(dynamic + np.asarray(stiffness)[:, None, None] * (self.parts.T @ self.parts))
 
     def field(self, omega: complex, forces: np.ndarray) -> np.ndarray:
         """Displacement (dofs,) in m that ``forces`` (pairs,) in N, which pull pairs together, make."""
@@ -64,5 +73,9 @@ class DenseCompliance:
     def _gain(self, omega: np.ndarray) -> np.ndarray:
         """The factor 1/(Om_n^2 - omega^2) (omega, mode); 0 of a mode at rest that no pair moves."""
         gap = self.squared - omega[:, None] ** 2
-        moved = np.any(self.parts != 0, axis=0)
-        return np.divide(1, gap, out=np.zeros_like(gap), where=moved | (gap != 0))
+        return np.divide(1, gap, out=np.zeros_like(gap), where=self._moved | (gap != 0))
+
+    @property
+    def _moved(self) -> np.ndarray:
+        """Mask (mode,) of the modes with a relative displacement of a pair."""
+        return np.asarray(np.any(self.parts != 0, axis=0))

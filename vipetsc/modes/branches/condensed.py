@@ -260,10 +260,8 @@ def _system_harmonics(motions: ConservativeMotions, compliance: DenseCompliance,
     balance = motions.balance(point.order)
     shift = balance.shift(omega)
     force = balance.shifted_force(point.x, omega, shift)
-    parts = compliance.parts
-    gaps = compliance.squared - (balance.orders * omega)[:, None] ** 2
-    dynamic = np.eye(len(gaps[0])) * gaps[:, None] + shift * (parts.T @ parts)
-    modal = np.linalg.solve(dynamic, parts.T @ force.real)
+    dynamic = compliance.dynamic_stiffness(balance.orders * omega, shift[:, 0, 0])
+    modal = np.linalg.solve(dynamic, compliance.parts.T @ force.real)
     return np.asarray(-(compliance.vectors @ modal)[..., 0])
 
 
