@@ -48,6 +48,8 @@ MOST_MARKS = 12
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 LEAST_DIFFERENCE = 1e-17  # shown in place of 0, which a logarithmic axis has not: below all rounding
 
+SLOPE = r"|d$f$/d$E$| (Hz/J)"
+
 # Heights of the panels of a column, in units of 1.55 inches.
 FREQUENCY_HEIGHT = 1.5
 OTHER_HEIGHT = 1.0
@@ -219,6 +221,12 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
     energy = branch["energy"].values[shown]
     steepness = np.abs(branch["slope"].values)[shown]
     is_lowest = lowest(branch)[shown]
+    if not np.any(steepness > 0):
+        # A logarithmic axis has no place for 0. The axis of the energy stays, as panels below may share it.
+        axes.set(yticks=[], ylabel=SLOPE)
+        reason = "the frequency does not change with the energy"
+        axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, transform=axes.transAxes)
+        return
 
     label = None
     if not is_lowest.all():
@@ -227,7 +235,7 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
     axes.loglog(energy, np.where(is_lowest, steepness, np.nan), lw=1.1, color=style.BLUE, label=label)
     if label:
         axes.legend(loc="lower left", fontsize=5.5)
-    axes.set_ylabel(r"|d$f$/d$E$| (Hz/J)")
+    axes.set_ylabel(SLOPE)
 
 
 def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
@@ -290,7 +298,8 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     """Draw the neighbourhood of the point ``first``, where contact begins, in an inset that covers least of the branch.
 
     The inset shows the branch up to where the frequency is a tenth off that of the last energy fold, or of the point
-    ``first`` if there is no fold, but at least three points beyond ``first``.
+    ``first`` if there is no fold, but at least three points beyond ``first``. Where it is so nowhere the inset
+    ends with a tenth of the largest change.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
@@ -298,8 +307,10 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     last = int(folds[-1]) if folds.size else first
     # A tenth beyond the fold the branch has its trend again, up or down, which the panel shows.
     is_beyond = (frequency[last:] >= 1.1 * frequency[last]) | (frequency[last:] <= frequency[last] / 1.1)
-    beyond = np.flatnonzero(is_beyond)
-    last = last + int(beyond[0]) if beyond.size else len(energy)
+    if not is_beyond.any():
+        change = np.abs(frequency[last:] - frequency[last])
+        is_beyond = change >= change.max() / 10
+    last += int(np.argmax(is_beyond))
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
 
