@@ -88,9 +88,9 @@ class Budget:
 
     def _run(self, amplitude: float, contacts: dict[str, object] | None = None) -> xr.Dataset:
         """Run the lattice under ``amplitude``; the dataset has the cells of the sites. ``contacts`` change the case."""
-        sites = self.case.model().chain.sites
-        # Files count cells from 1; the last site's contact may be with the cell after it.
-        output = {"window": [min(sites) + 1, max(sites) + 2]}
+        chain = self.case.model().chain
+        # Files count cells from 1; the last site's contact may be with the cell after it, if there is one.
+        output = {"window": [min(chain.sites) + 1, min(max(chain.sites) + 2, chain.cells)]}
         case: Case = self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=output)
         if contacts:
             case = case.varied(contacts=contacts)

@@ -100,17 +100,22 @@ def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
 
     value = float(parameter["value"])
     error = float(parameter["standard_error"])
-    # In percent of the best value: the digits in which clearances differ would not fit below an axis.
-    places = 100 * (parameter["profile/value"].values / value - 1)
+    unit = parameter["unit"].item()
+    # In percent of the best value: the digits in which clearances differ would not fit below an axis. Of a best value
+    # of 0 there are no percentages.
+    percent = 100 / value if value else 1.0
+    places = percent * (parameter["profile/value"].values - value)
     axes.plot(places, parameter["profile/cost"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     if np.isfinite(error) and error > 0:
         dense = np.linspace(places.min(), places.max(), 100)
-        parabola = (dense * value / (100 * error)) ** 2
+        parabola = (dense / (percent * error)) ** 2
         axes.plot(dense, parabola, color=style.GREY, lw=0.7, ls=style.DASHED)
     axes.axvline(0.0, color=style.BLACK, lw=0.6)
-    label = f"% from {value:.4g}"
-    if parameter["unit"].item() != "1":
-        label += f" {parameter['unit'].item()}"
+    label = f"from {value:.4g}"
+    if value:
+        label = f"% {label}"
+    if unit != "1":
+        label += f" {unit}"
     axes.set(xlabel=label, ylabel="misfit - least")
 
 

@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 
 from vipetsc import plugins
 from vipetsc.case.parts import module_names
+from vipetsc.figures.sources import FILES
 from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
 
-RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", "design.h5", "optimum.h5", "law.h5", "prediction.h5")
+RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", *(file.name for file in FILES.values()))
 
 
 def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, Callable[..., Any]], str]:
