@@ -75,11 +75,7 @@ class FigureSpec(NamedTuple):
 
 def branch(paths: Sequence[Path]) -> Figure:
     """Draw the branches in ``paths``, which are of one kind, side by side."""
-    kinds = []
-    for path in paths:
-        with open_netcdf(path, "branch") as file:
-            kinds.append(branch_kinds.branch_kind(file))
-
+    kinds = [branch_kinds.kind_of_file(path) for path in paths]
     # Folders on one page may hold branches of one name and different kinds: those of the first one's kind are shown.
     same = [path for path, kind in zip(paths, kinds, strict=True) if kind == kinds[0]]
     return BRANCH_FIGURES[kinds[0]](same)
@@ -323,15 +319,15 @@ def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files
 
     for spec in specs:
         if spec.together:
-            for drawing in _branch_drawing(spec, every_branch(folders), len(folders), files):
+            for drawing in _branch_drawing(spec, every_branch(folders, files), len(folders), files):
                 yield drawing._replace(stem=spec.name)
 
 
 def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files: Files) -> Iterator[Drawing]:
     """Yield the drawing of the branches in ``paths``, from so many ``folders``; none if there is nothing to show."""
-    if not all(point_count(path) for path in paths):
+    branches = [open_branch(path, files) for path in paths]
+    if not all(map(has_points, branches)):
         return
-    branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
     if spec.without and spec.without(branches):
         return
     stem = paths[0].stem if paths else ""
@@ -350,10 +346,14 @@ def _shown_branches(paths: Sequence[Path], branches: Sequence[xr.Dataset]) -> li
     return [Shown(name, [branch]) for name, branch in zip(names, branches, strict=True)]
 
 
-def point_count(path: Path) -> int:
-    """Return the number of points of a branch."""
-    with open_netcdf(path, "branch") as file:
-        return int(file.sizes["point"])
+def open_branch(path: Path, files: Files) -> xr.Dataset:
+    """Return the branch in ``path``, opened as one of the ``files``."""
+    return files.get(path, partial(open_netcdf, kind="branch"))
+
+
+def has_points(branch: xr.Dataset) -> bool:
+    """Return whether a point of a branch was computed."""
+    return branch.sizes["point"] > 0
 
 
 def branches_by_name(folders: Sequence[Path]) -> list[list[Path]]:
@@ -364,9 +364,10 @@ def branches_by_name(folders: Sequence[Path]) -> list[list[Path]]:
     return groups
 
 
-def every_branch(folders: Sequence[Path]) -> list[Path]:
-    """Return the files of all branches in ``folders`` that have a point."""
-    return [path for folder in folders for path in sorted(folder.glob("branch-*.h5")) if point_count(path)]
+def every_branch(folders: Sequence[Path], files: Files) -> list[Path]:
+    """Return the files of all branches in ``folders`` that have a point; they are opened as ``files``."""
+    paths = [path for folder in folders for path in sorted(folder.glob("branch-*.h5"))]
+    return [path for path in paths if has_points(open_branch(path, files))]
 
 
 def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:

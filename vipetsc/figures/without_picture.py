@@ -1,7 +1,6 @@
 """Why something has no picture: nothing is written for what cannot be drawn, and a message gives the reason."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import xarray as xr
@@ -14,14 +13,14 @@ from vipetsc.figures.registry import (
     every_branch,
     figure_names,
     figures_of,
-    point_count,
+    has_points,
+    open_branch,
     run_and_analysis,
     specified_drawings,
     with_ensemble,
 )
 from vipetsc.figures.sources import BRANCHES, RUN, SWEEP
 from vipetsc.figures.sweep_members import Files
-from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
 
 
@@ -53,8 +52,8 @@ def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[
     """Return why branches of the first folder are not drawn, by the names of files, and why figures in ``names``."""
     reasons = {}
     for paths in branches_by_name(folders):
-        has_points = all(map(point_count, paths))
-        reasons[paths[0].stem] = "" if has_points else "no point of the branch was computed"
+        drawn = all(has_points(open_branch(path, files)) for path in paths)
+        reasons[paths[0].stem] = "" if drawn else "no point of the branch was computed"
     if reasons and all(reasons.values()):
         reasons = {BRANCH: "no branch has a point"}
 
@@ -63,11 +62,10 @@ def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[
         spec = specs.get(name)
         if spec and spec.without:
             # The pictures that there would be, as the drawing has them.
-            pictures = [every_branch(folders)] if spec.together else branches_by_name(folders)
+            pictures = [every_branch(folders, files)] if spec.together else branches_by_name(folders)
             missing = []
             for paths in pictures:
-                branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-                missing.append(spec.without(branches))
+                missing.append(spec.without([open_branch(path, files) for path in paths]))
             # The figure is missing only if it has not a single picture.
             if missing and all(missing):
                 reasons[name] = missing[0]

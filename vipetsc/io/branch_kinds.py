@@ -4,7 +4,12 @@ All readers use `branch_kind`; ``vipetsc.modes.branches``, which has the format 
 module is not there but here because figures, which read branches, do not load PETSc.
 """
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import xarray as xr
+
+from vipetsc.io.netcdf import open_netcdf, root_attributes
 
 ORBITS = "orbits"
 """Periodic orbits by shooting: of a reduced system, or of a whole lattice."""
@@ -26,9 +31,26 @@ def branch_kind(branch: xr.Dataset) -> str:
     kind = branch.attrs.get("branch_kind")
     if kind is None:
         return _kind_by_variables(branch)
+    return _known(kind)
+
+
+def kind_of_file(path: Path, needs: Sequence[str] = ()) -> str:
+    """Return the kind of the branch in the file ``path``, by its attributes alone if one of them names the kind.
+
+    ``needs`` and errors are those of ``open_netcdf``; further errors those of ``branch_kind``.
+    """
+    kind = root_attributes(path, "branch", needs).get("branch_kind")
+    if isinstance(kind, str):
+        return _known(kind)
+    with open_netcdf(path, "branch", needs) as branch:
+        return branch_kind(branch)
+
+
+def _known(kind: str) -> str:
+    """Return the ``kind`` that an attribute names; raise ValueError if it is not one of ``BRANCH_KINDS``."""
     if kind not in BRANCH_KINDS:
         raise ValueError(f"branch_kind = {kind!r} is not one of {', '.join(BRANCH_KINDS)}: written by a later version?")
-    return str(kind)
+    return kind
 
 
 def _kind_by_variables(branch: xr.Dataset) -> str:

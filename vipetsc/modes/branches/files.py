@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import write_text
-from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, branch_kind
+from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch, FailureBelow
 from vipetsc.modes.branches.condensed_layout import CondensedLayout
@@ -73,9 +73,8 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
 
 def read_branch(path: Path) -> Branch[Any]:
     """The branch in an HDF5 file, without its ``extra``; raises OSError or ValueError if it holds none."""
-    # Opened twice: what a file must have depends on its kind, and a message about what it lacks should be right.
-    with open_netcdf(path, "branch", ("tangent",)) as file:
-        kind = branch_kind(file)
+    # The kind comes first: what a file must have depends on it, and a message about what it lacks should be right.
+    kind = kind_of_file(path, ("tangent",))
     layout = LAYOUTS[kind]
     with open_netcdf(path, "branch", layout.needs) as file:
         data = file.load()
