@@ -10,27 +10,15 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import StopAt, assert_same_bits, datasets
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.growing_windows import GrowingWindows
-from vipetsc.parallel import StoppedError, StopRequest, divided, on_root
+from vipetsc.parallel import StoppedError, divided, on_root
 from vipetsc.studies.identification import run_identification
 
 # Two starts and two points of a profile: several jobs, but fewer than three ranks.
 OPTIONS = {"starts": 2, "profile": 2, "steps": 4}
-
-
-class StopAfter(StopRequest):
-    """A request to stop that is granted after it has been checked ``checks`` times."""
-
-    def __init__(self, checks: int) -> None:
-        self.left = checks
-
-    @property
-    def requested(self) -> bool:
-        self.left -= 1
-        return self.left < 0
 
 
 def plan_of(folder: Path, changes: dict[str, Any], end: float = 0.009, **options: Any) -> IdentifyCase:
@@ -91,7 +79,7 @@ def test_the_result_does_not_depend_on_the_ranks(folder, plan, whole):
 def test_a_stopped_identification_goes_on(folder, plan, whole):
     """A fit that is stopped and resumed has the bits of an uninterrupted one."""
     with pytest.raises(StoppedError):
-        run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAfter(30))
+        run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAt(30))
     assert not (folder / "identified.h5").exists()
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
     assert_same_bits(datasets(folder / "identified.h5"), whole)
@@ -123,7 +111,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
     monkeypatch.setattr(GrowingWindows, "_solve", counted)
     for resume in (False, True):
         with pytest.raises(StoppedError):
-            run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAfter(14), resume=resume)
+            run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAt(14), resume=resume)
     before = len(solved)
     assert before >= 2
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)

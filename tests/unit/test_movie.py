@@ -279,8 +279,9 @@ def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsy
     except SystemExit as ended:
         code = ended.code
     assert code == 2
-    message = capsys.readouterr().err
-    # The message names the option with the wrong value, or the option that the others need.
+    # The last line is the message, after the usage where the value cannot be read. It names the option with the wrong
+    # value, or the option that the others need.
+    message = capsys.readouterr().err.splitlines()[-1]
     assert words.split()[-2] in message or words.split()[0] in message
     assert sorted(clear.rglob("*")) == before
 

@@ -117,8 +117,8 @@ def test_samples_travel_with_the_case(tmp_path):
     """A case holds the samples themselves, to the last bit, and their file's checksum; the file may be removed."""
     path = tmp_path / "lab.h5"
     time = np.linspace(0, 0.01, 30)
-    # The samples are numbers that few decimals would not hold.
-    force = np.sin(800 * time) * 1e-60 ** (time == 0)
+    # Few decimals would hold neither these numbers nor the first one, which is tiny and not zero.
+    force = np.where(time == 0, 1e-20, np.sin(800 * time))
     with h5py.File(path, "w") as file:
         file["drive"] = np.column_stack([time, force])
     drive = {"waveform": "samples", "samples": {"file": str(path), "dataset": "drive"}}

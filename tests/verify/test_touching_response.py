@@ -59,7 +59,7 @@ def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
         assert point.measured.unstable == growing
 
 
-def test_below_twice_its_resonance_a_motion_of_twice_the_period_grows():
+def test_above_twice_its_resonance_a_motion_of_twice_the_period_grows():
     """At 4.5 rad/s the motion of the drive's period is unstable, and one of twice the period grows (a multiplier < -1).
 
     The stiffness, which alternates between soft and stiff, excites it.

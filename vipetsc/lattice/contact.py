@@ -71,9 +71,11 @@ def least_restitution(factor: str) -> float:
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
-    """kc = 2 E sqrt(R) / (3 (1 - nu^2)) for modulus E in Pa, radius R in m; N/m^(3/2).
+    """kc = 2 E sqrt(R) / (3 (1 - nu^2)) in N/m^(3/2) for the modulus E in Pa and the radius R in m.
 
-    The paper uses the same number, in N/m, for its bilinear law.
+    It is Hertz's stiffness 4/3 E' sqrt(R) of two bodies of one material, 1/E' = 2 (1 - nu^2)/E, with the relative
+    curvature 1/R = 1/R1 + 1/R2: R is the radius of a sphere that meets a flat stop, and half the radius of two equal
+    spheres. The paper uses the same number, in N/m, for its bilinear law.
     """
     return 2 * modulus * np.sqrt(radius) / (3 * (1 - poisson**2))
 
