@@ -112,6 +112,15 @@ def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
     return [_value_or_raise(attempts[number]) for number in range(len(jobs))]
 
 
+def smallest(comm: MPI.Comm, *numbers: float) -> list[float]:
+    """Each of the ``numbers`` where it is smallest on any rank, in one reduction; all ranks must call it."""
+    if comm.size == 1:
+        return [*numbers]
+    reduced = np.array(numbers)
+    comm.Allreduce(MPI.IN_PLACE, reduced, MPI.MIN)
+    return [float(number) for number in reduced]
+
+
 class _Attempt(NamedTuple):
     """The ``value`` of a call, or the ``error`` that it raised."""
 

@@ -14,7 +14,7 @@ from tests.conftest import StopAt, assert_same_bits, datasets
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.growing_windows import GrowingWindows
-from vipetsc.parallel import StoppedError, divided, on_root
+from vipetsc.parallel import StoppedError, divided, on_root, smallest
 from vipetsc.studies.identification import run_identification
 
 # Two starts and two points of a profile: several jobs, but fewer than three ranks.
@@ -120,6 +120,14 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
     assert len(solved) == sum(" window " in line for line in lines) > before
     assert_same_bits(datasets(folder / "identified.h5"), whole)
     MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_the_smallest_numbers_of_all_ranks_are_known_to_all():
+    """``smallest`` reduces each number by itself: a rank may have one, another rank the other."""
+    comm = MPI.COMM_WORLD
+    last = comm.size - 1
+    assert smallest(comm, 2.0 + comm.rank, -float(comm.rank == last), 0.5) == [2.0, -1.0, 0.5]
 
 
 @pytest.mark.parallel([1, 2, 3])

@@ -13,14 +13,16 @@ from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
     FREE,
+    PERMANENT,
     contact_force,
     create_contacts,
     elastic_energy,
     elastic_force,
     elastic_force_and_slope,
     elastic_records,
+    impact_time,
 )
-from vipetsc.contact.tracker import TRACKED, ImpactTracker, impact_time
+from vipetsc.contact.tracker import TRACKED, ImpactTracker
 from vipetsc.lattice import Contact
 
 STIFFNESS = 3e5
@@ -318,6 +320,36 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
         assert each.contacts["mode"].tolist() == [FREE, FREE]
         assert each.counts.tolist() == tracker.counts.tolist()
     assert tracker.contact_time() == np.inf
+
+
+@pytest.mark.parametrize("way", ["switch", "begin", "restore", "permanent"])
+def test_a_contact_is_followed_from_the_beginning_or_after_steps_without_any(way):
+    tracker = create_tracker()
+    if way == "permanent":
+        tracker.contacts["mode"][1] = -PERMANENT
+        tracker = ImpactTracker(tracker.contacts, (4, 9))
+    else:
+        tracker.accept_step(STEP)
+    closed = tracker
+    if way == "restore":
+        closed = create_tracker()
+    if way == "begin":
+        motion = np.zeros((10, 2))
+        motion[9] = -1.01 * CLEARANCE, -0.1
+        tracker.begin(motion)
+    elif way != "permanent":
+        closed.start[1] = -CLEARANCE, -0.1, 0.0
+        assert closed.switch(0.1, np.zeros(2)) == 1
+    if way == "restore":
+        table = np.zeros(10, TRACKED)
+        table[[4, 9]] = closed.checkpoint()
+        tracker.restore(table)
+
+    tracker.start[1] = -CLEARANCE, -0.1, 0.0
+    tracker.end[1] = -1.5 * CLEARANCE, 0.0, 0.0
+    tracker.accept_step(STEP)
+    (episode,) = tracker.take_episodes(np.zeros(2), unfinished=True)
+    assert episode["indentation"] >= 0.5 * CLEARANCE
 
 
 def test_every_impact_that_pulls_is_counted():

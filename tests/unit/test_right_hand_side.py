@@ -13,10 +13,11 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.case import Model
+from vipetsc.contact.changes import first_change
 from vipetsc.contact.law import CLOSED, FREE
 from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
+from vipetsc.dynamics.ts.right_hand_side import find_change, observe, observe_at, observe_pairs, register
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
 from vipetsc.lattice.chain import Pair
 
@@ -236,8 +237,34 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
         if pairs:
             observe_pairs(found.y, found.rates, found.lattice, seen)
         else:
-            observe(motion.t, found.y, found.lattice, seen)
+            # As the engine calls it, by the address of what PETSc gets.
+            ts = PETSc.TS().create(MPI.COMM_SELF)
+            context = register(ts, found.lattice)
+            observe_at(motion.t, found.y, context.ctypes.data, seen)
         np.testing.assert_allclose(seen, expected, rtol=1e-11, err_msg=name)
+
+
+def test_the_first_change_of_the_sites_is_found_by_the_address_of_their_lattice():
+    model = lattice("free")
+    record = create_record(model, Layout(model, MPI.COMM_SELF, dashpots=True))
+    start = np.zeros((len(SITES), 3))
+    end = np.zeros((len(SITES), 3))
+    # Free sites that rise to both stops: the third one is first.
+    h = 1e-3
+    for site, depth in ((1, 2.0), (2, -3.0)):
+        end[site, 0] = depth * CLEARANCE
+        start[site, 1] = end[site, 1] = end[site, 0] / h
+
+    ts = PETSc.TS().create(MPI.COMM_SELF)
+    context = register(ts, record)
+    found = np.full(2, -7)
+    position = find_change(context.ctypes.data, start, end, h, found)
+    change = first_change(record.contacts, start, end, h, np.empty((2, 6)), kinks=True)
+    assert (position, *found) == change
+    assert change.site == 2
+    assert 0 < position < 1
+    # No change at all.
+    assert find_change(context.ctypes.data, start, start, h, found) == 2.0
 
 
 def test_a_rank_writes_only_to_what_it_owns():

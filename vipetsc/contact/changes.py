@@ -1,4 +1,4 @@
-"""Compiled search of a step for the first change of a site's mode, and the extremes of a contact within the step.
+"""Compiled search of a step for the first change of a site's mode; extremes within the step, shortest contact times.
 
 A site's motion is (w, w', w''), w = u_resonator - u_host, in rows of arrays (sites, 3). Every change is an upcrossing
 of one of two switching functions of the site's mode, each affine in w or in w':
@@ -13,8 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, RESTING, contact_force, gap_of, resting_side, side_of
+from vipetsc.compiled import allocating, kernel, njit
+from vipetsc.contact.law import (
+    CLIPPED,
+    CLOSED,
+    FREE,
+    PERMANENT,
+    RESTING,
+    contact_force,
+    gap_of,
+    impact_time,
+    resting_side,
+    side_of,
+)
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 # A site has landed on its clearance when |side w - D| is within this fraction of its ``scale``, which is D. The
@@ -284,3 +295,30 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
             low = left
     largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
     return Extremes(indentation=deepest - gap_of(contacts[i], side), force=largest, smallest_force=smallest)
+
+
+@njit(error_model="numpy")
+def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
+    """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
+
+    A contact closes if |side w - D| is at most ``MOVED_W`` of its scale and w approaches; inf if none does.
+    """
+    shortest = np.inf
+    for i in range(contacts.size):
+        site = contacts[i]
+        if abs(site.mode) == PERMANENT:
+            side = side_of(site.mode)
+            rate = side * motion[i, 1]
+            if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED_W * site.scale:
+                shortest = min(shortest, impact_time(site, rate))
+    return shortest
+
+
+@kernel
+def shortest_impact(contacts: np.ndarray) -> float:
+    """The smallest ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf if none is."""
+    shortest = np.inf
+    for i in range(contacts.size):
+        if abs(contacts[i].mode) in (CLOSED, CLIPPED):
+            shortest = min(shortest, impact_time(contacts[i], abs(contacts[i].approach)))
+    return shortest

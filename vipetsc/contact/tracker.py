@@ -11,7 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.changes import LANDED_G, LANDED_W, MOVED_W, Extremes, extremes, switching
+from vipetsc.contact.changes import (
+    LANDED_G,
+    LANDED_W,
+    Extremes,
+    extremes,
+    shortest_beginning,
+    shortest_impact,
+    switching,
+)
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -23,7 +31,6 @@ from vipetsc.contact.law import (
     elastic_energy,
     elastic_force,
     gap_of,
-    impact_time,
     resting_side,
     side_of,
 )
@@ -106,8 +113,12 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
 
 
 @njit(error_model="numpy")
-def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> None:
-    """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
+def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> bool:
+    """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3).
+
+    Returns whether there are any.
+    """
+    any_open = False
     for i in range(contacts.size):
         side = side_of(contacts[i].mode)
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
@@ -119,6 +130,8 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
         elif in_episode(contacts[i].mode):
             update_episode(contacts, tracks, i, extremes(contacts, i, start, end, h))
+        any_open |= in_episode(contacts[i].mode)
+    return any_open
 
 
 @njit(error_model="numpy")
@@ -236,33 +249,6 @@ def _set_mode(
         track.counts.clipped += 1
 
 
-@njit(error_model="numpy")
-def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
-
-    A contact closes if |side w - D| is at most ``MOVED_W`` of its scale and w approaches; inf if none does.
-    """
-    shortest = np.inf
-    for i in range(contacts.size):
-        site = contacts[i]
-        if abs(site.mode) == PERMANENT:
-            side = side_of(site.mode)
-            rate = side * motion[i, 1]
-            if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED_W * site.scale:
-                shortest = min(shortest, impact_time(site, rate))
-    return shortest
-
-
-@kernel
-def shortest_impact(contacts: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf if none is."""
-    shortest = np.inf
-    for i in range(contacts.size):
-        if abs(contacts[i].mode) in (CLOSED, CLIPPED):
-            shortest = min(shortest, impact_time(contacts[i], abs(contacts[i].approach)))
-    return shortest
-
-
 class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
@@ -275,6 +261,8 @@ class ImpactTracker:
         self.start, self.end = np.zeros((2, len(numbers), 3))
         sites = np.zeros(len(numbers), TRACKED)
         sites["number"] = numbers
+        # Whether any episode may be open: false only after a step in which none was, until a mode may change.
+        self._may_be_open = True
         self.tracks = Tracks(sites, log=np.zeros(2 * len(sites), EPISODE), closed=np.zeros(1, np.int64))
 
         # Permanent contacts are in an episode from the start.
@@ -291,6 +279,7 @@ class ImpactTracker:
         contacts lie before the run: w'_minus is the speed with which two masses alone come to w at w' without loss, so
         that mu (w'_minus^2 - w'^2)/2 is the elastic energy, mu the reduced mass.
         """
+        self._may_be_open = True
         sites = self.contacts
         tracked = self.tracks.sites
         numbered = np.flatnonzero(tracked["number"] >= 0)
@@ -346,7 +335,8 @@ class ImpactTracker:
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""
-        update_episodes(self.contacts, self.tracks, self.start, self.end, h)
+        if self._may_be_open:
+            self._may_be_open = update_episodes(self.contacts, self.tracks, self.start, self.end, h)
         self.start, self.end = self.end, self.start
 
     def switch(self, t: float, energies: np.ndarray) -> int:
@@ -354,6 +344,7 @@ class ImpactTracker:
 
         ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``.
         """
+        self._may_be_open = True
         self.tracks = with_room(self.tracks)
         return switch_sites(self.contacts, self.tracks, self.start, energies, t)
 
@@ -391,6 +382,7 @@ class ImpactTracker:
 
     def restore(self, table: np.ndarray) -> None:
         """Go back to a checkpoint, the ``table`` (site,) of dtype ``TRACKED`` of all sites by their numbers."""
+        self._may_be_open = True
         numbered = self.tracks.sites["number"] >= 0
         sites = table[self.tracks.sites["number"][numbered]]
         self.tracks.sites[numbered] = sites

@@ -8,10 +8,10 @@ right-hand sides are smooth.
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.changes import first_change, switching
+from vipetsc.contact.changes import first_change, shortest_impact, switching
 from vipetsc.contact.law import FREE, side_of
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
-from vipetsc.contact.tracker import Tracks, shortest_impact, switch_sites, with_room
+from vipetsc.contact.tracker import Tracks, switch_sites, with_room
 from vipetsc.dynamics.drives import select_piece
 from vipetsc.identification.motion_rates import Lattice, MotionState, difference, jerk, observe, rates_of
 from vipetsc.modes.shooting.dop853 import E3, E5, STAGES, A, B

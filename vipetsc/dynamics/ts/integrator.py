@@ -1,5 +1,6 @@
 """The engine ``ts``: one trial of PETSc's explicit Runge-Kutta at a time, landing on every contact change."""
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.changes import ModeChange, first_change, stays_landed, switching
+from vipetsc.contact.changes import ModeChange, stays_landed, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
@@ -21,11 +22,11 @@ from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.options import given_first_step
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.onset import onset_fraction
-from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs
+from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.dynamics.ts.time_stepper import TimeStepper
 from vipetsc.lattice.drive import Pieces
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, smallest
 
 # Measured on the built-in case up to 0.3 s, with Hertz's law (3,800 steps, 510 rejected) and the bilinear one (3,470,
 # 80): of these numbers none changes the error there, 1e-8 of the largest displacement.
@@ -86,6 +87,8 @@ class Integrator(Engine):
         self.time = 0.0
         self.state = layout.create_vector()
         register_sums(self.state)  # before it is duplicated
+        with self.state.localForm() as local:  # its memory, which stays where it is: own components, then ghosts
+            self._components = local.array
         # Only contacts of other pairs of masses are observed with rates of the whole state.
         self.rates = self.state
         if model.chain.pairs:
@@ -94,6 +97,7 @@ class Integrator(Engine):
         self.free_step = self.step
         self._stepper = TimeStepper(model, layout, self.state, self.lattice)
         self.ts = self._stepper.ts
+        self._place = np.zeros(2, np.int64)  # site and function of a change that `find_change` finds
 
         self._first_step = FIRST_STEP / model.drive.frequency
         self._fixed_step = PETSc.Options().getString("ts_adapt_type", "basic") == "none"
@@ -111,12 +115,11 @@ class Integrator(Engine):
         if time is None:
             time = self.time
         if not self.lattice.shape.paired:
-            with self.state.localForm() as local:
-                return observe(time, local.array, self.lattice, motion)
+            return observe_at(time, self._components, self._stepper.context_address, motion)
         self.ts.computeRHSFunction(time, self.state, self.rates)
         self.rates.ghostUpdate()
-        with self.state.localForm() as local, self.rates.localForm() as rates:
-            observe_pairs(local.array, rates.array, self.lattice, motion)
+        with self.rates.localForm() as rates:
+            observe_pairs(self._components, rates.array, self.lattice, motion)
 
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self.layout.place(cells, energy, self.state.array)
@@ -134,8 +137,7 @@ class Integrator(Engine):
                 return FillResult(k, stalled=str(error))
             if not goes_on:
                 return FillResult(k, stopped=True)
-            with self.state.localForm() as local:
-                take_sample(local.array, k, samples, self.lattice.contacts, self._own_rows)
+            take_sample(self._components, k, samples, self.lattice.contacts, self._own_rows)
         return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:
@@ -176,11 +178,12 @@ class Integrator(Engine):
             self.time = target
             return True
 
+        longest = self._longest_step()
+        if longest < shortest:
+            raise StalledError(f"the step fell to {longest:.3g} s")
         # Equal steps to the target: none of them is short because the others were long.
-        count = np.ceil(remaining / self._longest_step())
+        count = math.ceil(remaining / longest)
         h = remaining / count
-        if h < shortest:
-            raise StalledError(f"the step fell to {h:.3g} s")
         if not self._try_step(h):
             return True
 
@@ -193,9 +196,7 @@ class Integrator(Engine):
             change = self._first_change(h)
 
         # One reduction for both: the earliest change, and whether a stop was requested anywhere.
-        earliest = np.array([change.position, -float(self._stop.requested)])
-        self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
-        position, stop = earliest.tolist()
+        position, stop = smallest(self.comm, change.position, -float(self._stop.requested))
         if position <= 1.0:
             with log.LANDING:
                 self._land(h, position, change)
@@ -226,9 +227,8 @@ class Integrator(Engine):
 
     def _first_change(self, h: float) -> ModeChange:
         """The first change of this rank's sites in the step of ``h`` s that was just tried."""
-        tracker = self.tracker
-        room = np.empty((2, 6))
-        return first_change(tracker.contacts, tracker.start, tracker.end, h, room, kinks=True)
+        position = find_change(self._stepper.context_address, self.tracker.start, self.tracker.end, h, self._place)
+        return ModeChange(position, *self._place.tolist())
 
     def _land(self, h: float, position: float, change: ModeChange) -> None:
         """Step from the saved state onto the change at ``position`` in the step just tried, and switch there.

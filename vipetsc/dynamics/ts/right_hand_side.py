@@ -15,7 +15,8 @@ import numpy as np
 from numba import carray
 from numba.core.ccallback import CFunc
 
-from vipetsc.compiled import cfunc, kernel
+from vipetsc.compiled import cfunc, inlined, kernel, njit
+from vipetsc.contact.changes import first_change
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
@@ -158,6 +159,50 @@ CONTEXT = np.dtype(
 """A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables; and an ``ONSET``."""
 
 
+@inlined
+def _lattice_at(address: int) -> LatticeRecord:
+    """The lattice of the ``CONTEXT`` at an ``address``."""
+    context: Any = carray(pointer(address), (1,), CONTEXT)[0]
+    at = context.address
+    size = context.length
+    return LatticeRecord(
+        context.shape,
+        carray(pointer(at.masses), (size.masses,), MASS),
+        carray(pointer(at.couplings), (size.couplings,), COUPLING),
+        carray(pointer(at.springs), (size.springs,), SPRING),
+        carray(pointer(at.site_dofs), (size.site_dofs,), SITE_DOFS),
+        carray(pointer(at.contacts), (size.contacts,), SITE),
+        Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
+        carray(pointer(at.nonlinear), (size.nonlinear,), NONLINEAR),
+        carray(pointer(at.spring_laws), (size.spring_laws,), SPRING_LAW),
+        carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
+        carray(pointer(at.grounding), (size.grounding,), np.float64),
+        carray(pointer(at.stiffness), (size.stiffness,), np.float64),
+        carray(pointer(at.damping), (size.damping,), np.float64),
+    )
+
+
+@njit(error_model="numpy")
+def observe_at(t: float, y: np.ndarray, address: int, motion: np.ndarray) -> None:
+    """``observe`` in the lattice of the ``CONTEXT`` at an ``address``.
+
+    Python passes one number instead of a dozen arrays, which takes a fraction of the time.
+    """
+    observe(t, y, _lattice_at(address), motion)
+
+
+@njit(error_model="numpy")
+def find_change(address: int, start: np.ndarray, end: np.ndarray, h: float, place: np.ndarray) -> float:
+    """The position of ``first_change`` in a step of the sites of the ``CONTEXT`` at an ``address``.
+
+    Kinks count. ``place`` (2,) gets the site and the function: to make a ``ModeChange`` takes longer than the search.
+    """
+    change = first_change(_lattice_at(address).contacts, start, end, h, np.empty((2, 6)), kinks=True)
+    place[0] = change.site
+    place[1] = change.function
+    return change.position
+
+
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     context: Any = carray(pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
@@ -174,23 +219,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     if error != 0:
         return error
 
-    at = context.address
-    size = context.length
-    lattice = LatticeRecord(
-        shape,
-        carray(pointer(at.masses), (size.masses,), MASS),
-        carray(pointer(at.couplings), (size.couplings,), COUPLING),
-        carray(pointer(at.springs), (size.springs,), SPRING),
-        carray(pointer(at.site_dofs), (size.site_dofs,), SITE_DOFS),
-        carray(pointer(at.contacts), (size.contacts,), SITE),
-        Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
-        carray(pointer(at.nonlinear), (size.nonlinear,), NONLINEAR),
-        carray(pointer(at.spring_laws), (size.spring_laws,), SPRING_LAW),
-        carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
-        carray(pointer(at.grounding), (size.grounding,), np.float64),
-        carray(pointer(at.stiffness), (size.stiffness,), np.float64),
-        carray(pointer(at.damping), (size.damping,), np.float64),
-    )
+    lattice = _lattice_at(address)
     y = carray(pointer(state), (shape.ghosted,), np.float64)
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
     onset = context.onset
@@ -225,7 +254,7 @@ def compile_callback() -> CFunc:
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> np.ndarray:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``.
 
-    Returns its context, one record of dtype ``CONTEXT``, in which ``onset`` may be set before a step. Raises
+    Returns its context, one record (1,) of dtype ``CONTEXT``, in which ``onset`` may be set before a step. Raises
     RuntimeError where PETSc refuses the function.
     """
     callback = compile_callback()

@@ -1,10 +1,9 @@
 """PETSc's time stepper for a lattice: one trial of an explicit Runge-Kutta step at a time."""
 
+import math
 from typing import NamedTuple
 
 from petsc4py import PETSc
-
-import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.lattice_record import LatticeRecord
@@ -27,7 +26,8 @@ class StepOutcome(NamedTuple):
 class TimeStepper:
     """Steps of ``model`` from its ``state``, tried one at a time; creation is collective, as is every step.
 
-    ``ts`` is PETSc's time stepper with the options that the user gave.
+    ``ts`` is PETSc's time stepper with the options that the user gave. ``context_address`` is that of its right-hand
+    side's ``CONTEXT``, which lives as long as ``ts``.
     """
 
     def __init__(self, model: Model, layout: Layout, state: PETSc.Vec, lattice: LatticeRecord) -> None:
@@ -50,7 +50,9 @@ class TimeStepper:
         self.ts = ts
         self._state = state
         self._saved = state.duplicate()
-        self._onset = register(ts, lattice)["onset"]
+        context = register(ts, lattice)
+        self.context_address = int(context.ctypes.data)
+        self._onset = context["onset"]
 
         # The step must depend neither on the lattice's length nor on the ranks: the largest error decides. PETSc takes
         # the norm from its options alone, where it must not stay for the next time stepper of the process.
@@ -91,13 +93,13 @@ class TimeStepper:
             self._onset[0] = (0.0, 0.0)
             # The last stage of a first-same-as-last pair is a rate by z.
             ts.restartStep()
-        if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
+        if math.isfinite(suggestion) and ts.getConvergedReason() >= 0:
             # After an onset it is a length in z. That is a cautious one in t: at the end of the step dt/dz = 2.
             return StepOutcome(accepted=True, suggestion=suggestion)
 
         self.undo_step()
         # The error of a trial that overflows is not finite, and no step follows from it: a much shorter one is tried.
-        if not np.isfinite(suggestion):
+        if not math.isfinite(suggestion):
             return StepOutcome(accepted=False, suggestion=0.1 * h)
         if after_onset:
             # From z = 0 on, a length in t is z^2/h.
