@@ -129,11 +129,12 @@ class Sweep(StudyCase):
             digest.update("".join(sorted(texts)).encode())
             return digest.hexdigest()[:16]
 
-        # The values of an axis are written once; a sweep may have a million members.
+        # The values of an axis are written once, by one encoder: a sweep may have a million members.
+        encode = json.JSONEncoder(sort_keys=True, default=str).encode
         texts: list[list[str]] = []
         for axis in self.axes:
             rows = [dict(zip(axis, values, strict=True)) for values in zip(*axis.values(), strict=True)]
-            texts.append([json.dumps(row, sort_keys=True, default=str) for row in rows])
+            texts.append([encode(row) for row in rows])
         return [name(chosen) for chosen in itertools.product(*texts)]
 
     def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
