@@ -109,7 +109,7 @@ def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> 
         return rate(t, y.reshape(state.shape)).ravel()
 
     span = (0, period)
-    solved = solve_ivp(flat_rate, span, state.ravel(), "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 100)
+    solved = solve_ivp(flat_rate, span, state.ravel(), "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 50)
     return solved.y[:, -1].reshape(state.shape)
 
 

@@ -131,8 +131,8 @@ class ForcedCell:
         change.terminal = True
         while t < end:
             change.direction = -1 if side else 1
-            done = solve_ivp(self.rate, (t, end), y, "DOP853", events=change, args=(side, approach), rtol=1e-11,
-                             atol=1e-14, max_step=2e-4)  # fmt: skip
+            done = solve_ivp(self.rate, (t, end), y, "DOP853", events=change, args=(side, approach), rtol=1e-9,
+                             atol=1e-13, max_step=2e-4)  # fmt: skip
             t = done.t[-1]
             y = done.y[:, -1]
             u, v = y.reshape(2, -1)
