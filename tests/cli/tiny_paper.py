@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def drawing(plan: Plan) -> Plan:
     return replace(plan, figures=tuple(figure for figure in plan.figures if figure.id in DRAWN))
 
 
-def measure_claims(root: Path) -> list[dict]:
+def measure_claims(root: Path, unusable: Mapping[str, str]) -> list[dict]:
     """Return rows of claims whose values are sums over the results of two steps: they show any bit that differs."""
     found = []
     for name, key, step, data in (
@@ -71,7 +72,7 @@ def measure_claims(root: Path) -> list[dict]:
         path = root / step / "ensemble.h5"
         value = {}
         # A part of the paper may lack one of the steps; a step whose members all failed has no measures.
-        if path.exists():
+        if path.exists() and step not in unusable:
             with h5py.File(path) as file:
                 if data in file:
                     value = {"total": float(np.nansum(file[data][...]))}

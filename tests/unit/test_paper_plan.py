@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tomllib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import draw, make, steps
 from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.cell_search import search_design
+from vipetsc.paper.claims.criteria import UNMEASURED
+from vipetsc.paper.claims.measure import measure_claims
 from vipetsc.paper.paper_figures import TRANSFER, PaperFigure
 from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, PaperStep, Plan, fingerprint, paper_plan
 from vipetsc.parallel import StoppedError, StopRequest
@@ -153,6 +156,31 @@ def test_another_case_is_another_input_and_a_stale_step(searched):
     assert step.state(root) == DONE
 
 
+def test_no_claim_is_measured_from_results_that_are_stale_or_a_part(searched):
+    """Where another part of the paper is made, the claims of a step whose case has changed are not measured."""
+    plan, root = searched
+    given: list[Mapping[str, str]] = []
+
+    def measured(root: Path, unusable: Mapping[str, str]) -> list[dict[str, Any]]:
+        given.append(unusable)
+        return measure_claims(root, unusable)
+
+    def rows(step: PaperStep) -> list[dict[str, Any]]:
+        # Without the file the claims are measured again, whatever their inputs were.
+        (root / "claims.json").unlink(missing_ok=True)
+        whole = replace(plan, steps=(step,), figures=[], measure=measured)
+        nothing = replace(whole, steps=())
+        made = make._make_paper(whole, nothing, root, MPI.COMM_SELF, StopRequest(), lambda text: None)
+        return [row for row in made.claims if row["id"] == "C10"]
+
+    step = plan.steps[0]
+    assert all(row["files"] == ["design/design.h5"] for row in rows(step))
+    for row in rows(replace(step, changes=(*SMALL, "design.eta.count=4"))):
+        assert row["verdict"] == UNMEASURED and not row["files"]
+        assert "design has results of another case or version" in row["reason"]
+    assert [set(unusable) for unusable in given] == [set(), {"design"}]
+
+
 def test_a_relation_that_changes_is_another_input(tmp_path):
     """The scattering law that a prediction reads is a part of its identity."""
     step = step_of(paper_plan(FULL), TRANSFER)
@@ -226,7 +254,7 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
     root = tmp_path / "paper"
     step = plan.steps[0]
     figures = [figure for figure in plan.figures if figure.id == "fig10"]
-    plan = replace(plan, steps=(replace(step, name="other"), step), figures=figures, measure=lambda root: [])
+    plan = replace(plan, steps=(replace(step, name="other"), step), figures=figures, measure=lambda root, unusable: [])
     injector = Injector()
     injector.arm("member", 1, "exception")
 
@@ -268,7 +296,7 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
 @pytest.mark.parametrize("end", ["another case", "removed"])
 def test_the_time_of_a_step_is_that_of_the_results_that_are_there(searched, tmp_path, end):
     """The time of a step is that of its present results, not of earlier ones that were replaced or removed."""
-    plan = replace(searched[0], figures=[], measure=lambda root: [])
+    plan = replace(searched[0], figures=[], measure=lambda root, unusable: [])
     root = tmp_path / "paper"
     make.make_paper(plan, root)
     record = read_record(root)
@@ -315,7 +343,7 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
 @pytest.mark.usefixtures("plain_pictures")
 def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
     """A second call draws nothing; a missing picture is drawn again, a missing report encodes its pictures again."""
-    plan = replace(searched[0], measure=lambda root: [])
+    plan = replace(searched[0], measure=lambda root, unusable: [])
     root = tmp_path / "paper"
     offered: list[str] = []
     encoded: list[int] = []
@@ -380,7 +408,7 @@ def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
     plan = paper_plan(FULL)
     in_parts = [step for step in plan.steps if step.parts]
 
-    make.make_paper(replace(plan, steps=in_parts, figures=[], measure=lambda root: []), tmp_path)
+    make.make_paper(replace(plan, steps=in_parts, figures=[], measure=lambda root, unusable: []), tmp_path)
 
     assert len(jobs) == 7
     assert {name for _, name, _ in jobs} == {step.name for step in in_parts}

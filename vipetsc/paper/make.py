@@ -134,7 +134,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: st
         tell("claims")
         sys.audit("vipetsc.claims")
         begin = time.process_time()
-        write_claims(plan.measure(root), path)
+        write_claims(plan.measure(root, plan.unusable(root)), path)
         record["claims"] = inputs
         record["cpu"]["claims"] = time.process_time() - begin
 

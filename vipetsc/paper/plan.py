@@ -253,14 +253,14 @@ class Plan:
     """The steps in the order in which they are computed, and the figures of the paper.
 
     ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` returns the rows of ``claims.json``
-    from the folder that has the folders of all steps.
+    from the folder that has the folders of all steps, and the steps that cannot be used (``unusable``).
     """
 
     grid: str
     steps: tuple[PaperStep, ...]
     figures: Sequence[PaperFigure] = PAPER_FIGURES
     note: str = ""
-    measure: Callable[[Path], Sequence[Mapping[str, Any]]] = measure_claims
+    measure: Callable[[Path, Mapping[str, str]], Sequence[Mapping[str, Any]]] = measure_claims
 
     def only(self, ids: Sequence[str]) -> Self:
         """The part of the plan that the figures and claims ``ids`` need; the whole plan without any.
@@ -291,6 +291,12 @@ class Plan:
     def folders(self, root: Path) -> Mapping[str, Path]:
         """The folders of the steps that are done, by name."""
         return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}
+
+    def unusable(self, root: Path) -> Mapping[str, str]:
+        """The reason why a step has results that no claim is measured from, by its name: they are stale, or a part."""
+        reasons = {STALE: "has results of another case or version: compute it again", BEGUN: "is not finished"}
+        states = {step.name: step.state(root) for step in self.steps}
+        return {name: reasons[state] for name, state in states.items() if state in reasons}
 
     def claims_of(self, step: PaperStep) -> list[str]:
         """The ids of the claims that are measured from a step, or whose figures show it."""

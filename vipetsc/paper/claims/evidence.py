@@ -1,6 +1,7 @@
 """The evidence for the claims: the steps of the paper in one folder, and the numbers of a measurement."""
 
 import tomllib
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -109,21 +110,26 @@ class AmplitudeCurve:
 class Evidence(ExitStack):
     """Access to the results of the steps in ``root``: files are opened when asked for, and closed with the context.
 
-    ``files`` lists those asked for since the list was emptied, relative to ``root``, in order. Every method raises
-    MissingEvidence for what is not there, OSError or ValueError for a file that cannot be used.
+    ``files`` lists those asked for since the list was emptied, relative to ``root``, in order. ``unusable`` are reasons
+    why steps have no results to use, by their names. Every method raises MissingEvidence for what is not there or of
+    such a step, OSError or ValueError for a file that cannot be used.
     """
 
-    def __init__(self, root: str | Path) -> None:
+    def __init__(self, root: str | Path, unusable: Mapping[str, str] | None = None) -> None:
         super().__init__()
         self.root = Path(root)
+        self.unusable = unusable or {}
         self.files: list[str] = []
         # Claims ask for the same files again and again.
         self._open_ensemble = cache(open_ensemble)
         self._open = cache(lambda path, needs: self.enter_context(open_netcdf(path, "file of results", needs)))
 
     def path(self, *parts: str) -> Path:
-        """A file below ``root``, noted down; raises MissingEvidence where there is none."""
+        """A file below ``root``, noted down; raises MissingEvidence where there is none, or of an unusable step."""
         name = "/".join(parts)
+        step = name.split("/")[0]
+        if step in self.unusable:
+            raise MissingEvidence(f"{step} {self.unusable[step]}")
         if not (self.root / name).exists():
             raise MissingEvidence(f"{name} is missing")
         if name not in self.files:

@@ -14,16 +14,17 @@ from vipetsc.paper.claims.evidence import Evidence, Measurement, MissingEvidence
 DIGITS = 6  # significant ones of the numbers in claims.json: further ones depend on the machine
 
 
-def measure_claims(root: str | Path) -> list[dict[str, Any]]:
+def measure_claims(root: str | Path, unusable: Mapping[str, str] | None = None) -> list[dict[str, Any]]:
     """Measure all claims in their readings from the steps in ``root``; returns the rows of ``claims.json``.
 
     A row is a claim, by its ``id``, in one ``reading`` of the paper's parameters. ``value`` has numbers by name, None
     where one could not be measured; those that decide have the names of the criteria in ``threshold``. ``uncertainty``
     has intervals, spreads and numbers of points by name. ``figure`` is the stem of the picture that shows the claim;
     ``files`` are those that it was measured from, relative to ``root``. A claim whose files are missing or cannot be
-    used has the verdict "not measured", and ``reason`` says why.
+    used has the verdict "not measured", and ``reason`` says why; so has one of steps that are ``unusable``, which gives
+    the reasons by the names of steps.
     """
-    with Evidence(root) as evidence:
+    with Evidence(root, unusable) as evidence:
         rows = []
         for claim, spec in CLAIMS.items():
             rows += [measure_claim(claim, reading, evidence) for reading in spec.readings]
