@@ -47,6 +47,11 @@ WITHOUT_INFLUENCE = {
 pytestmark = pytest.mark.slow
 
 
+def answer(column: Column, feature: Feature) -> str:
+    """What the table says of a feature: each of its cases is read once for all tests."""
+    return answers()[feature.name][COLUMNS.index(column)]
+
+
 def is_in_turn(column: Column, feature: Feature) -> bool:
     """Whether a yes is computed: always by a fast verb, every ``TURNS``-th feature by a verb that takes seconds."""
     place = COLUMNS.index(column) + FEATURES.index(feature)
@@ -113,7 +118,7 @@ def test_every_yes_is_computed(column, tmp_path, in_process):
     before = computed(plain)
 
     for feature in FEATURES:
-        if column.answer(feature) != YES or not is_in_turn(column, feature):
+        if answer(column, feature) != YES or not is_in_turn(column, feature):
             continue
         results = computed(put_case(column, feature, tmp_path / feature.name))
         assert results
@@ -129,8 +134,8 @@ def test_every_yes_is_computed(column, tmp_path, in_process):
 def test_every_no_is_what_the_program_says(column, tmp_path, in_process):
     """A verb that refuses a feature writes nothing, and its message has the sentences of the table."""
     for feature in FEATURES:
-        answer = column.answer(feature)
-        if answer in (YES, UNREAD):
+        refusal = answer(column, feature)
+        if refusal in (YES, UNREAD):
             continue
         case = put_case(column, feature, tmp_path / feature.name)
         folder = case.parent / "out"
@@ -139,10 +144,10 @@ def test_every_no_is_what_the_program_says(column, tmp_path, in_process):
         if column.heading == "propagator":
             # The run uses the other engine, and says why.
             assert ended.returncode == 0, feature.name
-            assert answer in ended.stdout + ended.stderr
+            assert refusal in ended.stdout + ended.stderr
         else:
             assert ended.returncode == 2, feature.name
-            assert all(sentence in ended.stderr for sentence in answer.split("; ")), feature.name
+            assert all(sentence in ended.stderr for sentence in refusal.split("; ")), feature.name
             assert not list(folder.glob("*.h5"))
 
 

@@ -7,6 +7,7 @@ message that refuses it.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -291,7 +292,8 @@ FEATURES: tuple[Feature, ...] = (
 """The features of a case, in the order of the chapter."""
 
 
-def answers() -> dict[str, list[str]]:
+@cache
+def answers() -> Mapping[str, Sequence[str]]:
     """The answer of each column to each feature, by the feature's name."""
     return {feature.name: [column.answer(feature) for column in COLUMNS] for feature in FEATURES}
 

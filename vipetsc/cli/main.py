@@ -43,7 +43,7 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     if not has_verb:
         arguments = ["run", *arguments]  # of the built-in case
 
-    options = _parser().parse_args(arguments)
+    options = _parser(called=arguments[0]).parse_args(arguments)
     # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
@@ -103,10 +103,12 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         return STOPPED
 
 
-def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
+def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None) -> Parser:
     """The parser of all verbs.
 
-    ``complete`` says how a shell completes arguments (values of ``shtab``), by the arguments' names or flags.
+    ``complete`` says how a shell completes arguments (values of ``shtab``), by the arguments' names or flags. If the
+    verb that is ``called`` is known, it alone gets its arguments, since to declare those of all verbs takes longer than
+    to parse a command.
     """
     parser = Parser(
         prog="vipetsc",
@@ -126,6 +128,9 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
         )
         # The verb `completion` makes a parser of its own with this function, to describe it to a shell.
         of_verb.set_defaults(parser=_parser)
+        if called not in (None, verb.name):
+            continue
+
         for flag, keywords in (*verb.arguments, *OF_EVERY_VERB):
             added = of_verb.add_argument(flag, **keywords)
             if complete and flag in complete:
