@@ -38,6 +38,9 @@ TINY = set_words(
     "output.figures=false",
 )
 
+# One of the tests calls mpirun; in the same process as that one the others find the sdist and the wheel made.
+needs_the_wheel = pytest.mark.mpirun
+
 
 def tracked() -> list[str]:
     """Return the names of the files that git tracks and that exist."""
@@ -85,6 +88,7 @@ def site(built, tmp_path_factory) -> Path:
     return folder
 
 
+@needs_the_wheel
 def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):
     """The sdist has all tracked files that are not hidden; the wheel has all of the package's, and its version."""
     sdist, wheel = built
@@ -103,7 +107,7 @@ def test_the_top_level_holds_what_it_may():
     assert {name.partition("/")[0] for name in tracked()} <= TOP
 
 
-@pytest.mark.mpirun
+@needs_the_wheel
 def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     """The console script of the wheel prints its version, runs on two ranks, draws, and lists the paper's steps."""
     program = site / "bin" / "vipetsc"
@@ -129,6 +133,7 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
         assert (tmp_path / "paper" / path).exists()
 
 
+@needs_the_wheel
 def test_an_installed_package_registers_a_law(site, tmp_path):
     """A package with an entry point registers the manual's law; its version and hash are in the results."""
     write_modules(tmp_path, site / "vipetsc/manual/extend.md")
@@ -150,6 +155,7 @@ def test_an_installed_package_registers_a_law(site, tmp_path):
     assert case["contacts"]["law"] == "hardening"
 
 
+@needs_the_wheel
 def test_what_pip_cannot_bring_is_named(site, tmp_path):
     """Without the libraries that are built for MPI, ``doctor`` names them and their remedy, without a traceback."""
     # An import of a module that is None in sys.modules fails.

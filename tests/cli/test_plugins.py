@@ -54,6 +54,9 @@ end = 0.03
 engine = "propagator"
 """
 
+# One of the tests calls mpirun; in the same process as that one the others find the run made and its law compiled.
+pytestmark = pytest.mark.mpirun
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
@@ -320,7 +323,6 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
     assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
 
 
-@pytest.mark.mpirun
 def test_two_ranks_have_the_bits_of_one(folder, out, tmp_path, on_ranks):
     """The registered law, compiled on each of two ranks, gives the same bits as on one rank."""
     on_ranks(2, "run", folder / "case.toml", "--out", tmp_path / "two", *set_words("output.figures=false"))
