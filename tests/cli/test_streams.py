@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import clean_environment
+from vipetsc.cli.streams import CheckedStream
 
 pytestmark = pytest.mark.slow
 
@@ -55,26 +56,58 @@ def by_shell(tmp_path):
     return call
 
 
-@pytest.mark.parametrize("answer", ANSWERS)
-def test_an_answer_that_a_full_device_does_not_take_is_a_failure(by_shell, tmp_path, answer):
-    """A verb whose stdout is a full device ends with 1 and a sentence; a run keeps its results."""
-    ended = by_shell(ANSWERS[answer], ">/dev/full")
+@pytest.fixture
+def with_stdout(in_process, monkeypatch, tmp_path):
+    """Call the program in this process, in a temporary folder, with its stdout on a ``descriptor``, which is closed.
+
+    The stream is the one that the program puts in the place of Python's own. By ``by_shell`` each kind of redirection
+    is tested once in a real process, with its beginning and end.
+    """
+
+    def call(words: tuple[str, ...], descriptor: int) -> subprocess.CompletedProcess:
+        with CheckedStream(descriptor, "stdout", "utf-8") as stream, monkeypatch.context() as context:
+            context.setattr(sys, "stdout", stream)
+            return in_process(*words, cwd=tmp_path)
+
+    return call
+
+
+def assert_full_device_is_reported(ended: subprocess.CompletedProcess) -> None:
+    """The exit code is 1, and a sentence says that the device is full."""
     assert ended.returncode == 1, ended.stderr
     assert "vipetsc: stdout: No space left on device" in ended.stderr
     assert "Traceback" not in ended.stderr and "Logging error" not in ended.stderr
-    if answer == "run":
-        assert (tmp_path / "out/run.h5").exists()
 
 
-@pytest.mark.parametrize("answer", ["schema", "run"])
-def test_an_answer_to_a_closed_stdout_is_a_failure(by_shell, tmp_path, answer):
-    """A verb whose stdout is closed ends with 1 and a sentence; the answer does not go to stderr instead."""
-    ended = by_shell(ANSWERS[answer], ">&-")
+def test_a_run_whose_answer_a_full_device_does_not_take_is_a_failure(by_shell, tmp_path):
+    """A run whose stdout is a full device ends with 1 and a sentence, and keeps its results."""
+    assert_full_device_is_reported(by_shell(TINY, ">/dev/full"))
+    assert (tmp_path / "out/run.h5").exists()
+
+
+@pytest.mark.parametrize("answer", [answer for answer in ANSWERS if answer != "run"])
+def test_an_answer_that_a_full_device_does_not_take_is_a_failure(with_stdout, answer):
+    """A verb whose stdout is a full device ends with 1 and a sentence."""
+    assert_full_device_is_reported(with_stdout(ANSWERS[answer], os.open("/dev/full", os.O_WRONLY)))
+
+
+def assert_closed_stdout_is_reported(ended: subprocess.CompletedProcess) -> None:
+    """The exit code is 1, a sentence says that stdout is closed, and the answer does not go to stderr instead."""
     assert ended.returncode == 1, ended.stderr
     assert "vipetsc: stdout: Bad file descriptor" in ended.stderr
     assert "properties" not in ended.stderr and "complete: " not in ended.stderr
-    if answer == "run":
-        assert (tmp_path / "out/run.h5").exists()
+
+
+def test_an_answer_to_a_closed_stdout_is_a_failure(by_shell):
+    """A verb whose stdout is closed ends with 1 and a sentence."""
+    assert_closed_stdout_is_reported(by_shell(ANSWERS["schema"], ">&-"))
+
+
+def test_a_run_whose_answer_goes_to_a_closed_stdout_is_a_failure(with_stdout, tmp_path):
+    """A run whose stdout is closed ends with 1 and a sentence, and keeps its results."""
+    # At its beginning the program opens a file that cannot be written in the place of a closed stream.
+    assert_closed_stdout_is_reported(with_stdout(TINY, os.open(os.devnull, os.O_RDONLY)))
+    assert (tmp_path / "out/run.h5").exists()
 
 
 def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
@@ -96,25 +129,44 @@ def test_closed_streams_are_no_failure_where_nothing_is_printed(by_shell, tmp_pa
     assert (tmp_path / "out/run.h5").exists()
 
 
-@pytest.mark.parametrize("answer", ["schema", "run"])
-def test_a_reader_that_has_seen_enough_hears_nothing_more(by_shell, tmp_path, answer):
-    """A pipe whose reader has ended gives exit code 141 (128 + SIGPIPE) without a message; a run keeps its results."""
-    ended = by_shell(ANSWERS[answer], "| true")
+def assert_reader_hears_nothing_more(ended: subprocess.CompletedProcess) -> None:
+    """The exit code is 141 (128 + SIGPIPE), and nothing is said."""
     assert ended.returncode == 141
     for complaint in ("stdout", "Traceback", "Broken"):
         assert complaint not in ended.stderr
-    if answer == "run":
-        assert (tmp_path / "out/run.h5").exists()
 
 
-@pytest.mark.parametrize("words", [("schema",), TINY])
-def test_a_log_on_a_full_device_is_a_failure(by_shell, tmp_path, words):
-    """A verb whose log is a full device prints its answer, says once that the log failed, and ends with 1."""
-    ended = by_shell((*words, "--log", "/dev/full"), ">printed")
+def test_a_reader_that_has_seen_enough_hears_nothing_more(by_shell):
+    """A verb whose answer goes into a pipe without a reader ends with 141, without a message."""
+    assert_reader_hears_nothing_more(by_shell(ANSWERS["schema"], "| true"))
+
+
+def test_a_run_whose_reader_has_seen_enough_goes_on_in_silence(with_stdout, tmp_path):
+    """A run whose answer goes into a pipe without a reader ends with 141, without a message, and keeps its results."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    assert_reader_hears_nothing_more(with_stdout(TINY, writing))
+    assert (tmp_path / "out/run.h5").exists()
+
+
+def assert_lost_log_is_reported(ended: subprocess.CompletedProcess) -> None:
+    """The exit code is 1, and one sentence says that the log's device is full."""
     assert ended.returncode == 1, ended.stderr
     assert ended.stderr.count("vipetsc: --log /dev/full: No space left on device") == 1
     assert "Traceback" not in ended.stderr
+
+
+def test_a_log_on_a_full_device_is_a_failure(by_shell, tmp_path):
+    """A verb whose log is a full device prints its answer, says once that the log failed, and ends with 1."""
+    assert_lost_log_is_reported(by_shell(("schema", "--log", "/dev/full"), ">printed"))
     assert (tmp_path / "printed").stat().st_size > 100
+
+
+def test_the_log_of_a_run_on_a_full_device_is_a_failure(in_process, tmp_path):
+    """A run whose log is a full device prints its answer, says once that the log failed, and ends with 1."""
+    ended = in_process(*TINY, "--log", "/dev/full", cwd=tmp_path)
+    assert_lost_log_is_reported(ended)
+    assert len(ended.stdout) > 100
 
 
 def test_a_reader_that_is_slow_gets_all(tmp_path):
