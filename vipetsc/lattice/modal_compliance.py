@@ -124,11 +124,11 @@ class ModalCompliance:
         """
         rows, columns, rigid_rows, rigid_columns = self._parts
         omega = np.atleast_1d(np.asarray(omegas, complex))
-        out = (rows * self._gain(omega, np.any(rows, axis=0))[:, None, :]) @ columns
+        out = (rows * self._gain(omega, self._moved)[:, None, :]) @ columns
         if rigid_columns.size:
             with np.errstate(divide="ignore", invalid="ignore"):
                 out += rigid_rows @ rigid_columns / (-(omega[:, None, None] ** 2))
-        if not self.chain.is_damped and np.all(omega.imag == 0):
+        if not self._is_damped and np.all(omega.imag == 0):
             return np.asarray(out.real)
         return np.asarray(out)
 
@@ -162,10 +162,29 @@ class ModalCompliance:
         It is unbounded for p = 0 at omega = 0, where a body that nothing holds may be anywhere. It is set to 0 there
         unless the pole is ``moved`` (pole,).
         """
-        poles = self._poles.poles
-        gap = 1j * omega[:, None] - poles
+        gap = 1j * omega[:, None] - self._poles.poles
+        given = moved | self._oscillates
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.divide(1, gap, out=np.zeros_like(gap), where=moved | (poles != 0) | (gap != 0))
+            # Of most lattices every pole is another one than 0.
+            if given.all():
+                return np.divide(1, gap)
+            return np.divide(1, gap, out=np.zeros_like(gap), where=given | (gap != 0))
+
+    # What a response needs at each frequency is kept: to find it takes as long as the response of a small lattice.
+    @cached_property
+    def _is_damped(self) -> bool:
+        """Whether the lattice has a dashpot."""
+        return self.chain.is_damped
+
+    @cached_property
+    def _moved(self) -> np.ndarray:
+        """Mask (pole,) of the poles whose motion moves a pair."""
+        return np.asarray(np.any(self._parts[0], axis=0))
+
+    @cached_property
+    def _oscillates(self) -> np.ndarray:
+        """Mask (pole,) of the poles that are not 0."""
+        return np.asarray(self._poles.poles != 0)
 
     @cached_property
     def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
