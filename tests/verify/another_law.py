@@ -277,7 +277,7 @@ source = "force"
 infinite = false
 fixed = [{omega}]
 range = [{0.9 * touching}, {3 * touching}]
-harmonics = 31
+harmonics = 21
 
 [output]
 figures = false
