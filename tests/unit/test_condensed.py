@@ -16,6 +16,7 @@ from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
 from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.shifted_compliance import ShiftedCompliance
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError
@@ -233,6 +234,36 @@ def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_re
 
 def hardening_forces() -> SiteForces:
     return SiteForces([Stops.both(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
+
+
+@pytest.mark.parametrize("pairs", [1, 2])
+@pytest.mark.parametrize("detuning", [0.0, 1e-9, 1e-5, 1e-3])
+def test_the_rate_is_exact_beside_a_mode_that_hardly_moves_the_pairs(detuning, pairs):
+    """Stiff springs at the pairs: the pole of the shifted compliance is 4e-5 of the frequency beside the mode."""
+    stiffness = np.array([[1.2e4, -1e4, -1e3, 0], [-1e4, 1e4, 0, 0], [-1e3, 0, 1.4e4, -1.2e4], [0, 0, -1.2e4, 1.2e4]])
+    rows = np.array([[-1.0, 1.0, 0, 0], [0, 0, -1.0, 1.0]])[:pairs]
+    dense = DenseCompliance(np.array([1.0, 0.15, 1.0, 0.2]), stiffness, rows)
+    omega = float(np.sqrt(dense.squared[0])) * (1 + detuning)
+    orders = np.array([1, 3])
+    shifted = ShiftedCompliance(dense, pairs, orders, 1.0)
+    shift = shifted.shift(omega)
+    step = 1e-8 * omega
+    ends = [dense.with_springs(orders * omega + sign * step, shift[:, 0, 0]) for sign in (1, -1)]
+    expected = (ends[0] - ends[1]) / (2 * step)
+    found = shifted.rate(omega, shift)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())
+
+
+def test_a_branch_begins_at_a_mode_that_hardly_moves_its_pair():
+    """A cell's stiff spring lies beside the contact: the motion of the mode has its frequency."""
+    stiffness = np.array([[1.2e4, -1e4], [-1e4, 1e4]])
+    row = np.array([[-1.0, 1.0]])
+    dense = DenseCompliance(np.array([1.0, 0.15]), stiffness, row)
+    omega = float(np.sqrt(dense.squared[0]))
+    motions = ConservativeMotions(dense, SiteForces([Stops(CONSERVATIVE[0], 1.0, np.inf)]), NnmTable())
+    point = motions.from_mode(0.01 * row @ dense.vectors[:, 0], omega)
+    assert 2 * np.pi / point.period == pytest.approx(omega, rel=1e-12)
 
 
 def test_the_solution_does_not_depend_on_the_shift():

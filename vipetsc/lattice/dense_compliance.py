@@ -54,6 +54,18 @@ class DenseCompliance:
         loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
         return np.asarray(self.parts @ np.linalg.solve(dynamic, loads))
 
+    def rate(self, omegas: np.ndarray) -> np.ndarray:
+        """The derivative (omega, pair, pair) by the frequency of the compliance at ``omegas`` (omega,) in rad/s."""
+        gain = 2 * omegas[:, None] * self._gain(omegas) ** 2
+        return np.asarray((self.parts * gain[:, None, :]) @ self.parts.T)
+
+    def rate_with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """The derivative (omega, pair, pair) by the frequency of the compliance ``with_springs``."""
+        dynamic = self.dynamic_stiffness(omegas, stiffness)
+        loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
+        motions = np.linalg.solve(dynamic, loads)
+        return np.asarray(2 * omegas[:, None, None] * (motions.swapaxes(1, 2) @ motions))
+
     def dynamic_stiffness(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
         """diag(Om_n^2 - omega^2) + k Z^T Z (omega, mode, mode) in (rad/s)^2, of the modes' amplitudes.
 

@@ -1,8 +1,9 @@
 """The compliance at the multiples of a frequency, shifted by springs that keep its poles away.
 
 With a spring of the stiffness s added at each pair the compliance G becomes G_s = A G, A = (1 + s G)^-1
-(``harmonic_balance``). Its derivative by frequency is taken from values of G at complex frequencies around the real
-one, by Cauchy's formula, with nodes w_n on a circle of the radius r about omega:
+(``harmonic_balance``). If all modes are known, its derivative by frequency is A G' A. It is exact however near a pole
+of G_s is, as that of a mode that hardly moves the pairs. Otherwise it is taken from values of G at complex frequencies
+around the real one, by Cauchy's formula, with nodes w_n on a circle of the radius r about omega:
 
     dG_s/domega = (1/N) sum_n G_s(w_n)/(w_n - omega).
 
@@ -131,18 +132,26 @@ class ShiftedCompliance:
         if self.pairs < 2 or not isinstance(self.compliance, DenseCompliance):
             return Shifted(shifted, factor)
 
-        # Near the pole of a mode the compliance of several pairs is that of the mode alone, to rounding, and the
-        # inverse has lost the rest; of one pair nothing is lost.
-        sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
-        (near,) = np.nonzero(sizes > NEAR_POLE)
+        near = self._near_poles(values, shift)
         stiffness = shift[near, 0, 0]
-        if near.size and self.weight == 1.0:
+        if near.size:
             shifted[near] = self.compliance.with_springs(orders[near] * omega, stiffness)
             factor[near] = np.eye(self.pairs) - stiffness[:, None, None] * shifted[near]
         return Shifted(shifted, factor)
 
+    def _near_poles(self, values: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The numbers (n,) of the ``values`` that are so near to a pole of G that (1 + s G)^-1 has lost digits."""
+        # Near the pole of a mode the compliance of several pairs is that of the mode alone, to rounding, and the
+        # inverse has lost the rest; of one pair nothing is lost.
+        sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
+        is_near = (sizes > NEAR_POLE) & (self.pairs > 1) & (self.weight == 1.0)
+        return np.flatnonzero(is_near)
+
     def _differentiate(self, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The derivative of G_s: by Cauchy's formula, or by a central difference where G is complex."""
+        """The derivative of G_s: from all modes, by Cauchy's formula, or by a central difference where G is complex."""
+        if isinstance(self.compliance, DenseCompliance):
+            return self._differentiate_modes(self.compliance, omega, shift)
+
         # Frequencies of the orders, and the units of their distances to the nodes.
         rates = self.orders * omega
         sizes = np.maximum(rates, LEAST_RATE * rates[-1])
@@ -160,3 +169,18 @@ class ShiftedCompliance:
         if is_real:
             return np.asarray(slopes.real)
         return np.asarray(slopes)
+
+    def _differentiate_modes(self, compliance: DenseCompliance, omega: float, shift: np.ndarray) -> np.ndarray:
+        """The derivative of G_s by A G' A, with the derivative G' of the compliance from its modes."""
+        rates = self.orders * omega
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = compliance.rate(rates)
+        if not np.all(np.isfinite(slopes)):
+            slopes = compliance.rate(rates * (1 + DETUNING))
+        factor = self.at(omega, shift).factor
+        out = factor @ self._weighted(slopes, self.orders) @ factor
+
+        near = self._near_poles(self.values(omega), shift)
+        if near.size:
+            out[near] = compliance.rate_with_springs(rates[near], shift[near, 0, 0])
+        return np.asarray(out)
