@@ -21,6 +21,7 @@ from vipetsc.cli.drawing import draw_pictures, draw_unmeasured
 from vipetsc.cli.verbs.run_verb import PICTURES
 from vipetsc.dynamics import simulate
 from vipetsc.figures.common_turns import CommonTurns
+from vipetsc.figures.registry import draw
 from vipetsc.figures.second_process import SecondProcess
 
 pytestmark = pytest.mark.parallel(1)
@@ -70,6 +71,23 @@ class Recorded:
         return None
 
 
+class Immediate:
+    """A second process that has drawn all that it is asked for as soon as it is asked."""
+
+    is_asked = False
+
+    def __init__(self) -> None:
+        self.turns = iter(())
+        self.files = []
+
+    def ask(self, source, folders, divided=False, **options):
+        self.files += draw(source, folders, **options)
+        self.is_asked = True
+
+    def drawn(self):
+        return self.files
+
+
 @pytest.mark.slow
 def test_two_processes_draw_what_one_draws(run, tmp_path):
     """Two processes together draw the same pictures, byte by byte, as one process alone."""
@@ -112,6 +130,16 @@ def test_pictures_without_the_warnings_of_the_measures_are_drawn_again(name, req
     ahead, rest = second.requests
     assert {f"{figure}.png" for figure in ahead["names"]} == WITHOUT_MEASURES
     assert rest["omit"] == (ahead["names"] if name == "run" else ())
+
+
+def test_pictures_that_were_drawn_ahead_are_not_drawn_by_a_later_call(tmp_path):
+    """A later call draws nothing, though pictures of the first call are older than the measures."""
+    folder = run_in(tmp_path / "run", stride=1)
+    ahead = Immediate()
+    draw_unmeasured(PICTURES, folder, ahead)
+    assert draw_pictures(PICTURES, [folder], MPI.COMM_SELF, afresh=False, helper=ahead)
+
+    assert draw_pictures(PICTURES, [folder], MPI.COMM_SELF, afresh=False) == []
 
 
 def test_earlier_measures_keep_pictures_from_being_drawn_ahead(tmp_path):

@@ -136,6 +136,10 @@ def draw_pictures(
                 from_here = draw_here(turns=helper.turns, omit=drawn_ahead)
                 others = helper.drawn()
                 if others is not None:
+                    # Some are older than the measures, which have no warning for them. A later call, which compares
+                    # times, must not draw them again.
+                    for path in others:
+                        path.touch()
                     return [*{*from_here, *others}]
             return draw_here(turns=count(comm.rank, comm.size))
 
