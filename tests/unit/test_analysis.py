@@ -13,7 +13,7 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies import velocity_record
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.sweep_runs import leading_cell
+from vipetsc.studies.sweep_runs import first_site_cell
 
 SAMPLES = 400
 INTERVAL = 2e-4  # s
@@ -171,8 +171,8 @@ def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
     run["sites/cell"].values[:] = [22, 9]
     overrides = ["lattice.cells=24", "contacts.sites=[22, 9]", "drive.cell=3", "drive.cycles=3"]
     ring = Case.load(overrides=[*overrides, "lattice.ends=periodic"])
-    assert leading_cell(ring) == 22
-    assert leading_cell(Case.of(run)) == 9
+    assert first_site_cell(ring) == 22
+    assert first_site_cell(Case.of(run)) == 9
 
     measured = analyse(run.assign_attrs(case=ring.to_toml()))
 

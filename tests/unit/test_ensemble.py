@@ -17,7 +17,7 @@ from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
-from vipetsc.studies.linear_run import LinearRun, envelope_squares, leading_cell, linear_name, read_linear
+from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, read_linear
 from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {
@@ -196,7 +196,7 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
     # The sampling interval is 5 ms, and the bound is half of it.
     assert wave.arrival == pytest.approx(peak, abs=0.0026)
     assert wave.statistics == {"work": 1.0}
-    assert leading_cell(case) == 7
+    assert first_site_cell(case) == 7
     assert wave.arrival_at(7) == wave.arrival[6]
     assert wave.arrival_at(0) is None
 

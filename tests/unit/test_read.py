@@ -10,7 +10,7 @@ from vipetsc.io.read import (
     curves,
     field_interval,
     field_time,
-    leading_site,
+    first_site,
     nearest_cell,
     open_ensemble,
     open_run,
@@ -92,7 +92,7 @@ def test_a_run_is_read_by_name(run):
         # The cells of the sites differ from the coordinate ``cell``, the recorded cells.
         assert list(data["sites/cell"].values) == [3, 20, 14]
         # The drive is in cell 12, two cells from the third site.
-        assert leading_site(data) == 2
+        assert first_site(data) == 2
 
         assert [nearest_cell(data, cell) for cell in (1, 4, 20, 99)] == [0, 1, 6, 9]
         assert list(field_time(data)) == [0, 1, 2, 3, 4]

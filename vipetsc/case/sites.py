@@ -28,7 +28,7 @@ class Span(Section):
 
 
 class ClearanceSpan(Section):
-    """Clearances in m, log-spaced from the leading to the last site."""
+    """Clearances in m, log-spaced from the first to the last site."""
 
     first: Positive
     last: Positive

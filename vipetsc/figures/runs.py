@@ -12,7 +12,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
-from vipetsc.io.read import field_time, leading_site
+from vipetsc.io.read import field_time, first_site
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.damped import decay_length
 
@@ -232,7 +232,7 @@ class Motion(NamedTuple):
 
 def without_phase(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
     """Return why a run has no phase portraits; empty where it has some."""
-    site = leading_site(run)
+    site = first_site(run)
     if site is None:
         return "the lattice has no contact sites"
     cell = int(run["sites/cell"][site])
@@ -247,7 +247,7 @@ def without_phase(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
 
 def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw velocity against displacement at the first site: grey before the first contact, then by time."""
-    site = leading_site(run)
+    site = first_site(run)
     assert site is not None
     cell = int(run["sites/cell"][site])
     chain = Case.of(run).model().chain

@@ -25,7 +25,7 @@ from vipetsc.figures import panels, style
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, phrase, transfer_members
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
-from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
+from vipetsc.io.read import field_interval, field_time, first_site, nearest_cell
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, taper
 
@@ -128,7 +128,7 @@ def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) ->
 def _mark_segments(axes: Axes, member: MemberRun) -> None:
     """Draw lines along the cells before and behind the first site, on the right edge of a map over cells."""
     cells = member.analysis["kinetic_energy"]["cell"].values
-    first = member.run["sites/cell"].values[leading_site(member.run)]
+    first = member.run["sites/cell"].values[first_site(member.run)]
     lower_cells = (cells[0], first - 1)
     higher_cells = (first + 1, cells[-1])
     driven_below = member.model.drive_cell + 1 <= first

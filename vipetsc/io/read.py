@@ -93,7 +93,7 @@ def field_interval(run: xr.Dataset) -> float:
     return float(time[1] - time[0])
 
 
-def leading_site(run: xr.Dataset) -> int | None:
+def first_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     cells = run["sites/cell"].values
     if not len(cells):

@@ -27,7 +27,7 @@ from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble
 from vipetsc.spectra import power_law
-from vipetsc.studies.linear_run import factor, is_proportional, leading_cell, read_linear
+from vipetsc.studies.linear_run import factor, first_site_cell, is_proportional, read_linear
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -124,7 +124,7 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
         raise ValueError("a contact that touches at rest acts at any amplitude")
 
     sites = np.asarray(case.contacts.sites)
-    amplitude = float(touching[np.argmax(sites == leading_cell(case))])
+    amplitude = float(touching[np.argmax(sites == first_site_cell(case))])
     energy = linear.statistics["work"] * amplitude**2
     return Initiation(amplitude, energy, onset=float(touching.min()))
 

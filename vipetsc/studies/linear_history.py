@@ -23,8 +23,8 @@ from vipetsc.studies.linear_run import (
     MARGIN,
     LinearRun,
     envelope_squares,
+    first_site_cell,
     is_proportional,
-    leading_cell,
     linear_case,
     other_pairs,
     reached,
@@ -127,7 +127,7 @@ class MemberHistory:
 
         def arrival() -> float | None:
             linear = LinearRun.of(self._history.run, self._history.statistics, sites=(), names=())
-            return linear.arrival_at(leading_cell(self._case))
+            return linear.arrival_at(first_site_cell(self._case))
 
         # Simulated by all ranks, taken from the dataset that the first one has.
         _ = self._history

@@ -261,7 +261,7 @@ def _linear_table(case: Case) -> dict[str, Any]:
     return case.varied_table(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)
 
 
-def leading_cell(case: Case) -> int:
+def first_site_cell(case: Case) -> int:
     """Cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
     if not cells.size:

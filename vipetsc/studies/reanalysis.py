@@ -24,7 +24,7 @@ from vipetsc.spectra.measures import is_measure
 from vipetsc.studies.analysis import FULL, analyse
 from vipetsc.studies.analysis_options import options_of
 from vipetsc.studies.ensemble import MISSING, Results
-from vipetsc.studies.linear_run import leading_cell, measured, read_linear
+from vipetsc.studies.linear_run import first_site_cell, measured, read_linear
 from vipetsc.studies.sweep import conclude
 from vipetsc.studies.sweep_runs import keeps_all, measures_of
 
@@ -153,7 +153,7 @@ def measure_run(
         # One rank looks for the record: the others must simulate together or not at all.
         linear = on_root(comm, lambda: read_linear(sweep or _containing_folder(folder), case))
         if linear:
-            arrival = linear.arrival_at(leading_cell(case))
+            arrival = linear.arrival_at(first_site_cell(case))
         else:
             arrival = find_arrival()
         analysis = analyse(run, measures, arrival, options, comm)

@@ -29,7 +29,7 @@ from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.progress import Progress, say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
-from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
+from vipetsc.studies.linear_run import LinearRun, first_site_cell, linear_name
 from vipetsc.studies.sweep_runs import SweepRuns
 from vipetsc.wording import counted
 
@@ -219,7 +219,7 @@ def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
 
 
 class NeededRun(NamedTuple):
-    """A linear run that is missing: a ``case`` that needs it, and the leading ``sites`` (cells) to measure it for."""
+    """A linear run that is missing: a ``case`` that needs it, and the first ``sites`` (cells) to measure it for."""
 
     case: Case
     sites: list[int]
@@ -306,11 +306,11 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
 
 
 def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:
-    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all leading sites."""
+    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all first sites."""
     runs: dict[str, NeededRun] = {}
     for member in drawn:
         run = runs.setdefault(member.linear, NeededRun(member.case, []))
-        site = leading_cell(member.case)
+        site = first_site_cell(member.case)
         measured_run = results.linear.get(member.linear)
         measured = measured_run is not None and site in measured_run.measures
         # Where fields are kept members are measured, not scaled, and nobody needs measures of the linear run.

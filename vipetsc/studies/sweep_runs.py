@@ -25,7 +25,7 @@ from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly, history_bytes
-from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, leading_cell, linear_name, measured
+from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, first_site_cell, linear_name, measured
 from vipetsc.studies.pool import reason_of
 from vipetsc.studies.recorded_runs import RecordedRuns
 
@@ -55,7 +55,7 @@ class SweepRuns:
         self._fields = FieldMemory()
 
     def make_linear(self, case: Case, sites: Collection[int]) -> None:
-        """Simulate the linear run of ``case``, and measure it for members with a leading site among ``sites`` (cells).
+        """Simulate the linear run of ``case``, and measure it for members with a first site among ``sites`` (cells).
 
         Raises StoppedError, or RuntimeError if the run fails; then it is not tried again, and every later call raises.
         """
@@ -118,7 +118,7 @@ class SweepRuns:
             raise RuntimeError("; ".join(map(str, member.problems)))
 
         case = member.case
-        site = leading_cell(case)
+        site = first_site_cell(case)
         name = linear_name(case)
         linear = self._linear_of(case, name, site)
         modules: list[str] = []
@@ -135,7 +135,7 @@ class SweepRuns:
         on_root(self.recorded.team, lambda: self._append(number, status, record))
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
-        """The linear run ``name`` of ``case``, with measures for the leading ``site`` (cell); simulated if missing.
+        """The linear run ``name`` of ``case``, with measures for the first ``site`` (cell); simulated if missing.
 
         Raises as ``make_linear``.
         """
@@ -168,7 +168,7 @@ class SweepRuns:
         """Simulate and measure a member of which all samples and cells are recorded; returns its record.
 
         If the sweep keeps fields, its run is written to ``folder``, cut down to what the case keeps. ``arrival`` is the
-        time in s at which the linear wave arrives at the leading site, ``name`` the name of the linear run. Raises
+        time in s at which the linear wave arrives at the first site, ``name`` the name of the linear run. Raises
         StoppedError, or RuntimeError if the run fails.
         """
         fields = self.plan.options.fields
@@ -228,7 +228,7 @@ class SweepRuns:
 def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
     """The record of a member without contact: its ``linear`` run ``name``, scaled to the amplitude of ``case``.
 
-    ``site`` is the member's leading site (cell), for which the linear run was measured.
+    ``site`` is the member's first site (cell), for which the linear run was measured.
     """
     return {
         "reason": "complete: scaled from the linear run",

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.io.read import field_interval, field_time, leading_site
+from vipetsc.io.read import field_interval, field_time, first_site
 from vipetsc.lattice import wave_bands
 
 
@@ -40,8 +40,8 @@ class VelocityRecord:
         self.time = field_time(run)
         self.interval = field_interval(run)
         self.cells = run["cell"].values
-        leading = leading_site(run)
-        self.site = None if leading is None else int(run["sites/cell"].values[leading])
+        first = first_site(run)
+        self.site = None if first is None else int(run["sites/cell"].values[first])
 
         # Rounded up: a map has at most so many pixels on either side.
         self.sizes = (-(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels))
