@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.conftest import StopAt
 from tests.independent_lattice import ScipyLattice, Stop
 from tests.models import TWO_MASS_CELL
 from tests.steady_states import motion_at, refined
@@ -14,6 +15,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.response import steps
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
+from vipetsc.parallel import StoppedError
 
 CLEARANCE = 1e-4
 RESTITUTION = 0.7
@@ -147,3 +149,18 @@ def test_growing_amplitudes_have_the_scale_of_the_frequency_that_they_begin_at(m
     first_state(states)
     assert frequencies
     assert frequencies == pytest.approx([omega] * len(frequencies), rel=1e-12)
+
+
+def test_a_request_to_stop_ends_the_way_to_the_first_state(monkeypatch, by_weights):
+    """Neither growing amplitudes nor growing weights go on after a request to stop."""
+    states = states_from(1000.0, 3.0)
+    with pytest.raises(StoppedError, match="before the first point"):
+        first_state(states, StopAt(0))
+    assert not by_weights
+
+    # After a single step of growing amplitudes, growing weights take over.
+    monkeypatch.setattr(steps, "MOST_RAMP", 1)
+    monkeypatch.setattr(steps, "LONGEST_RAMP", 0.0)
+    with pytest.raises(StoppedError, match="before the first point"):
+        first_state(states, StopAt(3))
+    assert len(by_weights) == 1

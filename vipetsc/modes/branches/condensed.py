@@ -35,6 +35,7 @@ from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import System, elastic_stops
+from vipetsc.parallel import StopRequest
 
 # A field is left out below this fraction of its largest value.
 NEGLIGIBLE = 1e-16
@@ -114,7 +115,7 @@ class CondensedMethod(NnmMethod):
         """The equations of the case."""
         return self.motions
 
-    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """The motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
         if self.system is not None and not self.options.start_frequency:
             system = self.system

@@ -17,6 +17,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, StartError
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System, elastic_stops
+from vipetsc.parallel import StopRequest
 
 
 class LatticeMethod(NnmMethod):
@@ -51,7 +52,7 @@ class LatticeMethod(NnmMethod):
         """The shooting equations of the lattice."""
         return self.lattice
 
-    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """The orbit of a linear mode at a small energy, or a breather of a start frequency."""
         if self.options.start_frequency:
             return self.lattice.breather(self.options.start_frequency[job], self.options.start_sites or [1])

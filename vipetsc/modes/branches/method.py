@@ -9,6 +9,7 @@ from mpi4py import MPI
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, S
+from vipetsc.parallel import StopRequest
 
 Monitor = Callable[[S], str | None]
 
@@ -66,8 +67,8 @@ class Method(ABC, Generic[S]):
         """The equations of a branch."""
 
     @abstractmethod
-    def start(self, problem: PeriodicProblem[S], job: int) -> S:
-        """The first point of a branch."""
+    def start(self, problem: PeriodicProblem[S], job: int, stop: StopRequest | None = None) -> S:
+        """The first point of a branch; StoppedError is raised where that takes long and a ``stop`` is requested."""
 
     @abstractmethod
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:

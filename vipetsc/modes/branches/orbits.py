@@ -29,6 +29,7 @@ from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
+from vipetsc.parallel import StopRequest
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
@@ -141,7 +142,7 @@ class ShootingMethod(NnmMethod):
         """The shooting equations of the case."""
         return self.shooting
 
-    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """The orbit of a linear mode at a small energy."""
         return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
 

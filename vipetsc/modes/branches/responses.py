@@ -27,6 +27,7 @@ from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
 from vipetsc.modes.response.swept import swept_states
+from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
 
 # Between the name of a curve and the number of an isolated one near it.
@@ -90,10 +91,10 @@ class ResponseMethod(Method[Response]):
             self._compliance = curve.member, compliance_of(curve.case)
         return SteadyStates(curve.case, curve.restitution, curve.fixed, compliance=self._compliance[1])
 
-    def start(self, problem: PeriodicProblem[Response], job: int) -> Response:
+    def start(self, problem: PeriodicProblem[Response], job: int, stop: StopRequest | None = None) -> Response:
         """The state at the beginning of the range."""
         assert isinstance(problem, SteadyStates | StatesOverKey)
-        return first_state(problem)
+        return first_state(problem, stop)
 
     def rule(self, problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
         """Steps to the end of the range; the start counts among ``nfrc.points``."""

@@ -16,6 +16,7 @@ from vipetsc.modes.problem import Attempt, ContinuationError
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.parallel import StoppedError, StopRequest
 
 # Largest angle in rad between tangents, and correction over the step, of a step that is accepted.
 TURN = 0.25
@@ -98,18 +99,21 @@ class TurningSteps:
         return f"no step from the last good point, {at}: {verdict.why}; {remedy}"
 
 
-def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> Response:
+def first_state(
+    states: SteadyStates | StatesOverKey, stop: StopRequest | None = None, is_ramp: bool = False
+) -> Response:
     """The state at the lower end of the range, with its tangent towards larger parameters.
 
     It is found by growing amplitudes from one at which no contact is touched. Where these do not lead there, and where
     stops touch at rest, it is found by growing weights of the contacts' forces. ``is_ramp`` says that it is the
     beginning of growing amplitudes itself, which the linear motion is near. Raises ContinuationError where neither
-    leads there.
+    leads there, and StoppedError where a ``stop`` is requested on the way.
     """
+    stop = stop or StopRequest()
     if isinstance(states, StatesOverKey):
         low, _ = states.options.range
         # With the key at its first value this is a state over the amplitude.
-        guess = states.from_state(low, first_state(states.states_at(low)).xi)
+        guess = states.from_state(low, first_state(states.states_at(low), stop).xi)
         return _begun(states, guess)
 
     low = states.options.range[0] / states.parameter.scale
@@ -118,9 +122,9 @@ def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> 
     guess = states.balance.pack(amplitude * linear) / states.clearance
     # A stop that touches at rest acts at every amplitude: no small one is linear.
     if any(0 in (stops.plus, stops.minus) for stops in states.forces.contacts):
-        guess = _by_weights(states, omega, amplitude)
+        guess = _by_weights(states, omega, amplitude, stop)
     elif _touches(states, amplitude * linear[:, 1]) and not is_ramp:
-        guess = _by_amplitudes(states, omega, amplitude)
+        guess = _by_amplitudes(states, omega, amplitude, stop)
 
     return _begun(states, np.append(guess, low))
 
@@ -146,7 +150,7 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
     return False
 
 
-def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+def _by_weights(states: SteadyStates, omega: float, amplitude: float, stop: StopRequest) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
 
     The forces of all contacts, less those of springs in their place, are multiplied by a weight s^4. Each contact has a
@@ -155,7 +159,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
     there is no other state, and the dashpots keep it from resonances. The power gives stiff contacts, which act at
     small weights already, a long part of the path.
 
-    ``omega`` is in rad/s. Raises ContinuationError where the curve does not reach s = 1.
+    ``omega`` is in rad/s. Raises ContinuationError where the curve does not reach s = 1, StoppedError as ``_followed``.
     """
     impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
     update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
@@ -177,14 +181,14 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
     # At s = 0 the dashpots change the linear motion, but the equations are linear: one Newton step corrects it.
     linear = amplitude * states.linear_motion(omega).harmonics
     start = _begun(weights, np.append(states.balance.pack(linear) / weights.clearance, 0.0))
-    points = list(Continuation(weights, start, TurningSteps(weights, MOST_WEIGHTS)))
+    points = _followed(Continuation(weights, start, TurningSteps(weights, MOST_WEIGHTS)), stop)
     if not points or points[-1].xi[-1] * weights.parameter.scale != 1.0:
         remedy = "begin nfrc.range or nfrc.fixed at another value"
         raise ContinuationError(f"no state with closed contacts is found at amplitude {amplitude:g}; {remedy}")
     return points[-1].xi[:-1] * (weights.clearance / states.clearance)
 
 
-def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float, stop: StopRequest) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` in rad/s, reached by amplitudes that grow from 1e-3 of ``amplitude``.
 
     With stiff contacts that have a loss, states over the amplitude may come to motions that close a contact ever more
@@ -198,9 +202,20 @@ def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.n
     ramp = SteadyStates(case, states.restitution, omega, like=states)
     most = max(MOST_RAMP, int(LONGEST_RAMP / states.options.largest_step))
     try:
-        points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, most)))
+        start = first_state(ramp, stop, is_ramp=True)
+        points = _followed(Continuation(ramp, start, TurningSteps(ramp, most)), stop)
     except ContinuationError:
         points = []
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
-        return _by_weights(states, omega, amplitude)
+        return _by_weights(states, omega, amplitude, stop)
     return points[-1].xi[:-1] * (ramp.clearance / states.clearance)
+
+
+def _followed(curve: Continuation[Response], stop: StopRequest) -> list[Response]:
+    """All points of a ``curve``; raises StoppedError at the next one where a ``stop`` is requested."""
+    points = []
+    for point in curve:
+        if stop.requested:
+            raise StoppedError("stopped on request before the first point; continue with --resume")
+        points.append(point)
+    return points
