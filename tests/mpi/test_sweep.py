@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import tomllib
+from errno import ENOSPC
 
 from mpi4py import MPI
 
@@ -14,8 +15,13 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
+from vipetsc.io.records import RecordFile
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
+from vipetsc.studies import linear_history
+from vipetsc.studies.ensemble import FAILED
+from vipetsc.studies.linear_history import LinearHistory
 from vipetsc.studies.pool import TaskPool
+from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = """
@@ -145,6 +151,52 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
     assert run_sweep(plan, folder / "out", comm).complete
     assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
     comm.Barrier()
+
+
+@pytest.mark.parallel([2])
+@pytest.mark.parametrize(
+    ("module", "name"), [(linear_history, "envelope_squares"), (LinearHistory, "with_velocity_alone")]
+)
+def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monkeypatch, module, name):
+    """Where memory is short on the first rank alone, all members have the reason, and no rank waits for another.
+
+    The first rank alone has the motion of the linear run, of which it takes the envelope, and keeps the velocity.
+    """
+    comm = MPI.COMM_WORLD
+
+    def fail(*arguments):
+        raise MemoryError("Unable to allocate 1.00 TiB")
+
+    with monkeypatch.context() as patch:
+        if comm.rank == 0:
+            patch.setattr(module, name, fail)
+        result = run_sweep(sweep("sweep.ranks=2"), folder / "out", comm)
+
+    assert result.count(FAILED) == 6
+    failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
+    assert {row["reason"] for row in failed} == {"MemoryError: Unable to allocate 1.00 TiB"}
+
+    comm.Barrier()
+    assert run_sweep(sweep("sweep.ranks=2"), folder / "out", comm).complete
+    comm.Barrier()
+
+
+@pytest.mark.parallel([2])
+@pytest.mark.parametrize("study", ["sweep", "runs"])
+def test_records_that_one_rank_cannot_close_end_all_ranks(folder, monkeypatch, study):
+    """A network file system may say only on closing that the disk is full; then every rank raises."""
+    comm = MPI.COMM_WORLD
+
+    def fail(self):
+        raise OSError(ENOSPC, "No space left on device")
+
+    if comm.rank == 1:
+        monkeypatch.setattr(RecordFile, "close", fail)
+    with pytest.raises(OSError, match="No space left"):
+        if study == "sweep":
+            run_sweep(sweep(), folder / "out", comm)
+        else:
+            RecordedRuns("some-runs", folder, comm, StopRequest()).make([1.0, 2.0], lambda key: {"value": key})
 
 
 @pytest.mark.parallel([2, 3])

@@ -64,12 +64,14 @@ class LinearHistory(NamedTuple):
         memory = RunMemory(comm, states_every=STATES_EVERY)
         result = completed(simulate(linear_case(case), memory, comm, stop=stop))
 
-        envelope = None
-        if memory.dataset is not None:
+        def take_envelope() -> np.ndarray:
+            assert memory.dataset is not None
             stops = [int(parts[0]["samples"]) for parts in memory.states]
-            envelope = np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset, stops), axis=0))
+            return np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset, stops), axis=0))
+
+        envelope = on_root(comm, take_envelope)
         run = xr.Dataset() if memory.dataset is None else memory.dataset
-        return cls(run, memory.states, comm.bcast(envelope), result.statistics, entropies={})
+        return cls(run, memory.states, envelope, result.statistics, entropies={})
 
     def with_velocity_alone(self) -> Self:
         """The history without displacements, which takes half of the memory."""

@@ -19,7 +19,7 @@ from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.result import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
@@ -129,7 +129,7 @@ class RecordedRuns:
                 failed.append(f"{key}: {reason}")
 
         self.pool.run(missing, make_one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
-        self.file.close()
+        on_every_rank(self.comm, self.file.close)
         for records in self.comm.allgather(recorded):
             self.records |= records
         if self.pool.stopped:

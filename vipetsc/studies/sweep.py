@@ -189,7 +189,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     order = on_root(comm, lambda: surveys[0].order(runs.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
     computed = pool.run(order, runs.make, bar, runs.fail)
-    runs.recorded.file.close()
+    on_every_rank(comm, runs.recorded.file.close)
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(pool.busy / seconds))

@@ -20,7 +20,7 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import Record
 from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_every_rank, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
@@ -85,12 +85,15 @@ class SweepRuns:
         return LinearHistory.of(case, self.recorded.team, self.recorded.stop)
 
     def _keep(self, name: str, history: LinearHistory, case: Case) -> None:
-        """Keep the ``history`` of the linear run ``name`` of ``case`` for the members that begin from it."""
+        """Keep the ``history`` of the linear run ``name`` of ``case`` for the members that begin from it.
+
+        All ranks of the team must call it: if one has too little memory, all raise MemoryError and keep nothing.
+        """
         if not begins_linearly(self.plan, case):
             return
         size = history_bytes(case)
         if not self.plan.options.fields:
-            history = history.with_velocity_alone()
+            history = on_every_rank(self.recorded.team, history.with_velocity_alone)
             size = history_bytes(case, fields=1)
         self._histories.keep(name, history, size)
 
