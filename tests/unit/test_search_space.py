@@ -211,6 +211,51 @@ def test_a_key_that_the_sites_do_not_take_is_no_variable(variables):
         plan_of(variables, contacts={"each": {"restitution": [0.5, 0.6, 0.7]}})
 
 
+@pytest.mark.parametrize(
+    ("variables", "key"),
+    [
+        ({"clearance": [1e-8, 1e-5]}, "clearance"),
+        ({"profile": [1e-8, 1e-5]}, "profile"),
+        ({"contacts": {"clearance": {"log": [1e-8, 1e-5]}}}, "contacts.clearance"),
+        ({"contacts": {"clearance": {"first": {"log": [1e-8, 1e-5]}}}}, "contacts.clearance.first"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("pressed", "path"),
+    [
+        ({"precompression": 1e-6}, "contacts.precompression"),
+        ({"each": {"precompression": [0.0, 1e-6, 1e-7]}}, "contacts.each.precompression"),
+        ({}, ""),
+    ],
+)
+def test_clearances_that_vary_at_pressed_sites_are_warned_of(variables, key, pressed, path):
+    """A clearance is taken from the precompression, of which one sentence with both keys tells."""
+    clearance = {"first": 1e-7, "last": 1e-7} if "first" in str(variables) else 1e-7
+    contacts = {"clearance": clearance, "side": "minus", "restitution": 1.0} | pressed
+    plan = plan_of(variables, contacts=contacts)
+
+    found = [sentence for sentence in plan.warnings() if "precompression" in sentence]
+
+    if not path:
+        assert not found
+        return
+    (sentence,) = found
+    assert sentence.startswith(f"optimise.variables.{key}: ")
+    assert f"({path}, up to 1e-06 m)" in sentence
+    # What the sentence says: the stop of a design is pressed by the difference of the two.
+    design = plan.design(plan.begin())
+    assert min(gap for stops in design.model().gaps for gap in stops) == pytest.approx(1e-7 - 1e-6)
+
+
+@pytest.mark.parametrize("key", ["stiffness", "precompression"])
+def test_other_keys_of_pressed_sites_vary_without_a_warning(key):
+    """Where no clearance varies at pressed sites, nothing is taken from the precompression that is not in the case."""
+    pressed = {"side": "minus", "restitution": 1.0, "precompression": 1e-6, "clearance": 0.0}
+    plan = plan_of({"contacts": {key: {"log": [1e-7, 1e-5]}}}, contacts=pressed)
+
+    assert not [sentence for sentence in plan.warnings() if "precompression" in sentence]
+
+
 def test_an_amplitude_that_varies_is_that_of_the_runs():
     """An amplitude that varies is that of the runs; objectives at given amplitudes are refused beside it."""
     variables = {"drive": {"amplitude": {"log": [1.0, 10.0]}}}

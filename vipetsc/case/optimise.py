@@ -18,7 +18,7 @@ from vipetsc.case.schema import Positive
 from vipetsc.case.search_space import SearchSpace, case_of, search_space
 from vipetsc.case.section import is_within
 from vipetsc.case.study import StudyCase, with_fastest_engine
-from vipetsc.case.variable_problems import variable_problems
+from vipetsc.case.variable_problems import variable_problems, variable_warnings
 from vipetsc.case.variables import Variable, VariablesTable
 
 # Designs of a search: with a run of 0.3 s for each, as of the built-in case, so many take eight hours.
@@ -110,8 +110,8 @@ class OptimiseCase(StudyCase):
         return {"table": table, "options": options, "base": base}, problems
 
     def warnings(self) -> list[str]:
-        """Warnings of settings in the initial case that are probably unintended."""
-        return self.base.warnings()
+        """Warnings of settings in the initial case, and of variables, that are probably unintended."""
+        return [*self.base.warnings(), *variable_warnings(self.options.variables, self.base)]
 
     def to_toml(self) -> str:
         """The case as TOML; reading it back gives the same search."""

@@ -1,4 +1,4 @@
-"""Problems with the variables of a search."""
+"""Problems with the variables of a search, and warnings about them."""
 
 import copy
 from collections.abc import Iterable, Iterator
@@ -8,12 +8,14 @@ import numpy as np
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, put
-from vipetsc.case.contacts import lists_of
+from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.search_space import VariableRow, case_of, row_of, search_space
 from vipetsc.case.section import is_within
 from vipetsc.case.variables import SECTIONS, VariablesTable
 
 AT = "optimise.variables"
+# Keys of the case that are clearances; each path stands for the keys within it, too.
+CLEARANCES = ("contacts.clearance", "contacts.clearance_minus", "contacts.each.clearance_minus")
 
 
 def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Iterator[Problem]:
@@ -51,6 +53,25 @@ def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Itera
         # One problem for each key, since later checks find the cause of the first one again.
         yield from problems[:1]
         paths += row.paths
+
+
+def variable_warnings(bounds: VariablesTable, base: Case) -> Iterator[str]:
+    """The warning of clearances that vary at sites of the case ``base`` with a precompression."""
+    varying = [name for name in ("clearance", "profile") if getattr(bounds, name)]
+    varying += [key for key in bounds.keys_of_case() if is_within(key, CLEARANCES)]
+    pressed = values_of_sites(base.contacts, "precompression", len(base.model().chain.sites))
+    deepest = max((depth or 0.0 for depth in pressed), default=0.0)
+    if not (varying and deepest):
+        return
+
+    path = "contacts.precompression"
+    if "precompression" in lists_of(base.contacts):
+        path = "contacts.each.precompression"
+    yield (
+        f"{AT}.{varying[0]}: a clearance reduces the precompression ({path}, up to {deepest:.3g} m), so that a contact"
+        " is pressed at rest by the difference of the two, and open from a clearance above the precompression on; to"
+        f" search for the indentation at rest let {path} vary instead"
+    )
 
 
 def _twice(key: str, given: Any, paths: Iterable[str]) -> Iterator[Problem]:
