@@ -8,6 +8,7 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 
 from vipetsc.figures import panels, style
+from vipetsc.figures.nfrc import lag_of
 from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
 TIME = np.linspace(0.0, 0.3, 4)
@@ -141,3 +142,47 @@ def test_means_over_blocks_keep_the_mean():
     assert pooled.shape == (434, 7)
     np.testing.assert_allclose(pooled[3], values[9:12].mean(axis=0))
     np.testing.assert_allclose(pooled[-1], values[-1])
+
+
+@pytest.mark.parametrize("begin", [panels.ROUNDING - 180, -panels.ROUNDING])
+def test_rounding_does_not_turn_phases(begin):
+    """Phase and antiphase are 0 and 180 degrees on whichever side of them rounding puts them, as sums of turns may."""
+    exact = np.array([0, 0, 180, 180, 0, 180, 180])
+    rounded = exact + 1e-10 * np.array([1, -1, 1, -1, -1, -1, 1]) + 360 * np.array([0, 1, 0, -1, 0, -1, 0])
+
+    assert panels.continuous_phase(rounded, begin) == pytest.approx(exact, abs=1e-9)
+    assert panels.continuous_phase(rounded[2:], begin) == pytest.approx(exact[2:], abs=1e-9)
+
+
+def test_antiphase_to_the_drive_is_a_lag_of_180_degrees():
+    """Without loss the first site is behind the drive by 0 or 180 degrees, whatever the sign of the rounding."""
+    harmonics = np.zeros((4, 1, 2))
+    harmonics[:, 0, 1] = [-1, -1, 1, -1]
+    imaginary = np.zeros((4, 1, 2))
+    imaginary[:, 0, 1] = [1e-13, -1e-13, 1e-13, 1e-13]
+    names = ("point", "site", "harmonic")
+
+    lag = lag_of(xr.Dataset({"harmonics": (names, harmonics), "harmonics_imaginary": (names, imaginary)}))
+
+    assert lag == pytest.approx(np.array([180, 180, 0, 180]), abs=1e-9)
+
+
+def test_a_phase_that_goes_on_turns_without_jumps():
+    """A phase that grows by more than a revolution has no jumps, in whichever revolution its values are given."""
+    exact = np.arange(-100.0, 800.0, 40.0)
+
+    assert panels.continuous_phase(np.mod(exact, 360), begin=-180) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("angles", "low", "high"), [((180.0, 180 + 1e-10), 179.5, 180.5), ((-1e-10, 1e-10), -0.5, 0.5), ((0, 3), 0, 3)]
+)
+def test_an_axis_of_a_constant_phase_does_not_show_its_rounding(axes, angles, low, high):
+    """The axis of a phase spans a degree or more, about its values."""
+    axes.margins(y=0)
+    axes.plot(angles)
+
+    panels.mark_degrees(axes)
+
+    assert axes.get_ylim() == pytest.approx((low, high), abs=1e-9)
+    assert not axes.yaxis.get_major_formatter().get_offset()

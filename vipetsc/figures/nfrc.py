@@ -129,14 +129,14 @@ def lag_of(branch: xr.Dataset) -> np.ndarray:
     """Return the phase (point,) in degrees by which the first site, or else spring, is behind the drive.
 
     It is that of the fundamental Z_1 in w(t) = Re sum Z_k exp(i k Omega t), under a drive cos(Omega t). Along the curve
-    it is continuous, and in the first state between -180 and 180 degrees.
+    it is continuous, and in the first state between -180 and 180 degrees; antiphase is 180.
     """
     name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
     # The mean is harmonic 0.
     fundamental = branch[name].values[:, 0, 1] + 1j * branch[f"{name}_imaginary"].values[:, 0, 1]
-    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
-    turns = np.floor((lag[0] + 180) / 360)
-    return np.asarray(lag - 360 * turns)
+    lag = -np.degrees(np.angle(fundamental))
+    # Above -180 by more than rounding: of the two angles of antiphase it is 180.
+    return panels.continuous_phase(lag, begin=panels.ROUNDING - 180)
 
 
 def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:

@@ -25,6 +25,8 @@ MOST_LINES = 30  # of sites in a map; more lines would hide it
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
+ROUNDING = 1e-6  # degrees by which equal phases may differ
+LEAST_SPAN = 1.0  # degrees of an axis of phases
 KAPPA = "Wavenumber κ (π rad/cell)"
 OMEGA = "Frequency ω (krad/s)"
 
@@ -221,11 +223,26 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
     panels[0].figure.colorbar(image, ax=panels, label=label, **options)
 
 
+def continuous_phase(angle: np.ndarray, begin: float) -> np.ndarray:
+    """Return angles (point,) in degrees without jumps by revolutions, the first between ``begin`` and ``begin`` + 360.
+
+    A jump by half a revolution, from phase to antiphase in a lattice without loss, is drawn as it is, since rounding
+    would decide on its direction.
+    """
+    turned = begin + np.mod(angle - begin, 360)
+    return np.unwrap(turned, discont=180 + ROUNDING, period=360)
+
+
 def mark_degrees(axes: Axes) -> None:
     """Put few ticks on a vertical axis in degrees: multiples of 1, 1.5, 3, 4.5 or 9 times a power of ten.
 
-    Over a revolution these are multiples of 45 or 90 degrees, over small ranges round numbers.
+    Over a revolution these are multiples of 45 or 90 degrees, over small ranges round numbers. The axis spans
+    ``LEAST_SPAN`` or more, so that the rounding of a constant phase is not seen; all curves must be there.
     """
+    low, high = axes.get_ylim()
+    if high - low < LEAST_SPAN:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - LEAST_SPAN / 2, middle + LEAST_SPAN / 2)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 

@@ -62,7 +62,7 @@ def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
     """Draw the phase in degrees by which each location's fundamental is behind the drive."""
     for number in range(curve.sizes["location"]):
         # Files have lags from 0 to 360 degrees, between which a curve would jump across the panel.
-        lag = np.degrees(np.unwrap(np.radians(curve["lag"].values[:, number])))
+        lag = panels.continuous_phase(curve["lag"].values[:, number], begin=-panels.ROUNDING)
         _draw_states(axes, curve, lag, number)
     axes.set_ylabel("phase lag (degrees)")
     panels.mark_degrees(axes)
