@@ -66,7 +66,7 @@ class HaloRegions:
             scatter = self._scatter.handle
             vector = self._vector.handle
         native.bind_symbols()
-        return Halo(columns, cells, scatter, vector, np.array([state.handle for state in states]))
+        return Halo(columns, cells, scatter, vector, np.array([state.handle for state in states], np.int64))
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
