@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -23,6 +21,7 @@ from vipetsc.contact.law import (
     impact_time,
 )
 from vipetsc.contact.tracker import TRACKED, ImpactTracker
+from vipetsc.dynamics.ts.right_hand_side import CONTEXT, find_change
 from vipetsc.lattice import Contact
 
 STIFFNESS = 3e5
@@ -43,8 +42,14 @@ def closed_sites(contact: Contact, count: int, approach: float, mass: float = 1.
     return contacts
 
 
-def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, seconds: float) -> Any:
-    return changes.first_change(contacts, start, end, seconds, np.empty((2, 6)))
+def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, seconds: float) -> changes.ModeChange:
+    """Return the first change of sites as an integrator finds it: by the address of a lattice, here of sites alone."""
+    context = np.zeros(1, CONTEXT)
+    context["address"]["contacts"] = contacts.ctypes.data
+    context["length"]["contacts"] = contacts.size
+    place = np.full(2, -7)
+    position = find_change(context.ctypes.data, start, end, seconds, place)
+    return changes.ModeChange(position, *place)
 
 
 @LAWS
@@ -386,7 +391,7 @@ def test_the_log_takes_any_number_of_episodes():
     tracker = ImpactTracker(create_contacts(Contact("hertz", STIFFNESS), [CLEARANCE] * 2, MASS), (7, 3))
     for k in range(9):
         tracker.start[:] = CLEARANCE, 0.1, 0.0
-        assert tracker.switch(k, np.zeros(2)) == 2
+        assert tracker.switch(float(k), np.zeros(2)) == 2
         tracker.start[:] = CLEARANCE, -0.1, 0.0
         assert tracker.switch(k + 0.5, np.zeros(2)) == 2
     log = tracker.take_episodes(np.zeros(2))

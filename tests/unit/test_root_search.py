@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
+from vipetsc.contact.search import bernstein, evaluate, first_upcrossing_after_start
 
 coefficient = st.floats(-1, 1, allow_subnormal=False)
 
@@ -17,6 +17,11 @@ def quintic(start, end, length):
     coefficients = np.empty(6)
     bernstein(np.array(start), np.array(end), length, coefficients)
     return coefficients
+
+
+def first_upcrossing(coefficients):
+    """Return the first upcrossing, the start included: no start is within a negative tolerance."""
+    return first_upcrossing_after_start(coefficients, -1.0)
 
 
 @given(
