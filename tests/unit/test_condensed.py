@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.lattice import Contact, DenseCompliance, Spring
+from vipetsc.lattice import Chain, Contact, DenseCompliance, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
@@ -253,6 +253,27 @@ def test_the_rate_is_exact_beside_a_mode_that_hardly_moves_the_pairs(detuning, p
     found = shifted.rate(omega, shift)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("compliance", [ModalCompliance, WaveCompliance])
+@pytest.mark.parametrize("detuning", [0.0, 1e-7, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("stiffness", [1e3, 3e3, 1e4, 1e5])
+def test_the_rate_from_values_around_the_frequency_is_that_of_all_modes(stiffness, detuning, compliance):
+    """Stiff springs in the cells: the pole of the shifted compliance is within 3e-4 of the frequency of the mode.
+
+    Without all modes its derivative is taken on a circle around the frequency, which must not contain the pole.
+    """
+    cell = UnitCell((1.0, 0.15), (Spring(0, 0, 1e3, next_cell=True), Spring(0, 1, stiffness)), host=0, resonator=1)
+    chain = Chain(cell, 3, sites=(1,))
+    rows = ModalCompliance(chain).loads.T
+    dense = DenseCompliance(chain.masses(), chain.stiffness_matrix().toarray(), rows)
+    omega = float(np.sqrt(dense.squared[0])) * (1 + detuning)
+    orders = np.array([1, 3])
+    exact = ShiftedCompliance(dense, 1, orders, 1.0)
+    shift = exact.shift(omega)
+    expected = exact.rate(omega, shift)
+    found = ShiftedCompliance(compliance(chain), 1, orders, 1.0).rate(omega, shift)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_a_branch_begins_at_a_mode_that_hardly_moves_its_pair():

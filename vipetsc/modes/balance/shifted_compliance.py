@@ -8,7 +8,8 @@ around the real one, by Cauchy's formula, with nodes w_n on a circle of the radi
     dG_s/domega = (1/N) sum_n G_s(w_n)/(w_n - omega).
 
 With N = 8 and r = 1e-4 omega rounding makes an error of 1e-12 G_s/omega, and the truncation one of the order
-(r/d)^8, with the distance d of the nearest pole of G_s.
+(r/d)^8, with the distance d of the nearest pole of G_s. The mean of G_s(w_n) is G_s(omega) with an error of that order:
+where it is not, as a pole is near, r is taken smaller.
 """
 
 from functools import partial
@@ -19,8 +20,12 @@ import numpy as np
 from vipetsc.lattice import DenseCompliance
 from vipetsc.modes.latest import LatestValues
 
-# Radius, over the frequency, of a circle on which Cauchy's formula gives the derivative of a real compliance.
-RADIUS = 1e-4
+# Radii, over the frequency, of circles on which Cauchy's formula gives the derivative of a real compliance. A smaller
+# one is taken where a pole is near a larger one.
+RADII = (1e-4, 1e-5, 1e-6, 1e-7)
+# Difference between G_s and its mean over a circle, over the largest of its values, that no near pole makes: it is the
+# error of the derivative by a pole ten radii away.
+MISFIT = 1e-8
 # The lower half of its eight nodes.
 NODES = np.exp(-1j * np.pi / 8 * np.array([1, 3, 5, 7]))
 # Relative step of a central difference, which is taken for a complex compliance: half a circle is not enough for it.
@@ -52,6 +57,13 @@ class Shifted(NamedTuple):
 
     compliance: np.ndarray
     factor: np.ndarray
+
+
+class Expansion(NamedTuple):
+    """The mean (orders, pairs, pairs) in m/N of G_s over a circle, and its derivative in the centre: ``slopes``."""
+
+    mean: np.ndarray
+    slopes: np.ndarray
 
 
 class ShiftedCompliance:
@@ -152,23 +164,48 @@ class ShiftedCompliance:
         if isinstance(self.compliance, DenseCompliance):
             return self._differentiate_modes(self.compliance, omega, shift)
 
-        # Frequencies of the orders, and the units of their distances to the nodes.
-        rates = self.orders * omega
-        sizes = np.maximum(rates, LEAST_RATE * rates[-1])
-        is_real = np.isrealobj(self.values(omega))
+        if np.isrealobj(self.values(omega)):
+            return self._differentiate_real(omega, shift)
 
-        # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
         circle = STEP * np.array([1.0, -1.0])
-        if is_real:
-            circle = RADIUS * NODES
-        near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
-        values = self._weighted(near.reshape(len(circle), len(rates), self.pairs, self.pairs), self.orders)
+        return self._expand(self.orders, omega, shift, circle).slopes
 
-        factor = np.linalg.inv(np.eye(self.pairs) + shift * values)
-        slopes = np.einsum("n,nkij->kij", 1 / circle, factor @ values) / (sizes * len(circle))[:, None, None]
-        if is_real:
-            return np.asarray(slopes.real)
+    def _differentiate_real(self, omega: float, shift: np.ndarray) -> np.ndarray:
+        """The derivative of a real G_s by Cauchy's formula, of each order on a circle without poles."""
+        # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
+        expansion = self._expand(self.orders, omega, shift, RADII[0] * NODES)
+        mean = expansion.mean.real
+        slopes = expansion.slopes.real
+
+        # The mean of G_s over a circle is G_s in its centre, unless a pole is near. Close to a pole of G that several
+        # pairs have, rounding hides the difference.
+        centre = self.at(omega, shift).compliance
+        is_certain = np.ones(len(self.orders), bool)
+        is_certain[self._near_poles(self.values(omega), shift)] = False
+        largest = np.abs(centre).max(axis=(1, 2))
+        for radius in RADII[1:]:
+            misfit = np.abs(mean - centre).max(axis=(1, 2))
+            disturbed = np.flatnonzero(is_certain & (misfit > MISFIT * largest))
+            if not disturbed.size:
+                break
+            expansion = self._expand(self.orders[disturbed], omega, shift[disturbed], radius * NODES)
+            mean[disturbed] = expansion.mean.real
+            slopes[disturbed] = expansion.slopes.real
         return np.asarray(slopes)
+
+    def _expand(self, orders: np.ndarray, omega: float, shift: np.ndarray, circle: np.ndarray) -> Expansion:
+        """The mean of G_s over a ``circle`` around the frequency of each of some ``orders``, and its derivative there.
+
+        ``circle`` (node,) are the distances of the nodes over the frequency.
+        """
+        rates = orders * omega
+        sizes = np.maximum(rates, LEAST_RATE * (self.orders[-1] * omega))
+        near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
+        values = self._weighted(near.reshape(len(circle), len(rates), self.pairs, self.pairs), orders)
+
+        shifted = np.linalg.inv(np.eye(self.pairs) + shift * values) @ values
+        slopes = np.einsum("n,nkij->kij", 1 / circle, shifted) / (sizes * len(circle))[:, None, None]
+        return Expansion(shifted.mean(axis=0), slopes)
 
     def _differentiate_modes(self, compliance: DenseCompliance, omega: float, shift: np.ndarray) -> np.ndarray:
         """The derivative of G_s by A G' A, with the derivative G' of the compliance from its modes."""
