@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ from vipetsc.figures.registry import draw
 from vipetsc.modes.balance.hill import Hill, Stability
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
 
@@ -125,6 +127,27 @@ def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("place", ["step", "special point"])
+def test_a_place_without_a_unique_tangent_is_passed(place, tmp_path, monkeypatch):
+    """A step that ends where the derivative is singular is taken again, shorter; a special point there is left out."""
+    tangent_at = SteadyFrame.tangent_at
+    asked = 0
+
+    def singular(self, xi):
+        nonlocal asked
+        caller = inspect.stack()[1].function
+        if caller == ("_corrected" if place == "step" else "at"):
+            asked += 1
+            if asked == 3:
+                raise np.linalg.LinAlgError("Singular matrix")
+        return tangent_at(self, xi)
+
+    monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
+    (curve,) = follow_all(case_of(FLIP), tmp_path, MPI.COMM_SELF)
+    assert asked > 3
+    assert curve.complete
+
+
 def test_special_points_are_in_files_and_pictures(tmp_path):
     case = case_of(FLIP, harmonics=15)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)

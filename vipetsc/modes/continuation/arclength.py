@@ -27,7 +27,7 @@ import numpy as np
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, strain
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, PeriodicProblem, S
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Frame, PeriodicProblem, S
 
 # The following numbers decide how many points lie on a branch, not its course: each point solves the equations and
 # keeps the guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21
@@ -243,10 +243,8 @@ class Continuation(Generic[S]):
         verdict = Verdict(False, self.step)
 
         while self.step >= self.rule.smallest_step:
-            predicted = frame.xi + self.step * frame.tangent
-            attempt = frame.correct(predicted, self.step)
-            if attempt.converged:
-                tangent = frame.tangent_at(attempt.xi)
+            attempt, tangent = _corrected(frame, self.step)
+            if tangent is not None:
                 point = replace(frame.measures(attempt, tangent), index=last.index + 1, step=self.step)
 
                 # The cosine is cut off at 1, above which rounding may bring it. It needs no bound below: the tangent is
@@ -265,6 +263,21 @@ class Continuation(Generic[S]):
             if verdict.accepted:
                 return replace(point, next_step=self.step)
         raise ContinuationError(self.rule.stuck(last, attempt, verdict))
+
+
+def _corrected(frame: Frame[S], step: float) -> tuple[Attempt, np.ndarray | None]:
+    """The attempt at a point a ``step`` along the tangent of ``frame``, and the unit tangent there if it converges.
+
+    Newton's method may converge to a point with no unique tangent, as where two branches meet, or where a jump led to
+    another branch. This counts as an attempt that has not converged: another step leads to another point.
+    """
+    attempt = frame.correct(frame.xi + step * frame.tangent, step)
+    if not attempt.converged:
+        return attempt, None
+    try:
+        return attempt, frame.tangent_at(attempt.xi)
+    except np.linalg.LinAlgError as error:
+        return replace(attempt, converged=False, reason=f"no unique tangent: {error}"), None
 
 
 def _rule(problem: Any, control: Any) -> Any:

@@ -93,7 +93,10 @@ class Segment(Generic[S]):
         if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
             raise ArithmeticError("Newton's method leaves the step")
 
-        direction = self.frame.tangent_at(attempt.xi)
+        try:
+            direction = self.frame.tangent_at(attempt.xi)
+        except np.linalg.LinAlgError as error:
+            raise ArithmeticError(f"no unique tangent: {error}") from None
         point = self.frame.measures(attempt, direction)
         self._tie(arclength, attempt.xi, direction)
         return replace(point, index=self.right.index, step=arclength)
