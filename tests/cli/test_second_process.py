@@ -71,18 +71,16 @@ class Recorded:
         return None
 
 
-class Immediate:
+class Immediate(Recorded):
     """A second process that has drawn all that it is asked for as soon as it is asked."""
 
-    is_asked = False
-
     def __init__(self) -> None:
-        self.turns = iter(())
+        super().__init__()
         self.files = []
 
     def ask(self, source, folders, divided=False, **options):
+        super().ask(source, folders, divided, **options)
         self.files += draw(source, folders, **options)
-        self.is_asked = True
 
     def drawn(self):
         return self.files

@@ -148,6 +148,17 @@ def test_a_place_without_a_unique_tangent_is_passed(place, tmp_path, monkeypatch
     assert curve.complete
 
 
+def test_a_curve_whose_start_has_no_unique_tangent_fails_with_the_reason(tmp_path, monkeypatch):
+    """Where the derivative at the first state is singular, the curve ends, and the command does not."""
+
+    def singular(self, xi):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
+    (curve,) = follow_all(case_of(FLIP), tmp_path, MPI.COMM_SELF)
+    assert curve.ending == "failed: Singular matrix"
+
+
 def test_special_points_are_in_files_and_pictures(tmp_path):
     case = case_of(FLIP, harmonics=15)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)

@@ -50,9 +50,7 @@ class DenseCompliance:
         It is Z (diag(Om_n^2 - omega^2) + k Z^T Z)^-1 Z^T, with the columns z_n in Z and the stiffness k.
         """
         # (1 + k G)^-1 G of the compliance G without springs is the same, but loses digits close to a pole of G.
-        dynamic = self.dynamic_stiffness(omegas, stiffness)
-        loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
-        return np.asarray(self.parts @ np.linalg.solve(dynamic, loads))
+        return np.asarray(self.parts @ self._motions(omegas, stiffness))
 
     def rate(self, omegas: np.ndarray) -> np.ndarray:
         """The derivative (omega, pair, pair) by the frequency of the compliance at ``omegas`` (omega,) in rad/s."""
@@ -61,10 +59,14 @@ class DenseCompliance:
 
     def rate_with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
         """The derivative (omega, pair, pair) by the frequency of the compliance ``with_springs``."""
+        motions = self._motions(omegas, stiffness)
+        return np.asarray(2 * omegas[:, None, None] * (motions.swapaxes(1, 2) @ motions))
+
+    def _motions(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
+        """Amplitudes of the modes (omega, mode, pair) under a unit load at each pair, ``with_springs``."""
         dynamic = self.dynamic_stiffness(omegas, stiffness)
         loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
-        motions = np.linalg.solve(dynamic, loads)
-        return np.asarray(2 * omegas[:, None, None] * (motions.swapaxes(1, 2) @ motions))
+        return np.asarray(np.linalg.solve(dynamic, loads))
 
     def dynamic_stiffness(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
         """diag(Om_n^2 - omega^2) + k Z^T Z (omega, mode, mode) in (rad/s)^2, of the modes' amplitudes.

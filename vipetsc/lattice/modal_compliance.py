@@ -165,7 +165,7 @@ class ModalCompliance:
         gap = 1j * omega[:, None] - self._poles.poles
         given = moved | self._oscillates
         with np.errstate(divide="ignore", invalid="ignore"):
-            # Of most lattices every pole is another one than 0.
+            # In most lattices no pole is 0.
             if given.all():
                 return np.divide(1, gap)
             return np.divide(1, gap, out=np.zeros_like(gap), where=given | (gap != 0))

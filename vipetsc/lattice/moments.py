@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.lattice.bands import pass_bands
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import WaveCompliance
 
@@ -29,22 +28,18 @@ class SeriesCompliance:
     def __init__(self, compliance: WaveCompliance) -> None:
         self.compliance = compliance
         self.chain = compliance.chain
-        self.top = pass_bands(self.chain.cell)[-1].high
-
-    @property
-    def highest(self) -> float:
-        """The highest frequency of a wave in rad/s."""
-        return self.top
+        # The highest frequency of a wave in rad/s.
+        self.highest = compliance.highest
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
         omega = np.atleast_1d(omegas)
-        high = np.abs(omega) > FAST_FROM * self.top
+        high = np.abs(omega) > FAST_FROM * self.highest
         pairs = len(self.chain.sites)
         compliance = np.zeros((len(omega), pairs, pairs), omega.dtype if np.iscomplexobj(omega) else float)
         if not high.all():
             compliance[~high] = self.compliance.at(omega[~high])
-        ratio = (self.top / omega[high]) ** 2
+        ratio = (self.highest / omega[high]) ** 2
         powers = ratio ** np.arange(1, TERMS + 1)[:, None]
         compliance[high] = -np.einsum("nij,nw->wij", self._moments, powers)
         return compliance
@@ -64,7 +59,7 @@ class SeriesCompliance:
                 rows[start + chain.cell.host, j] = -1.0
 
             # Scaled by the top of the bands, terms neither grow nor vanish.
-            scale = 1 / (piece.masses()[:, None] * self.top**2)
+            scale = 1 / (piece.masses()[:, None] * self.highest**2)
             stiffness = piece.stiffness_matrix()
             moved = rows * scale
             for n in range(TERMS):

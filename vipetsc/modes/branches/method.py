@@ -6,6 +6,8 @@ from typing import Any, ClassVar, Generic, NamedTuple
 
 from mpi4py import MPI
 
+import numpy as np
+
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, S
@@ -37,7 +39,8 @@ class Method(ABC, Generic[S]):
 
     kind: ClassVar[str]
     shared: ClassVar[bool] = False
-    failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError)
+    # Where the derivative is singular a motion has no unique tangent.
+    failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError, np.linalg.LinAlgError)
     keeps_empty: ClassVar[bool] = True
     finishes_interrupted: ClassVar[bool] = False
     locates_grazing: bool = False

@@ -31,8 +31,9 @@ from vipetsc.modes.response.state import Response
 # Relative step of the central difference in frequency. Rounding makes an error of 1e-16/SLOPE = 1e-10, which slows
 # Newton's method by as little; the solutions do not depend on it.
 SLOPE = 1e-6
-# What may end a curve of steady states, or keep Newton's method from one.
-FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError
+# What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
+# unique tangent.
+FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError, np.linalg.LinAlgError
 
 
 class LinearMotion(NamedTuple):
