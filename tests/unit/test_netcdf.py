@@ -121,6 +121,23 @@ def test_files_of_xarray_itself_are_read(tmp_path):
         assert {name: np.asarray(value).tolist() for name, value in data["field"].attrs.items()} == attributes
 
 
+def test_a_file_without_scales_is_read(tmp_path):
+    """Axes without a scale are dimensions of their own; an attribute may be empty, or of a type that is an array."""
+    values = np.arange(6, dtype="i4").reshape(3, 2)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        field = file.create_dataset("group/field", data=np.zeros((2, 3)))
+        field.attrs["empty"] = h5py.Empty("f8")
+        pair = h5py.h5t.array_create(h5py.h5t.NATIVE_INT32, (2,))
+        pairs = h5py.h5a.create(field.id, b"pairs", pair, h5py.h5s.create_simple((3,)))
+        pairs.write(values, pair)
+
+    with open_netcdf(tmp_path / "a.h5", "state") as data:
+        read = data["group/field"]
+        assert read.dims == ("group/field/axis_0", "group/field/axis_1")
+        assert read.attrs["empty"].tolist() == []
+        np.testing.assert_array_equal(read.attrs["pairs"], values)
+
+
 def test_files_of_another_kind_are_refused(tmp_path):
     """A missing file, one that is no HDF5 and one of another program are refused with what they lack."""
     with pytest.raises(OSError, match="missing"):

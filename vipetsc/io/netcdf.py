@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
+Node: TypeAlias = "h5py.h5g.GroupID | h5py.h5d.DatasetID"
 
 # Attributes by which HDF5 and netCDF-4 describe dimensions: they are no attributes of a variable.
 OF_DIMENSIONS = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
@@ -201,22 +202,29 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
     variables: Variables = {}
     attributes: dict[str, Any] = {}
     with files.acquire_context() as file:
-        for node in _nodes(file):
+        nodes = dict(_nodes("", h5py.h5g.open(file.id, b"/")))
+        # The address of an object is at hand, while HDF5 searches the whole file for the name of one.
+        paths = {h5py.h5o.get_info(node).addr: path for path, node in nodes.items()}
+
+        for path, node in nodes.items():
             stored = _stored_attributes(node)
             described = {key: _attribute(value) for key, value in stored.items() if key not in OF_DIMENSIONS}
-            if isinstance(node, h5py.Group):
-                attributes |= {_path(node.name, key): value for key, value in described.items()}
+            if isinstance(node, h5py.h5g.GroupID):
+                attributes |= {_path(path, key): value for key, value in described.items()}
                 continue
             if bytes(stored.get("NAME", b"")).startswith(NO_COORDINATE):
                 continue
 
-            dims = _dimensions(file, node, stored)
-            # Texts are read at once: they are few, and the type of numpy's array depends on the longest.
+            dims = _dimensions(file, path, node, stored, paths)
+            # Texts are read at once: they are few, and the type of numpy's array depends on the longest. So are
+            # coordinates, of which xarray makes indexes.
             if h5py.check_string_dtype(node.dtype):
-                data = node.asstr()[...].astype(str)
+                data = h5py.Dataset(node).asstr()[...].astype(str)
+            elif dims == [path]:
+                data = h5py.Dataset(node)[...]
             else:
-                data = indexing.LazilyIndexedArray(StoredArray(files, node))
-            variables[_path(node.name)] = xr.Variable(dims, data, described)
+                data = indexing.LazilyIndexedArray(StoredArray(files, path, node.shape, node.dtype))
+            variables[path] = xr.Variable(dims, data, described)
     return variables, attributes
 
 
@@ -225,53 +233,67 @@ def _path(*parts: str) -> str:
     return "/".join(parts).strip("/")
 
 
-def _nodes(group: h5py.Group) -> Iterator[h5py.Group | h5py.Dataset]:
-    """A ``group``, its datasets, and then each group in it with its own datasets and groups.
+def _nodes(path: str, group: h5py.h5g.GroupID) -> Iterator[tuple[str, Node]]:
+    """The ``group`` at a ``path``, its datasets, and then each group in it with its own contents, by their paths.
 
-    Soft links are left out: they lead to coordinates of other groups.
+    Soft links are left out: they lead to coordinates of other groups. Nodes are of h5py's low level: its groups and
+    datasets take twice the time.
     """
-    yield group
-    groups = []
-    # By the functions on which h5py's ``group[name]`` is built, which take half the time: this is half of the time that
-    # it takes to open a file.
-    for name in group.id:
-        if group.id.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+    yield path, group
+    groups = {}
+    for name in group:
+        if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
             continue
-        member = h5py.h5o.open(group.id, name)
+        member = h5py.h5o.open(group, name)
+        member_path = _path(path, name.decode("utf-8", "surrogateescape"))
         if isinstance(member, h5py.h5d.DatasetID):
-            yield h5py.Dataset(member)
+            yield member_path, member
         elif isinstance(member, h5py.h5g.GroupID):
-            groups.append(h5py.Group(member))
+            groups[member_path] = member
 
-    for inner in groups:
-        yield from _nodes(inner)
+    for inner_path, inner in groups.items():
+        yield from _nodes(inner_path, inner)
 
 
-def _stored_attributes(node: h5py.Group | h5py.Dataset) -> dict[str, Any]:
-    """The attributes of a group or a dataset as h5py reads them, without the list of the datasets that a scale has.
+def _stored_attributes(node: Node) -> dict[str, Any]:
+    """The attributes of a group or a dataset with texts as bytes, without the list of the datasets that a scale has."""
+    stored: dict[str, Any] = {}
+    for index in range(h5py.h5a.get_num_attrs(node)):
+        attribute = h5py.h5a.open(node, index=index)
+        name = attribute.name.decode("utf-8", "surrogateescape")
+        if name == "REFERENCE_LIST":
+            continue
 
-    All are read here, once: to ask h5py whether there is a certain one takes as long as to read it.
+        dtype = attribute.dtype
+        if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL:
+            stored[name] = h5py.Empty(dtype)
+            continue
+        values = np.empty(attribute.shape, dtype)
+        # The type is named because numpy counts a type that is itself an array among the axes.
+        attribute.read(values, h5py.h5t.py_create(dtype))
+        stored[name] = values[()]
+    return stored
+
+
+def _dimensions(
+    file: h5py.File, path: str, dataset: h5py.h5d.DatasetID, stored: Mapping[str, Any], paths: Mapping[int, str]
+) -> list[str]:
+    """The names of the dimensions of a ``dataset`` at a ``path``, with ``stored`` attributes.
+
+    The dimension of an axis is named by the path of the scale that is attached to it, which ``paths`` has by the
+    address; a scale has the dimension of its own path. An axis without a scale is a dimension that no other dataset
+    has.
     """
-    return {key: node.attrs[key] for key in node.attrs if key != "REFERENCE_LIST"}
+    if dataset.rank == 1 and stored.get("CLASS") == b"DIMENSION_SCALE":
+        return [path]
 
-
-def _dimensions(file: h5py.File, dataset: h5py.Dataset, stored: Mapping[str, Any]) -> list[str]:
-    """The names of the dimensions of a ``dataset`` with ``stored`` attributes.
-
-    The dimension of an axis is named by the path of the scale that is attached to it; a scale has the dimension of its
-    own path. An axis without a scale is a dimension that no other dataset has.
-    """
-    if dataset.ndim == 1 and stored.get("CLASS") == b"DIMENSION_SCALE":
-        return [_path(dataset.name)]
-
-    lists = stored.get("DIMENSION_LIST", [[]] * dataset.ndim)
     dims = []
-    for axis, scales in enumerate(lists):
+    for axis, scales in enumerate(stored.get("DIMENSION_LIST", [[]] * dataset.rank)):
         if len(scales):
-            name = h5py.h5r.get_name(scales[0], file.id).decode()
-            dims.append(_path(name))
+            scale = h5py.h5r.dereference(scales[0], file.id)
+            dims.append(paths[h5py.h5o.get_info(scale).addr])
         else:
-            dims.append(_path(dataset.name, f"axis_{axis}"))
+            dims.append(_path(path, f"axis_{axis}"))
     return dims
 
 

@@ -2,23 +2,22 @@
 
 from typing import Any
 
-import h5py
 import numpy as np
 from xarray.backends import BackendArray, CachingFileManager
 from xarray.core import indexing
 
 
 class StoredArray(BackendArray):
-    """A ``dataset`` of an HDF5 file, of which only what is indexed is read.
+    """The dataset ``name`` of an HDF5 file, of which only what is indexed is read.
 
     xarray keeps few files open, and closes those that were not used for long: ``files`` opens the file again.
     """
 
-    def __init__(self, files: CachingFileManager, dataset: h5py.Dataset) -> None:
-        self.shape = dataset.shape
-        self.dtype = dataset.dtype
+    def __init__(self, files: CachingFileManager, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self.shape = shape
+        self.dtype = dtype
         self._files = files
-        self._name = dataset.name
+        self._name = name
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         """The values at ``key``, an array or a number."""
