@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,13 @@ collect_seldom()
 
 ROOT = Path(__file__).parents[1]
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
+
+# Hypothesis tries the constants of the project's modules as examples. It would count all that Debian installs outside
+# of the virtual environment as the project's: to read it takes seconds, and most constants would be numpy's, scipy's.
+with suppress(ImportError):
+    from hypothesis.internal.scrutineer import SITE_PACKAGES_DIRS
+
+    SITE_PACKAGES_DIRS.add(Path(np.__file__).resolve().parents[1])
 
 # A first call may have to load kernels, or compile them.
 hypothesis.settings.register_profile("vipetsc", deadline=None)
