@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance import hill
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import ContourLine, Hill
 from vipetsc.modes.balance.stops import Stops
 
@@ -87,6 +87,26 @@ def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude:
     return half @ half
 
 
+def slow_motion(
+    frequencies: tuple[float, float], contact: float, amplitude: float, order: int
+) -> tuple[np.ndarray, Hill, ForceSeries]:
+    """Two masses of 1 kg with a stop of ``contact`` N/m on both sides of the first, at 1 rad/s.
+
+    Returns the growth rates (state,) over the frequency by the monodromy matrix, Hill's method for harmonics up to
+    ``order``, and the forces of the motion, ``amplitude`` cos t in clearances.
+    """
+    turned = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+    stiffness = turned @ np.diag(np.square(frequencies)) @ turned.T
+    row = np.array([1.0, 0.0])
+    multipliers = np.linalg.eigvals(monodromy(stiffness, row, contact, amplitude))
+
+    z = np.zeros((1, order + 1), complex)
+    z[0, 1] = amplitude
+    series = SiteForces([Stops.both(Contact("bilinear", contact), 1.0)]).series(z, 1.0)
+    found = Hill(DenseCompliance(np.ones(2), stiffness, row[None]), 1.0, order, odd=True, finite=True)
+    return np.log(np.abs(multipliers)) / (2 * np.pi), found, series
+
+
 @pytest.mark.parametrize(
     ("frequencies", "contact", "amplitude"),
     [
@@ -100,17 +120,26 @@ def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude:
 )
 def test_growth_of_a_slow_motion_is_that_of_the_monodromy_matrix(frequencies, contact, amplitude):
     """The growth is that of the monodromy matrix, as orders up to the highest frequency, also in contact, are kept."""
-    turned = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
-    stiffness = turned @ np.diag(np.square(frequencies)) @ turned.T
-    row = np.array([1.0, 0.0])
-    multipliers = np.linalg.eigvals(monodromy(stiffness, row, contact, amplitude))
-    growth = np.log(np.abs(multipliers)) / (2 * np.pi)
-
-    order = 171
-    z = np.zeros((1, order + 1), complex)
-    z[0, 1] = amplitude
-    series = SiteForces([Stops.both(Contact("bilinear", contact), 1.0)]).series(z, 1.0)
-    found = Hill(DenseCompliance(np.ones(2), stiffness, row[None]), 1.0, order, odd=True, finite=True)
+    growth, found, series = slow_motion(frequencies, contact, amplitude, order=171)
     assert growth.max() > 0.01
     assert found.fastest(series).real == pytest.approx(growth.max(), abs=2e-3)
     assert found.unstable(series) == np.count_nonzero(growth > found.least)
+
+
+@pytest.mark.parametrize(("order", "is_decided"), [(161, False), (171, True)])
+def test_a_motion_with_fewer_harmonics_than_perturbations_need_is_undecided(order, is_decided):
+    """Orders below the highest frequency in contact decide nothing, where the growth they show may be any."""
+    frequencies = (0.7, 142.0)
+    contact = 142.0**2 / 3
+    # The bound on the highest frequency in contact, by which the orders are judged: the stop acts on 1 kg.
+    assert 161 < np.hypot(142, np.sqrt(contact)) < 165
+    growth, found, series = slow_motion(frequencies, contact, amplitude=1.3, order=order)
+    assert np.count_nonzero(growth > found.least) == 1
+    if is_decided:
+        assert found.unstable(series) == 1
+        return
+    assert found.unstable(series) == -1
+    assert found.fastest(series) is None
+    assert found.pairs(series) == []
+    with pytest.raises(ArithmeticError, match="no complex pair"):
+        found.near(series, 0.1 + 0.2j)

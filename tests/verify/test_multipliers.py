@@ -205,3 +205,18 @@ def test_sensitivities_of_all_masses_and_hills_determinant_agree(monkeypatch, si
 
     assert (by_orbit > 1.5) == (len(sites) == 2)
     assert by_orbit == pytest.approx(by_hill, rel=1e-6)
+
+
+def test_a_slow_motion_with_few_harmonics_has_the_multiplier_of_its_orbit():
+    """Where harmonics end below the highest mode, which decides nothing by Hill's method, the orbit of all masses does.
+
+    A chain of 25 masses moves in its lowest mode with 15 harmonics, at a sixteenth of the highest frequency.
+    """
+    masses = 25
+    springs = [{"start": i, "end": i + 1, "stiffness": 1.0} for i in range(masses)]
+    system = {"masses": [1.0] * masses, "springs": springs, "smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}
+    options = {"system": "own", "method": "condensed", "start_energy": 1e-3, "own": system}
+    method = CondensedMethod(NnmCase.from_table({"nnm": options}), MPI.COMM_SELF)
+    point = method.start(method.motions, 0)
+    assert point.order * 2 * np.pi / point.period < method.motions.compliance.highest
+    assert method.assess(method.motions, point).multiplier == 1.0

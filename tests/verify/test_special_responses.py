@@ -163,14 +163,17 @@ def test_special_points_are_in_files_and_pictures(tmp_path):
     case = case_of(FLIP, harmonics=15)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     path = tmp_path / f"branch-{curve.name}.h5"
-    rows = list(csv.DictReader(path.with_suffix(".csv").open()))
-    special = [row for row in rows if row["kind"] != "regular"]
+    points = list(csv.DictReader(path.with_suffix(".csv").open()))
+    special = [row for row in points if row["kind"] != "regular"]
     assert [(row["kind"], row["sideband"]) for row in special] == [("period-doubling", "0.5")] * 2
     with vipetsc.open(path) as data:
         assert data["kind"].attrs["flag_meanings"].split()[3] == "period-doubling"
-    assert dict(curve_rows(case, curve))["period doubling"].startswith("1.08")
+    rows = dict(curve_rows(case, curve))
+    assert rows["period doubling"].startswith("1.08")
+    assert "undecided" not in rows
     (picture,) = draw("branches", [tmp_path], formats=("json",))
     assert "period doubling" in picture.read_text()
+    assert "undecided" not in picture.read_text()
 
     # A curve that is resumed has the same points.
     parts = tmp_path / "parts"
@@ -179,7 +182,7 @@ def test_special_points_are_in_files_and_pictures(tmp_path):
     follow_all(few, parts, MPI.COMM_SELF)
     follow_all(case, parts, MPI.COMM_SELF, resume=True)
     assert_same_bits(datasets(path), datasets(parts / path.name))
-    assert len(read_branch(path).points) == len(rows)
+    assert len(read_branch(path).points) == len(points)
 
 
 def test_undecided_states_have_no_special_points_between_them(tmp_path, monkeypatch):
@@ -191,6 +194,22 @@ def test_undecided_states_have_no_special_points_between_them(tmp_path, monkeypa
     undecided = states.stability(left.xi)._replace(unstable=-1)
     monkeypatch.setattr(states, "stability", lambda xi: undecided)
     assert list(StabilityChanges(states, left, right).kinds()) == []
+
+
+def test_undecided_states_are_named_in_tables_files_and_pictures(tmp_path):
+    """A motion of three harmonics has too few orders for perturbations in contact: no state counts as stable."""
+    case = case_of(FLIP, harmonics=3)
+    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    count = len(curve.points)
+    rows = dict(curve_rows(case, curve))
+    assert rows["stable"] == f"0 of {count} points"
+    assert rows["undecided"] == f"{count} points; more than nfrc.harmonics = 3 may decide them"
+
+    with vipetsc.open(tmp_path / f"branch-{curve.name}.h5") as data:
+        assert (data["unstable"].values == -1).all()
+        assert np.isnan(data["growth"].values).all()
+    (picture,) = draw("branches", [tmp_path], formats=("json",))
+    assert "unstable or undecided" in picture.read_text()
 
 
 class States:

@@ -184,7 +184,10 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         after = np.insert(~stable[:-1], 0, False)
         before = np.append(~stable[1:], False)
         dashed = np.where(~stable | before | after, size, np.nan)
-        axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label="unstable")
+        label = "unstable"
+        if np.any(branch["unstable"].values < 0):
+            label = "unstable or undecided"
+        axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label=label)
 
     draw_special(axes, branch, size, labelled=True)
     axes.set_ylabel(label)

@@ -20,7 +20,7 @@ LAYOUT = {
     ),
     "largest": Stored("site", "m", "largest relative displacement"),
     "share": Stored("way", "1", "outgoing or dissipated energy over the incident energy"),
-    "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: unknown"),
+    "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: undecided"),
     "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
     "sideband": Stored("", "1", "frequency of the fastest growing perturbation over that of the drive; 1/2 at most"),
     "closed": Stored("site", "1", "fraction of the time in contact"),

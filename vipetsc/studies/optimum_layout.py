@@ -39,7 +39,7 @@ LAYOUT = {
     "response/point": ("response/point", "1", "point of a line, one line after the other"),
     "response/of": ("response/point", "1", "line of a point, from 0"),
     "response/parameter": ("response/point", "1", "parameter that varies along the curves, in its unit"),
-    "response/unstable": ("response/point", "1", "number of growing perturbations; -1: unknown"),
+    "response/unstable": ("response/point", "1", "number of growing perturbations; -1: undecided"),
     "response/value": ("response/point objective", "1", "what the objective measures; NaN for an objective of runs"),
     "curve/value": ("compared amplitude objective", "1", "measure of the objective"),
 }

@@ -259,8 +259,12 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
         jumps += [f"{parameter[a]:.5g} {direction}" for a, b in itertools.pairwise(path) if abs(a - b) > 1]
     rows.append(("jumps", ", ".join(jumps) or "none"))
 
-    stable = measure(curve, "unstable") == 0
-    rows.append(("stable", f"{stable.sum()} of {len(stable)} points"))
+    unstable = measure(curve, "unstable")
+    rows.append(("stable", f"{np.sum(unstable == 0)} of {len(unstable)} points"))
+    undecided = int(np.sum(unstable < 0))
+    if undecided:
+        remedy = f"more than nfrc.harmonics = {options.harmonics} may decide them"
+        rows.append(("undecided", f"{counted(undecided, 'point')}; {remedy}"))
     if options.infinite:
         # The balance of energies is none of the equations that were solved, and so checks the whole computation.
         error = np.nanmax(np.abs(measure(curve, "share").sum(axis=1) - 1))

@@ -157,6 +157,7 @@ class ForceSeries:
     ``forces`` (pairs, 2K + 1) complex in N: those beyond K show the size of what a motion with K harmonics leaves out.
     ``potential`` (pairs,) is the mean potential energy in J, ``loss`` (pairs,) the dissipated energy in J per period,
     ``closed`` (pairs,) the fraction of the time in contact; ``episodes`` are in the order of pairs and onset phases.
+    ``slopes`` (pairs, 2K + 1) in N/m are the Fourier coefficients of df/dz: two orders up to K differ by up to 2K.
     """
 
     def __init__(self, pairs: int, order: int) -> None:
@@ -166,9 +167,8 @@ class ForceSeries:
         self.loss = np.zeros(pairs)
         self.closed = np.zeros(pairs)
         self.episodes: list[Episode] = []
-        # Fourier coefficients of df/dz and df/dz': two orders up to K differ by up to 2K.
-        self._slopes = np.zeros((pairs, 2 * order + 1), complex)
-        self._rates = np.zeros((pairs, 2 * order + 1), complex)
+        self.slopes = np.zeros((pairs, 2 * order + 1), complex)
+        self._rates = np.zeros((pairs, 2 * order + 1), complex)  # those of df/dz'
         self._onsets: list[_Onset] = []
 
     def add(self, pair: int, theta: np.ndarray, weights: np.ndarray, values: np.ndarray, rate: np.ndarray) -> None:
@@ -194,7 +194,7 @@ class ForceSeries:
         # The mean of f exp(-i k theta) is F_k/2, but F_0 for k = 0, since f is a real part.
         self.forces[pair] += 2 * means[0]
         self.forces[pair, 0] -= means[0, 0]
-        self._slopes[pair] += means[1]
+        self.slopes[pair] += means[1]
 
     def add_onset(self, onset: _Onset) -> None:
         """Add how the force of an arc depends on the approach velocity at its onset."""
@@ -203,7 +203,7 @@ class ForceSeries:
     @property
     def acting(self) -> np.ndarray:
         """Numbers of the pairs whose force a perturbation changes: those in contact at some phase, and springs."""
-        changes = np.any(self._slopes, axis=1) | np.any(self._rates, axis=1)
+        changes = np.any(self.slopes, axis=1) | np.any(self._rates, axis=1)
         return np.flatnonzero(changes)
 
     def add_load(self, pair: int, stops: Stops, z: np.ndarray) -> None:
@@ -216,7 +216,7 @@ class ForceSeries:
         self.potential[pair] -= stops.load * mean + stops.energy_at_rest
 
         self.forces[pair, : len(z)] -= stops.spring * z
-        self._slopes[pair, 0] -= stops.spring
+        self.slopes[pair, 0] -= stops.spring
         # The mean of z^2 of a one-sided series.
         squared = mean**2 + float(np.sum(np.abs(z[1:]) ** 2)) / 2
         self.potential[pair] -= stops.spring * squared / 2
@@ -252,7 +252,7 @@ class ForceSeries:
         if rows is None:
             rows = orders
         lag = rows[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
-        slopes = np.hstack([self._slopes[:, :0:-1].conj(), self._slopes])
+        slopes = np.hstack([self.slopes[:, :0:-1].conj(), self.slopes])
         matrices = np.repeat(slopes[None, :, lag], len(exponents), axis=0)
         if not self.dissipates:
             return matrices

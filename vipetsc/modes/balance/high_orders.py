@@ -16,7 +16,7 @@ eigenvalues of M^-1 (K + B S B^T), where B^T u are the elongations. By Weyl's in
     omega_h^2 = omega_max^2 + the largest eigenvalue of S^1/2 B^T M^-1 B S^1/2
 
 with the highest linear frequency omega_max. Orders up to ``ABOVE`` omega_h/Om are kept, ``KEPT`` at least. A motion
-whose own harmonics end below omega_h has too few orders for its perturbations, and nothing is eliminated.
+whose own harmonics end below omega_h has too few orders for its perturbations, and leaves their growth undecided.
 """
 
 from typing import NamedTuple
@@ -34,6 +34,8 @@ KEPT = 48
 ABOVE = 1.25
 # The number of orders is a multiple of this one, so that neighbouring states of a curve have compliances in common.
 KEPT_TOGETHER = 16
+# A frequency so many times above the linear ones shows the masses, with an error of 1e-4.
+FAR = 100.0
 
 
 class KeptOrders(NamedTuple):
@@ -47,19 +49,20 @@ class KeptOrders(NamedTuple):
 
 
 def kept_orders(
-    compliance: Compliance, omega: float, series: ForceSeries, orders: np.ndarray, acting: np.ndarray
+    compliance: Compliance, omega: float, series: ForceSeries, orders: np.ndarray, acting: np.ndarray, highest: float
 ) -> KeptOrders:
     """Eliminate the high ones of ``orders``, -K..K or every other one, in a motion at ``omega`` (rad/s).
 
-    The ``series`` has its forces; the matrices are those of the pairs with the numbers ``acting``.
+    The ``series`` has its forces, and ``highest`` is omega_h; the matrices are those of the pairs with the numbers
+    ``acting``.
     """
     if series.dissipates:
         return KeptOrders(orders, None)
 
     pairs = len(acting)
-    by_pair = series.jacobian(orders=orders)[acting]
-    jacobian = flat(by_pair)
-    high = np.abs(orders) > _highest_kept(compliance, omega, orders, by_pair, acting)
+    jacobian = flat(series.jacobian(orders=orders)[acting])
+    multiples = int(np.ceil(ABOVE * highest / omega / KEPT_TOGETHER))
+    high = np.abs(orders) > max(KEPT, multiples * KEPT_TOGETHER)
     if not high.any():
         return KeptOrders(orders, jacobian)
 
@@ -71,23 +74,14 @@ def kept_orders(
     return KeptOrders(orders[~high], reduced)
 
 
-def _highest_kept(
-    compliance: Compliance, omega: float, orders: np.ndarray, jacobian: np.ndarray, acting: np.ndarray
-) -> int:
-    """The highest of the ``orders`` that are kept; ``jacobian`` (acting, order, order) is J by pairs."""
-    last = int(orders[-1])
-    if last <= KEPT or last * omega <= compliance.highest:
-        return last
-
-    # The first column of J holds the Fourier coefficients of df/dz, from the mean on.
-    samples = 2 * len(orders)
-    slopes = np.fft.irfft(jacobian[:, :, 0], samples) * samples
+def highest_in_contact(compliance: Compliance, omega: float, series: ForceSeries, acting: np.ndarray) -> float:
+    """omega_h in rad/s of a motion at ``omega`` (rad/s) with the forces ``series`` on the pairs ``acting``."""
+    samples = 2 * series.slopes.shape[1]
+    slopes = np.fft.irfft(series.slopes[acting], samples) * samples
     root = np.sqrt(np.maximum(slopes.max(axis=1), 0.0))
 
-    # Above all linear frequencies inertia alone counts: G = -B^T M^-1 B/omega^2.
-    top = np.array([last * omega])
-    inverse_masses = -of_pairs(compliance.at(top), acting)[0].real * top**2
+    # Far above all linear frequencies inertia alone counts: G = -B^T M^-1 B/omega^2.
+    far = FAR * max(compliance.highest, series.order * omega)
+    inverse_masses = -of_pairs(compliance.at(np.array([far])), acting)[0].real * far**2
     by_forces = np.linalg.eigvalsh(root[:, None] * inverse_masses * root)[-1]
-    highest = np.sqrt(compliance.highest**2 + max(by_forces, 0.0))
-    multiples = int(np.ceil(ABOVE * highest / omega / KEPT_TOGETHER))
-    return max(KEPT, multiples * KEPT_TOGETHER)
+    return float(np.sqrt(compliance.highest**2 + max(by_forces, 0.0)))

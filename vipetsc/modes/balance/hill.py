@@ -41,7 +41,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from vipetsc.modes.balance.harmonics import ForceSeries
-from vipetsc.modes.balance.high_orders import KeptOrders, kept_orders
+from vipetsc.modes.balance.high_orders import KeptOrders, highest_in_contact, kept_orders
 from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one
 from vipetsc.modes.balance.shifted_compliance import Compliance
 
@@ -132,6 +132,12 @@ class Stability(NamedTuple):
     at_minus_one: float
 
 
+def _turns(values: np.ndarray) -> np.ndarray:
+    """The angles by which D turns between neighbouring ``values``; NaN where it is 0 or not finite."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.angle(values[1:] / values[:-1])
+
+
 def least_growth(finite: bool, decay: float = 0.0) -> float:
     """Re lambda/Om up to which a motion counts as stable, of a ``finite`` system whose modes decay at least so fast."""
     if not finite:
@@ -163,7 +169,7 @@ class Hill:
         self._reduced: tuple[ForceSeries, list[KeptOrders]] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
-        """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases."""
+        """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases. NaN with too few orders."""
         return self._evaluate(series, exponents).values
 
     def _evaluate(self, series: ForceSeries, exponents: np.ndarray, units: np.ndarray | float = 0.0) -> _Determinants:
@@ -175,8 +181,11 @@ class Hill:
         if not acting.size:
             return _Determinants(out, sizes)
         if self._reduced is None or self._reduced[0] is not series:
-            reduced = [kept_orders(self.compliance, self.omega, series, orders, acting) for orders in self._blocks]
-            self._reduced = series, reduced
+            self._reduced = series, self._reduce(series, acting)
+        # With too few orders for the perturbations D decides nothing.
+        if not self._reduced[1]:
+            return _Determinants(np.full(len(exponents), np.nan, complex), sizes)
+
         for block, (low, jacobian) in enumerate(self._reduced[1]):
             compliances = self._at(block, low, exponents.tolist())
 
@@ -195,6 +204,13 @@ class Hill:
                 for i, value in enumerate(phases * np.exp(np.minimum(logs - units[block], LARGEST_LOG)), begin):
                     out[i] *= value
         return _Determinants(out, sizes)
+
+    def _reduce(self, series: ForceSeries, acting: np.ndarray) -> list[KeptOrders]:
+        """The orders kept of each block and their J; none at all if perturbations may have higher orders."""
+        highest = highest_in_contact(self.compliance, self.omega, series, acting)
+        if highest > series.order * self.omega:
+            return []
+        return [kept_orders(self.compliance, self.omega, series, orders, acting, highest) for orders in self._blocks]
 
     def _acting(self, series: ForceSeries) -> np.ndarray:
         """Numbers of the pairs of which the determinant is taken.
@@ -234,7 +250,7 @@ class Hill:
         positions = np.linspace(0, 0.5, intervals + 1)
         values, sizes = self._evaluate(series, growth + 1j * positions)
         for _ in range(FINEST):
-            turns = np.abs(np.angle(values[1:] / values[:-1]))
+            turns = np.abs(_turns(values))
             # Several zeros beside one interval may turn D in it by a whole circle, which the angles do not show; but
             # then |D| changes much in that interval or in the next one.
             steep = np.abs(np.diff(sizes.sum(axis=0))) > STEEP
@@ -248,7 +264,7 @@ class Hill:
             sizes = np.insert(sizes, wide + 1, between.logs, axis=1)
             positions = np.insert(positions, wide + 1, middles)
 
-        turned = np.cumsum(np.angle(values[1:] / values[:-1]))
+        turned = np.cumsum(_turns(values))
         return ContourLine(
             positions=positions,
             logs=sizes.sum(axis=0) + 1j * np.insert(turned, 0, 0.0),

@@ -156,10 +156,14 @@ class CondensedMethod(NnmMethod):
         """The largest multiplier by Hill's method, or by the orbit's sensitivities; NaN where it is not found."""
         motions = self.motions
         omega = 2 * np.pi / point.period
-        if motions.forces.pairs <= MOST_OF_HILL or not isinstance(motions.compliance, DenseCompliance):
+        has_all_modes = isinstance(motions.compliance, DenseCompliance)
+        if motions.forces.pairs <= MOST_OF_HILL or not has_all_modes:
             hill = Hill(motions.compliance, omega, point.order, motions.forces.odd, finite=True)
             fastest = hill.fastest(motions.balance(point.order).series(point.x, omega))
-            return np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real))
+            if fastest is not None:
+                return float(np.exp(2 * np.pi * fastest.real))
+            if not has_all_modes:
+                return np.nan
 
         u = np.concatenate(list(state_of(motions, point, self.dofs).values()))
         try:
