@@ -51,10 +51,10 @@ def test_all_ranks_together_draw_what_one_draws(run, monkeypatch):
 
     def work(helpers):
         draw_unmeasured(PICTURES, run, helpers)
-        assert helpers.is_asked
+        assert helpers.requests
         measure_run(run)
         files = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, helper=helpers)
-        assert not helpers.is_asked
+        assert not helpers.requests
         return files
 
     files = with_helping_ranks(COMM, StopRequest(), work)
@@ -90,7 +90,7 @@ def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
 
     def work(helpers):
         helpers.ask("run", [run], names=["unit_cell", "ledger"])
-        return helpers.drawn()
+        return helpers.drawn().files
 
     with pytest.raises(ValueError, match=f"rank {COMM.size - 1} cannot draw"):
         with_helping_ranks(COMM, StopRequest(), work)
@@ -99,6 +99,19 @@ def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
     monkeypatch.undo()
     files = with_helping_ranks(COMM, StopRequest(), work)
     assert {path.stem for path in files} == {"unit_cell", "ledger"}
+
+
+@pytest.mark.parallel([2, 3])
+def test_an_answer_has_the_pictures_of_the_requests_since_the_last_answer(run):
+    """Rank 0, which waits twice, gets each picture once."""
+
+    def work(helpers):
+        helpers.ask("run", [run], names=["unit_cell"])
+        first = helpers.drawn()
+        helpers.ask("run", [run], names=["ledger"])
+        return [path.stem for files, _ in (first, helpers.drawn()) for path in files]
+
+    assert with_helping_ranks(COMM, StopRequest(), work) == ["unit_cell", "ledger"]
 
 
 @pytest.mark.parallel([2, 3])
@@ -113,8 +126,8 @@ def test_what_rank_0_raises_is_raised_on_all(run):
         with_helping_ranks(COMM, StopRequest(), work)
 
     def work_again(helpers):
-        helpers.ask("run", [run], divided=True, names=["unit_cell"])
-        return helpers.drawn()
+        helpers.ask("run", [run], names=["unit_cell"])
+        return helpers.drawn().files
 
     # Rank 0 draws none of these pictures.
     (path,) = with_helping_ranks(COMM, StopRequest(), work_again)

@@ -2,11 +2,10 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -14,7 +13,7 @@ from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
 from vipetsc.figures.loading import load_matplotlib
-from vipetsc.figures.second_process import SecondProcess
+from vipetsc.figures.second_process import Drawn, DrawRequest, SecondProcess
 from vipetsc.io.errors import is_disk_full
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import root_attributes
@@ -28,27 +27,24 @@ SWEEP_FIGURES = "sweep"  # the name in the registry of the pictures of sweeps
 
 
 class Helper(Protocol):
-    """A process, or ranks, that draw pictures while this process computes, or draws other pictures.
+    """A process, or ranks, that draw pictures while this process computes.
 
     There are `vipetsc.figures.second_process.SecondProcess` and `vipetsc.cli.helping_ranks.HelpingRanks`.
     """
 
     @property
-    def turns(self) -> Iterator[int]:
-        """Numbers of pictures to draw; the helper takes from the same numbers, so that each goes to one of both."""
+    def draws_alone(self) -> bool:
+        """Whether the helper draws on all cores once this process waits for it, which then need not draw."""
 
     @property
-    def is_asked(self) -> bool:
-        """Whether anything was asked for that `drawn` has not waited for."""
+    def requests(self) -> Sequence[DrawRequest]:
+        """What was asked for and `drawn` has not waited for: this process can draw pictures that are left of it."""
 
-    def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
-        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once.
+    def ask(self, source: str, folders: Sequence[Path], **options: Any) -> None:
+        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once."""
 
-        The helper draws all of it, or, if ``divided``, the pictures whose numbers it takes from ``turns``.
-        """
-
-    def drawn(self) -> list[Path] | None:
-        """Wait for all that was asked for; returns the files, or None if it failed and all is to be drawn here."""
+    def drawn(self) -> Drawn | None:
+        """Wait for all that was asked for; None if it failed and all is to be drawn here."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +74,17 @@ class Pictures:
 
 
 def second_process(
-    pictures: Pictures, comm: MPI.Comm, names: Sequence[str] | None = None
+    pictures: Pictures, comm: MPI.Comm, draws_alone: bool, names: Sequence[str] | None = None
 ) -> AbstractContextManager[SecondProcess | None]:
     """A second process for ``pictures``, or None where it is of no use; as a context.
 
     It is of use for pictures that take long, those of a run that are not restricted to ``names``, and where this
-    process is the only rank of ``comm`` and a core is idle.
+    process is the only rank of ``comm`` and a core is idle. If this process has no other work meanwhile it draws as
+    well, sooner than one that has yet to begin; else the second one ``draws_alone``, which has loaded its tools by the
+    time that the results are there.
     """
     if pictures.unmeasured and not names and comm.size == 1 and SecondProcess.is_useful():
-        return SecondProcess()
+        return SecondProcess(draws_alone)
     return nullcontext()
 
 
@@ -109,22 +107,24 @@ def draw_pictures(
     """Draw the ``pictures`` of ``folders`` on all ranks; results without measures, or newer than these, are measured.
 
     ``names`` are the figures to draw, all by default. Unless ``afresh``, pictures stay that are newer than the files
-    that they show. A ``helper``, which may have been asked to `draw_unmeasured`, draws a part of the figures. Returns
-    the files written on rank 0, and an empty list on the others. Raises FolderError for folders that hold nothing to
-    draw, and for a figure that does not exist. Collective.
+    that they show. A ``helper``, which may have been asked to `draw_unmeasured`, draws too, or alone. Returns the files
+    written on rank 0, and an empty list on the others. Raises FolderError for folders that hold nothing to draw, and
+    for a figure that does not exist. Collective.
     """
     on_root(comm, lambda: prepare(pictures, folders, names))
     # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
     newest = None
     if not afresh:
         newest = on_root(comm, lambda: newest_result(folders))
-    # The helper is asked before this process loads matplotlib, so that it draws meanwhile.
-    drawn_ahead: tuple[str, ...] = ()
+
     if helper:
-        # Pictures that were drawn before the measures lack warnings of these, and are drawn again if there are any.
-        if helper.is_asked and not measures_warn(folders[0]):
-            drawn_ahead = pictures.unmeasured
-        helper.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
+        ask_for_rest(pictures, folders, helper, formats=formats, newest=newest)
+        if helper.draws_alone:
+            # This process does not even load matplotlib, unless the helper has failed.
+            if drawn := helper.drawn():
+                report(pictures, comm, sentences_on(drawn.reasons))
+                return sorted(marked_as_new(drawn.files))
+            helper = None
 
     load_matplotlib()
     from vipetsc.figures.registry import draw
@@ -133,29 +133,52 @@ def draw_pictures(
     def draw_part() -> list[Path]:
         with reading(pictures, folders):
             if helper:
-                from_here = draw_here(turns=helper.turns, omit=drawn_ahead)
+                here = [draw(**request.options, turns=request.turns, files=files) for request in helper.requests]
                 others = helper.drawn()
-                if others is not None:
-                    # Some are older than the measures, which have no warning for them. A later call, which compares
-                    # times, must not draw them again.
-                    for path in others:
-                        path.touch()
-                    return [*{*from_here, *others}]
-            return draw_here(turns=count(comm.rank, comm.size))
+                if others:
+                    return [*chain.from_iterable(here), *marked_as_new(others.files)]
+            turns = count(comm.rank, comm.size)
+            return draw(pictures.source, folders, names, formats, newest=newest, files=files, turns=turns)
 
     # What is left out and what is drawn is read from the same results, which are opened once.
     with Files() as files:
-        draw_here = partial(draw, pictures.source, folders, names, formats, newest=newest, files=files)
-        sentences = on_root(comm, lambda: left_out(pictures, folders, files, names))
-        for sentence in sentences:
-            if pictures.source == SWEEP_FIGURES:
-                echo(comm, f"vipetsc: {sentence}", sys.stderr)
-            else:
-                # A lattice without sites has no impacts: no matter to warn of.
-                echo(comm, f"  {sentence}")
-        drawn = on_every_rank(comm, draw_part)
+        report(pictures, comm, on_root(comm, lambda: left_out(pictures, folders, files, names)))
+        drawn_here = on_every_rank(comm, draw_part)
     # ``gather`` returns None on all ranks but the first.
-    return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
+    return sorted(path for paths in comm.gather(drawn_here) or [] for path in paths)
+
+
+def ask_for_rest(pictures: Pictures, folders: Sequence[Path], helper: Helper, **options: Any) -> None:
+    """Ask the ``helper`` for those of the ``pictures`` that it was not asked to `draw_unmeasured`."""
+    # Pictures that were drawn before the measures lack their warnings. If there are any, all pictures are drawn when
+    # none of the earlier ones is being drawn any more.
+    if helper.requests and measures_warn(folders[0]):
+        helper.drawn()
+    drawn_ahead: tuple[str, ...] = ()
+    if helper.requests:
+        drawn_ahead = pictures.unmeasured
+    helper.ask(pictures.source, folders, omit=drawn_ahead, **options)
+
+
+def marked_as_new(pictures: Sequence[Path]) -> Sequence[Path]:
+    """Give the files of ``pictures`` the present time, and return them.
+
+    Some are older than the measures, which have no warning for them. A later call, which compares times, must not draw
+    them again.
+    """
+    for path in pictures:
+        path.touch()
+    return pictures
+
+
+def report(pictures: Pictures, comm: MPI.Comm, sentences: Sequence[str]) -> None:
+    """Print ``sentences`` about pictures that are left out, on rank 0."""
+    for sentence in sentences:
+        if pictures.source == SWEEP_FIGURES:
+            echo(comm, f"vipetsc: {sentence}", sys.stderr)
+        else:
+            # A lattice without sites has no impacts: no matter to warn of.
+            echo(comm, f"  {sentence}")
 
 
 def measures_warn(folder: Path) -> bool:
@@ -214,10 +237,7 @@ def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names:
     if asked:
         missing = "; ".join(f"--fig {name}: {reasons[name]}" for name in asked)
         raise FolderError(f"{folders[0]}: {missing}")
-    by_reason: dict[str, list[str]] = {}
-    for name, reason in reasons.items():
-        by_reason.setdefault(reason, []).append(name)
-    sentences = [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
+    sentences = sentences_on(reasons)
     if pictures.source != SWEEP_FIGURES:
         return sentences
 
@@ -229,6 +249,14 @@ def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names:
     elif branches and OVER_BRANCHES not in reasons and (unrelated := curves_left_out(folders)):
         sentences.append(f"{OVER_BRANCHES}: without {unrelated}")
     return sentences
+
+
+def sentences_on(reasons: Mapping[str, str]) -> list[str]:
+    """Sentences about figures that are left out, from the ``reasons`` by name."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
 
 
 def newest_result(folders: Sequence[Path]) -> float:

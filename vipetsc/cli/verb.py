@@ -175,7 +175,7 @@ class StudyVerb(Verb):
             stack.enter_context(locked(comm, folder))
             # Results of an earlier command have their pictures already: there is nothing to help with.
             if pictures and not work.helper and (options.force or not pictures.are_of([folder])):
-                work.helper = stack.enter_context(second_process(pictures, comm))
+                work.helper = stack.enter_context(second_process(pictures, comm, draws_alone=True))
 
             outcome = self.study(case, work)
             # After a request to stop nothing is drawn: what was computed is saved, and the next command draws it.

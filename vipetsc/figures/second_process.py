@@ -2,46 +2,86 @@
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from vipetsc.figures.common_turns import CommonTurns
+from vipetsc.figures.draw_requests import LONGEST
 from vipetsc.io.atomic import remove_abandoned
 
 # The program of the second process. It finds modules where this process does: a module that the case names may be in
 # the working folder.
-SERVE = "import sys; sys.path[:] = {path!r}; from vipetsc.figures.draw_requests import serve; serve({turns})"
+SERVE = (
+    "import sys; sys.path[:] = {path!r};"
+    " from vipetsc.figures.draw_requests import serve; serve({alive}, {turns}, {channels})"
+)
+MOST_CORES = 4  # to draw on: a run has seven pictures, and each core needs 60 MB for them
+
+
+class DrawRequest(NamedTuple):
+    """A call of ``vipetsc.figures.registry.draw`` with ``options``; processes share its pictures by their ``turns``."""
+
+    options: Mapping[str, Any]
+    turns: Iterator[int]
+
+
+class Drawn(NamedTuple):
+    """The ``files`` of pictures, and the ``reasons`` why figures were left out, by name, if the helper knows them."""
+
+    files: list[Path]
+    reasons: Mapping[str, str]
 
 
 class SecondProcess:
     """A process that draws what it is asked for, as ``vipetsc.figures.registry.draw``, one request after the other.
 
-    It loads the tools for pictures while this process computes. It holds no lock and no open file of this process, and
-    ends with it, however that ends. It gives no message if anything fails: `drawn` then returns None, and the caller,
-    who draws by itself, meets the error. ``turns`` are the numbers of the pictures of a request that both processes
-    share.
+    It loads the tools for pictures while this process computes, and then draws on every idle core, by copies of itself.
+    It holds no lock and no open file of this process, and all copies end with it, however that ends. They give no
+    message if anything fails: `drawn` then returns None, and the caller, who draws by itself, meets the error.
+
+    ``requests`` are those for which `drawn` has not waited: the caller may draw some of their pictures, by their turns.
+    If the process ``draws_alone``, the caller only waits in `drawn`, and a further copy draws on its core meanwhile.
+    Results in the folders must not change after the first request, but for files that are added.
     """
 
-    def __init__(self) -> None:
-        self._file = os.memfd_create("turns")
-        self.turns = CommonTurns(self._file)
-        self._channel, its_end = socket.socketpair()
+    def __init__(self, draws_alone: bool) -> None:
+        self.draws_alone = draws_alone
+        self.requests: list[DrawRequest] = []
+        self._messages: list[bytes] = []
+        self._numbers = count()
         self._folders: set[Path] = set()
-        self._asked = 0
-        with its_end:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", SERVE.format(path=sys.path, turns=self._file)],
-                stdin=its_end.fileno(),
-                pass_fds=(self._file,),
-                # Signals of the terminal are for the process that asks.
-                process_group=0,
-            )
+
+        # Messages arrive whole, as they were sent.
+        cores = _cores()
+        copies = cores if draws_alone else cores - 1
+        pairs = [socket.socketpair(type=socket.SOCK_SEQPACKET) for _ in range(copies)]
+        self._channels = [ours for ours, _ in pairs]
+        # Until it waits, this process computes on one of the cores.
+        self._beside = self._channels[: cores - 1]
+        self._instead = self._channels[cores - 1 :]
+
+        self._file = os.memfd_create("turns")
+        alive, self._alive = os.pipe()
+        theirs = [channel.fileno() for _, channel in pairs]
+        program = SERVE.format(path=sys.path, alive=alive, turns=self._file, channels=theirs)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdin=subprocess.DEVNULL,
+            pass_fds=(alive, self._file, *theirs),
+            # Signals of the terminal are for the process that asks; a signal to the group ends all copies.
+            process_group=0,
+        )
+        os.close(alive)
+        for _, channel in pairs:
+            channel.close()
 
     @staticmethod
     def is_useful() -> bool:
@@ -53,44 +93,34 @@ class SecondProcess:
         # macOS has neither affinities nor files in memory (``os.memfd_create``).
         if not sys.platform.startswith("linux"):
             return False
-        has_idle_core = len(os.sched_getaffinity(0)) > 1 and os.getloadavg()[0] < (os.cpu_count() or 1)
+        has_idle_core = _cores() > 1 and os.getloadavg()[0] < (os.cpu_count() or 1)
         return has_idle_core and "matplotlib" not in sys.modules
 
-    @property
-    def is_asked(self) -> bool:
-        """Whether the process was asked for anything for which `drawn` has not waited."""
-        return self._asked > 0
-
-    def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
-        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; return at once.
-
-        If the pictures are ``divided``, the process draws those whose ``turns`` this process does not take.
-        """
+    def ask(self, source: str, folders: Sequence[Path], names: Sequence[str] | None = None, **options: Any) -> None:
+        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; return at once."""
+        number = next(self._numbers)
+        turns = CommonTurns(self._file, number)
+        self.requests.append(DrawRequest({"source": source, "folders": folders, "names": names} | options, turns))
         self._folders |= {*folders}
-        self._asked += 1
-        options |= {"source": source, "folders": [str(folder) for folder in folders]}
-        text = json.dumps({"divided": divided, "options": options})
-        # If the process has ended, `drawn` will find no answer.
-        with suppress(OSError):
-            self._channel.sendall(f"{text}\n".encode())
 
-    def drawn(self) -> list[Path] | None:
-        """Wait for all that was asked for, and return the files; None if anything failed."""
-        with self._channel.makefile(encoding="utf-8") as answers:
-            try:
-                lines = [answers.readline() for _ in range(self._asked)]
-            except OSError:
-                return None
-        self._asked = 0
+        paths = [str(folder) for folder in folders]
+        request = {"source": source, "folders": paths, "names": names, "options": options, "number": number}
+        self._messages.append(json.dumps(request).encode())
+        for channel in self._beside:
+            _send(channel, self._messages[-1:])
 
-        files: list[Path] = []
-        for line in lines:
-            # An empty line means that the process has ended, null that a picture has failed.
-            names = json.loads(line or "null")
-            if names is None:
-                return None
-            files += map(Path, names)
-        return files
+    def drawn(self) -> Drawn | None:
+        """Wait for all that was asked for, and return it; None if anything failed."""
+        for channel in self._instead:
+            _send(channel, self._messages)
+        answers = [_received(channel) for channel in self._channels for _ in self._messages]
+        self.requests.clear()
+        self._messages.clear()
+
+        if None in answers:
+            return None
+        # The last request was for all figures, also where some had been drawn before.
+        return Drawn([Path(name) for answer in answers for name in answer["files"]], answers[-1]["reasons"])
 
     def __enter__(self) -> Self:
         return self
@@ -98,11 +128,38 @@ class SecondProcess:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process, at once even if it draws."""
-        self._channel.close()
-        os.close(self._file)
-        self._process.kill()
+        """End the process and its copies, at once even if they draw."""
+        # There is no process to be found if the system has killed them all.
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        # It may have been writing a picture.
+        os.close(self._alive)
+        os.close(self._file)
+        for channel in self._channels:
+            # Copies are no children of this process, which would be waited for: one has ended when its socket has.
+            with channel, suppress(ConnectionError):
+                while channel.recv(LONGEST):
+                    pass
+
+        # Some may have been writing a picture.
         for folder in self._folders:
             remove_abandoned(folder / "figures")
+
+
+def _cores() -> int:
+    """The number of cores that this process and the copies may use."""
+    return min(len(os.sched_getaffinity(0)), MOST_CORES)
+
+
+def _send(channel: socket.socket, messages: Sequence[bytes]) -> None:
+    """Send ``messages`` through a ``channel``; if its process has ended, there will be no answer."""
+    with suppress(ConnectionError):
+        for message in messages:
+            channel.send(message)
+
+
+def _received(channel: socket.socket) -> Any:
+    """The next answer from a ``channel``; None if the request has failed, or the process has ended."""
+    with suppress(ConnectionError):
+        return json.loads(channel.recv(LONGEST) or "null")
+    return None

@@ -82,7 +82,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
         raise FolderError(f"{misplaced[0]}: applies only to movies; add --movie")
-    with second_process(pictures, comm, options.fig) as helper:
+    with second_process(pictures, comm, draws_alone=False, names=options.fig) as helper:
         drawn = draw_pictures(
             pictures, folders, comm, options.fig, formats=tuple(options.format or ("png",)), helper=helper
         )
