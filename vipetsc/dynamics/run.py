@@ -28,6 +28,7 @@ from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.result import Result
 from vipetsc.dynamics.samples import Block, Samples
+from vipetsc.dynamics.subnormals import subnormals_as_zero
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
@@ -260,7 +261,8 @@ class Run:
         total = setup.model.samples
         while self.samples < total:
             samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
-            filled = engine.fill(samples)
+            with subnormals_as_zero():
+                filled = engine.fill(samples)
             block, failure = self._observe(samples, filled)
             if len(block):
                 self.samples = block.first + len(block)
