@@ -1,5 +1,6 @@
 """The process itself: its rank and requests to stop before MPI is started, its log, the time that it compiles."""
 
+import atexit
 import gc
 import logging
 import os
@@ -75,9 +76,12 @@ def quick_start() -> Iterator[None]:
 def collect_seldom() -> None:
     """Look for cyclic garbage less often than Python does by itself.
 
-    Most objects are those of libraries, which stay; arrays and records are freed without a search.
+    Most objects are those of libraries, which stay; arrays and records are freed without a search. When the process
+    ends it looks for none: all memory is free then, and a search would take a twentieth of a run's time.
     """
     gc.set_threshold(ALLOCATIONS)
+    # Python's searches at the end leave out what is frozen.
+    atexit.register(gc.freeze)
 
 
 def end_on_request() -> None:

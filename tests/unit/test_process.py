@@ -1,4 +1,4 @@
-"""A process before MPI: the environment in which it starts MPI, and requests to stop until then."""
+"""A process before MPI and at its end: the environment in which it starts MPI, requests to stop, garbage."""
 
 from __future__ import annotations
 
@@ -98,3 +98,24 @@ def test_a_signal_that_nohup_has_set_aside_stays_so():
     program = ignoring + REQUESTED.format(name="SIGHUP")
     ended = subprocess.run([sys.executable, "-c", program], check=False)
     assert ended.returncode == 0
+
+
+# Objects in a circle are freed by a search for garbage only.
+CIRCLE = """
+from vipetsc.process import collect_seldom
+class InCircle:
+    def __del__(self):
+        print("freed")
+{seldom}
+circle = InCircle()
+circle.itself = circle
+del circle
+"""
+
+
+@pytest.mark.parametrize(("seldom", "printed"), [("collect_seldom()", ""), ("", "freed\n")])
+def test_a_process_that_collects_seldom_ends_without_a_search(seldom, printed):
+    """At its end the process does not look for garbage, as Python does by itself."""
+    program = CIRCLE.format(seldom=seldom)
+    ended = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True)
+    assert ended.stdout == printed
