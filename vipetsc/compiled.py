@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
+from llvmlite.binding import parse_assembly
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.runtime import rtsys
 
 from vipetsc.kernel import EntryCompiler, Kernel
@@ -92,8 +93,30 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
     return decorate
 
 
+class _MachineCode(CompileResultCacheImpl):
+    """What is stored of a function that Python calls: its machine code, without what numba stores for its callers."""
+
+    def reduce(self, cres: Any) -> Any:
+        """Numba's tuple for a function, without the code of LLVM, and with the environments that are used.
+
+        Numba would read the code of LLVM at each start for other kernels to link it; kernels link each other as
+        ``Kernel`` says. It has an environment of every function that was linked into this one, and would import their
+        modules; few functions ever look at theirs.
+        """
+        (name, kind, (machine_code, _)), description, *parts, environments = super().reduce(cres)
+        # Numba asks the code of LLVM which functions there are: Python calls this one.
+        entry = parse_assembly(f'define void @"{description.llvm_cpython_wrapper_name}"() {{ ret void }}')
+
+        # Each environment is named where it is declared, and where it is read.
+        code = cres.library.get_llvm_str()
+        used = tuple(environment for environment in environments if code.count(environment.env_name) > 1)
+        return (name, kind, (machine_code, entry.as_bitcode())), description, *parts, used
+
+
 class _KeptCode(FunctionCache):
     """Machine code of a function that is compiled at its first call."""
+
+    _impl_class = _MachineCode
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The code for a signature, or None; numba would first prepare to compile, which takes longer than to load."""

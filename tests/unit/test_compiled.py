@@ -13,6 +13,7 @@ import tomllib
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 import vipetsc
@@ -151,6 +152,52 @@ def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_pa
     # An equal package elsewhere, whose files have other times, finds the same kernels.
     shutil.copytree(folder, tmp_path / "elsewhere" / "vipetsc", copy_function=shutil.copyfile)
     assert ask(tmp_path / "elsewhere") == [[31.0, 12.0], [1, 1, 1], True]
+
+
+MAKING = """
+import sys
+import numpy as np
+from vipetsc.compiled import njit
+@njit
+def total(n):
+    return np.arange(n).sum()
+print(total(4), "numba.np.arrayobj" in sys.modules)
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_is_loaded_without_the_modules_that_compile_it(package, tmp_path):
+    """Numba's module for arrays is loaded where a kernel that makes one is compiled, but not where it is found."""
+    (package / "making.py").write_text(MAKING)
+
+    def ran() -> str:
+        code = [sys.executable, "-c", "import vipetsc.making"]
+        done = subprocess.run(code, cwd=tmp_path, env=environment_of(tmp_path), capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert [ran(), ran()] == ["6 True", "6 False"]
+
+
+def test_environments_that_code_reads_are_stored():
+    """Of the functions that are linked into a kernel, one that handles Python objects keeps its environment."""
+
+    @numba.njit
+    def show(values):
+        print(values)
+
+    @numba.njit
+    def total(n):
+        values = np.arange(n)
+        show(values)
+        return values.sum()
+
+    assert total(4) == 6
+    (code,) = total.overloads.values()
+    stored = compiled._MachineCode(total.py_func).reduce(code)
+    names = {environment.env_name for environment in stored[-1]}
+    (shown,) = show.overloads.values()
+    assert names == {code.environment.env_name, shown.environment.env_name}
 
 
 def test_a_kernel_is_translated_only_where_python_calls_it():
