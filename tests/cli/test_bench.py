@@ -88,11 +88,13 @@ def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch
     assert row["wall_ms"] > 0
     assert 0 < row["fraction_of_bandwidth_limit"] < 1
     assert 0.01 < row["peak_gib_a_rank"] < 4
+    # A step sends one message for each of its 13 stages and one for its end, and has two reductions: PETSc's of the
+    # error, and the package's of the earliest change of contact.
+    steps = row["messages"] / 14
+    assert steps in (1, 2, 3)
+    assert row["reductions"] == 2 * steps
     # A message holds the ghosts of one cell: 4 displacements and 4 velocities of 8 bytes, or half of them.
-    assert row["messages"] >= 13
     assert row["message_bytes"] / row["messages"] in (32, 64)
-    # A step of 13 stages has at least one reduction, of PETSc or of the package.
-    assert row["reductions"] > row["messages"] / 14
     # These times come from events of PETSc's log.
     assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0
 

@@ -34,13 +34,15 @@ def put_foreign(path: Path, contents: str) -> None:
 @pytest.mark.parametrize("contents", CONTENTS)
 @pytest.mark.parametrize("name", ["run", "optimum", "branch-r1", "law", "prediction", "design", "ensemble", "analysis"])
 def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, contents):
-    """``plot`` refuses an HDF5 file of another program under a name of results; ``export`` refuses or leaves it."""
+    """``plot`` and ``export`` refuse an HDF5 file of another program under a name of results, and write nothing."""
     put_foreign(tmp_path / "out" / f"{name}.h5", contents)
     ended = in_process("plot", tmp_path / "out")
     assert ended.returncode == 2
     assert "of vipetsc" in ended.stderr or "cannot be opened" in ended.stderr or "contains no run.h5" in ended.stderr
     exported = in_process("export", tmp_path / "out")
-    assert exported.returncode in (0, 2)
+    assert exported.returncode == 2
+    assert "of vipetsc" in exported.stderr or "cannot be opened" in exported.stderr
+    assert not (tmp_path / "out" / "curves").exists()
 
 
 @pytest.mark.slow

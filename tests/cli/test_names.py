@@ -128,14 +128,14 @@ def test_a_case_file_may_have_a_name_that_is_no_text(in_process, tmp_path):
 
 
 def test_samples_may_lie_in_a_folder_whose_name_is_no_text(in_process, tmp_path):
-    """A case with samples in a folder whose name is not valid text ends without a traceback, valid or not."""
+    """Samples in a folder whose name is not valid text are not found, as the case has their path as text."""
     folder = tmp_path / NO_TEXT
     folder.mkdir()
     (folder / "samples.csv").write_text("0.0 0.0\n0.01 1.0\n0.02 0.0\n")
     (folder / "case.toml").write_text(f'{TINY}\n[drive.samples]\nfile = "samples.csv"\n'.replace("cycles = 3", ""))
     ended = in_process("validate", "case.toml", "--set", "drive.waveform=samples", cwd=folder)
-    assert "surrogates" not in ended.stderr
-    assert ended.returncode in (0, 2)
+    assert ended.returncode == 2
+    assert "no\ufffdtext/samples.csv': no such file" in ended.stderr
 
 
 def test_a_marker_that_is_no_text_is_another_case(in_process, tmp_path):

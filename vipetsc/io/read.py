@@ -72,7 +72,7 @@ def open_results(path: str | Path) -> xr.Dataset:
         contents = ", ".join(file.name for file in files) or "no results"
         raise ValueError(f"{path}: contains {contents}; name a file")
 
-    data = open_netcdf(files[0], "result")
+    data = open_netcdf(files[0], "result", needs=("case",))
     data = with_point_names(data)
     data.encoding["source"] = str(files[0])
     return data.set_coords([name for name in ("impacts/onset",) if name in data])

@@ -64,8 +64,8 @@ def write_exports(path: Path) -> list[Path]:
                 written.append(mesh)
         for source in sources:
             written += write_curves(source)
-    # OSError: a file that was cut off or is no HDF5. TypeError: a file of another program, whose types fit no table.
-    except (OSError, TypeError, ValueError) as error:
+    # OSError: a file that was cut off or is no HDF5. ValueError: a file of another program.
+    except (OSError, ValueError) as error:
         if is_disk_full(error):
             raise
         raise FolderError(str(error)) from error
