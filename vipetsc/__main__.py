@@ -40,6 +40,8 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     end = arguments.index("--") if "--" in arguments else len(arguments)
 
+    # Modules stay loaded until the process ends: searches for garbage leave their objects out.
+    gc.disable()
     import petsc4py
 
     # PETSc's handlers of signals would end the process at once; ours end a run at its next step, with a checkpoint.
@@ -69,8 +71,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options:
         database.delValue(name)
 
-    # Modules stay loaded until the process ends: searches for garbage leave their objects out.
     gc.freeze()
+    gc.enable()
     return run_verb(arguments[:end], options)
 
 
