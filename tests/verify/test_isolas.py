@@ -125,7 +125,7 @@ def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stay
     rate = rate_of(states, omega, 0.18)
     end = 2 * np.pi / omega * periods
     late = np.linspace(0.97 * end, end, 400)
-    motion = solve_ivp(rate, (0, end), state_of(states, begin), "LSODA", t_eval=late, rtol=1e-7, atol=1e-9)
+    motion = solve_ivp(rate, (0, end), state_of(states, begin), "DOP853", t_eval=late, rtol=1e-5, atol=1e-7)
 
     largest = np.abs(motion.y[0]).max()
     assert (largest > 1.3) == stays

@@ -134,8 +134,9 @@ QUIET: Table = {"output": {"figures": False}}
 NNM = {"modes": [1], "points": 2, "energy": [0.0, 1.0]}
 # By the default bound on the harmonics that are left out, hundreds would be taken along.
 FEW_HARMONICS = {"harmonics": 41, "truncation": 1e-3}
+TWELVE_CELLS: Table = {"lattice": {"cells": 12}, "contacts": {"sites": [6, 8]}}
 BREATHER = {"start_frequency": [4500.0], "start_sites": [1]}
-STEPS = {"points": 6, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
+STEPS = {"points": 4, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
 FORCE = {"source": "force", "infinite": False, "range": [0.44, 1.0]}
 FEW_RUNS = {"largest": 2.0, "tolerance": 0.9, "finest": 0.5, "samples": 1}
 PREDICT = {"predict": {"amplitudes": [2.0], "points": 16}}
@@ -166,7 +167,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("nfrc", NfrcCase, merged(DRIVEN, {"nfrc": STEPS | FORCE})),
     Column("wave", NfrcCase, merged(DRIVEN, {"nfrc": STEPS | {"range": [0.9, 2.0]}})),
     Column("reduced", NnmCase, QUIET | {"nnm": NNM | {"system": "reduced", "modes": [2]}}),
-    Column("chain", NnmCase, QUIET | {"nnm": NNM | {"system": "chain", "modes": [25]}}),
+    Column("chain", NnmCase, QUIET | TWELVE_CELLS | {"nnm": NNM | {"system": "chain", "modes": [13]}}),
     Column("own", NnmCase, QUIET | {"nnm": NNM | {"system": "own", "own": OWN}}, is_system=True),
     Column("condensed", NnmCase, QUIET | {"nnm": NNM | BREATHER | FEW_HARMONICS | {"system": "condensed"}}),
 )
@@ -201,7 +202,7 @@ FEW_SPRINGS: Table = {
     "contacts": {"sites": [2, 3]},
     "nnm": {"points": 1, "harmonics": 21, "truncation": 1e-3},
 }
-SHORT_LATTICE: Table = {"lattice": {"cells": 12}, "contacts": {"sites": [6, 8]}, "nfrc": {"points": 2, "harmonics": 3}}
+SHORT_LATTICE: Table = TWELVE_CELLS | {"nfrc": {"points": 2, "harmonics": 3}}
 IN_CELL_6 = {"lattice": {"cells": 12, "profiles": {"springs[2].cubic": {"cells": [6], "value": 1e9}}}}
 IN_CELL_2 = {"lattice": {"cells": 4, "profiles": {"springs[2].cubic": {"cells": [2], "value": 1e9}}}}
 SECOND_DRIVE = {"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}
@@ -227,7 +228,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature(
         "smooth springs in few cells",
         _lattice(profiles={"springs[2].cubic": {"cells": [6, 13], "value": 1e9}}),
-        scaled={"nfrc": SHORT_LATTICE | IN_CELL_6, "condensed": FEW_SPRINGS | IN_CELL_2},
+        scaled={"nfrc": SHORT_LATTICE | IN_CELL_6, "chain": IN_CELL_6, "condensed": FEW_SPRINGS | IN_CELL_2},
     ),
     Feature("profiles of cells", _lattice(profiles={"masses[1]": {"first": 4e-3, "last": 4.1e-3}})),
     Feature("disorder of cells", {"disorder": {"cells": {"masses[1]": {"relative": 0.01}}}}),
