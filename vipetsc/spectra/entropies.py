@@ -34,9 +34,9 @@ KC = 12.0
 # into a core's cache. 8 snapshots take 10 % more time, 32 the same; 16 nodes and 32 snapshots take twice the time.
 CHUNK = 16
 GROUP = 8
-# Operations that a matrix product does while a fast transform does one: 4 were measured. With 3 an octave for which
+# Operations that a matrix product does while a fast transform does one: 5.8 were measured. With 5 an octave for which
 # both would take the same time is transformed.
-PRODUCT_GAIN = 3
+PRODUCT_GAIN = 5
 # The largest weight of a run is sought in so many snapshots: those with the largest energy in any window of so many
 # cells. In the built-in run 2 and 32 find the same weight.
 STRONGEST = 8
@@ -168,36 +168,40 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> LocalEntropy:
     return LocalEntropy(local, weight)
 
 
-class _FilterPart(NamedTuple):
+class _Filters(NamedTuple):
     """The ``values`` (kappa, k) of the filters of some nodes at consecutive wavenumbers k of a transform.
 
-    ``first`` is the number of the first of these wavenumbers.
+    ``first`` is the number of the first of these wavenumbers; at all others the filters let nothing through.
     """
 
     first: int
     values: np.ndarray
+
+    @classmethod
+    def of(cls, filters: np.ndarray) -> Self:
+        """The ``filters`` (kappa, k) from the first to the last wavenumber that any lets through."""
+        inside = np.flatnonzero(_lets_through(filters))
+        first = int(inside[0])
+        return cls(first=first, values=np.ascontiguousarray(filters[:, first : inside[-1] + 1]))
 
 
 class _FastOctave(NamedTuple):
     """An octave of nodes whose wavelet transforms are computed by fast Fourier transforms.
 
     A signal is transformed with the length ``padded``; the inverse transform, at every ``stride``-th cell, has the
-    ``length`` padded/stride. ``groups`` of nodes are filtered together; each has its filters as a list of parts, no
-    one of which crosses a multiple of ``length``.
+    ``length`` padded/stride. ``groups`` are the filters of nodes that are filtered together.
     """
 
     padded: int
     length: int
-    groups: list[list[_FilterPart]]
+    groups: list[_Filters]
 
     def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
         """X (t, kappa, cell) at every ``stride``-th cell of the padded ``signal`` (t, cell), group by group."""
         spectrum = fft.rfft(signal, self.padded)
         for group in self.groups:
-            x = np.zeros((len(signal), len(group[0].values), self.length), dtype=complex)
-            for part in group:
-                # Folded onto the length: see the module's docstring.
-                _filter(spectrum, part.first, part.values, x, part.first % self.length)
+            x = np.empty((len(signal), len(group.values), self.length), dtype=complex)
+            _filter(spectrum, group.first, group.values, x)
             yield fft.ifft(x, overwrite_x=True)
 
 
@@ -228,13 +232,15 @@ class _NarrowOctave(NamedTuple):
 
     def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
         """X (t, kappa, cell) at every ``stride``-th cell of the ``signal`` (t, cell), of all nodes."""
-        # The rounding of a matrix product depends on the number of its rows. There are always ``CHUNK`` of them, so
-        # that the bits of a snapshot do not depend on how many are transformed with it.
-        rows = np.zeros((CHUNK, signal.shape[1]))
-        rows[: len(signal)] = signal
-        spectrum = (rows @ self.waves)[: len(signal)].view(complex)
+        # The rounding of a matrix product depends on the number of its rows. There are always ``CHUNK`` snapshots, so
+        # that the bits of one do not depend on how many are transformed with it.
+        snapshots = np.zeros((CHUNK, signal.shape[1]))
+        snapshots[: len(signal)] = signal
+        spectrum = (snapshots @ self.waves).view(complex)
         filtered = spectrum[:, None] * self.filters
-        yield filtered @ self.waves_back
+        # One product of all rows takes half as long as one for each snapshot.
+        x = filtered.reshape(-1, len(self.waves_back)) @ self.waves_back
+        yield x.reshape(*filtered.shape[:2], -1)[: len(signal)]
 
 
 @lru_cache(maxsize=8)
@@ -257,7 +263,7 @@ def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
         if in_products < PRODUCT_GAIN * in_transforms:
             octaves.append(_NarrowOctave.of(filters, padded, cells, stride))
         else:
-            groups = [_parts(filters[first : first + GROUP], length) for first in range(0, len(nodes), GROUP)]
+            groups = [_Filters.of(filters[first : first + GROUP]) for first in range(0, len(nodes), GROUP)]
             octaves.append(_FastOctave(padded=padded, length=length, groups=groups))
     return octaves
 
@@ -267,34 +273,30 @@ def _lets_through(filters: np.ndarray) -> np.ndarray:
     return np.asarray(filters.max(axis=0) > np.finfo(float).eps * filters.max())
 
 
-def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
-    """The ``filters`` (kappa, k) where any lets something through, cut at multiples of ``length``."""
-    inside = np.flatnonzero(_lets_through(filters))
-    parts = []
-    for cut in range(inside[0] // length * length, inside[-1] + 1, length):
-        first = max(inside[0], cut)
-        end = min(inside[-1] + 1, cut + length)
-        parts.append(_FilterPart(first=first, values=np.ascontiguousarray(filters[:, first:end])))
-    return parts
-
-
 @kernel
-def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray, start: int) -> None:
-    """Add a ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k).
+def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray) -> None:
+    """Write a ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k).
 
-    The first of the values belongs to the column ``first`` of the spectrum, and to ``start`` of ``x``. The kernel gets
-    whole arrays, which are contiguous: for views of them it would be compiled once more.
+    The first of the values belongs to the column ``first`` of the spectrum. Columns that differ by a multiple of the
+    number of columns of ``x`` are added up ("folded"). The kernel gets whole arrays, which are contiguous: for views of
+    them it would be compiled once more.
     """
-    width = values.shape[1]
+    length = x.shape[2]
+    end = first + values.shape[1]
     for t in range(x.shape[0]):
-        unfiltered = spectrum[t, first : first + width]
         for i in range(x.shape[1]):
-            filtered = x[t, i, start : start + width]
-            for k in range(width):
-                z = unfiltered[k]
-                value = values[i, k]
-                # Part by part: a real factor would be multiplied as a complex one, which takes longer.
-                filtered[k] += complex(z.real * value, z.imag * value)
+            x[t, i] = 0.0
+            for cut in range(first // length * length, end, length):
+                low = max(first, cut)
+                high = min(end, cut + length)
+                unfiltered = spectrum[t, low:high]
+                factors = values[i, low - first : high - first]
+                filtered = x[t, i, low - cut : high - cut]
+                for k in range(high - low):
+                    z = unfiltered[k]
+                    value = factors[k]
+                    # Part by part: a real factor would be multiplied as a complex one, which takes longer.
+                    filtered[k] += complex(z.real * value, z.imag * value)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
