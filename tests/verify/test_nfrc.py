@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
 from scipy.optimize import root
 
 from tests.conftest import assert_same_bits, datasets, run_of
@@ -37,6 +38,47 @@ THREE = {"sites": [10, 12, 15], "clearance": [CLEARANCE, 0.97 * CLEARANCE, 0.9 *
 def varied(case: NfrcCase, **options: Any) -> NfrcCase:
     """The same case with other ``options`` of its section [nfrc]."""
     return case.model_copy(update={"nfrc": case.nfrc.model_copy(update=options)})
+
+
+@pytest.mark.parametrize("detuning", [3e-7, 1e-4, 1e-2])
+def test_the_derivative_by_frequency_is_exact_beside_a_mode_that_hardly_moves_the_pair(detuning):
+    """The drive's term changes as the lattice with a spring of the shift at its pair, by d(D^-1)/domega = 2 omega/D^2.
+
+    A mode of such a lattice is at 3e-6 of the frequency of the lattice's own mode.
+    """
+    cell = {
+        "masses": [1.0, 0.15],
+        "springs": [
+            {"start": 1, "end": 1, "stiffness": 1e3, "next_cell": True},
+            {"start": 1, "end": 2, "stiffness": 4e4},
+        ],
+    }
+    table = {
+        "lattice": {"cells": 3, "cell": cell},
+        "contacts": {"law": "bilinear", "stiffness": 1e4, "restitution": 1.0, "sites": [2], "clearance": 1e-3},
+        "drive": {"waveform": "harmonic", "frequency": 20.0, "cell": 1, "amplitude": 1.0},
+        "time": {"end": 1.0},
+        "nfrc": {"source": "force", "over": "frequency", "infinite": False, "harmonics": 5, "range": [10.0, 30.0]},
+    }
+    table["nfrc"]["fixed"] = [1.0]
+    states = SteadyStates(NfrcCase.from_table(table), restitution=1.0, fixed=1.0)
+    chain = states.case.model().chain
+    stiffness = chain.stiffness_matrix().toarray()
+    masses = np.diag(chain.masses())
+    omega = np.sqrt(eigh(stiffness, masses, eigvals_only=True)[0]) * (1 + detuning)
+
+    # At rest the pair's force, and the derivative of its term, vanish.
+    rest = np.append(np.zeros(states.balance.size), omega / states.parameter.scale)
+    shift = states.shift_near(rest)
+    column = states.jacobian(rest, shift)[:, -1] * states.clearance / states.parameter.scale
+
+    first = list(states.balance.orders).index(1)
+    pair = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0])
+    push = np.eye(6)[0]
+    dynamic = stiffness + shift[first, 0, 0] * np.outer(pair, pair) - omega**2 * masses
+    expected = -2 * omega * pair @ np.linalg.solve(dynamic, masses @ np.linalg.solve(dynamic, push))
+    (place,) = np.flatnonzero(column)
+    assert column[place] == pytest.approx(expected, rel=1e-4)
 
 
 def after_a_period(chain, contact, site: int, omega: float, state: np.ndarray, force: float) -> np.ndarray:

@@ -28,9 +28,10 @@ from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
 from vipetsc.modes.response.state import Response
 
-# Relative step of the central difference in frequency. Rounding makes an error of 1e-16/SLOPE = 1e-10, which slows
-# Newton's method by as little; the solutions do not depend on it.
-SLOPE = 1e-6
+# Relative step of the central difference in frequency. A pole of A w at the relative distance d makes an error of
+# (SLOPE/d)^2, as a mode that hardly moves the pairs, and rounding one of 1e-16/SLOPE, which slows Newton's method by as
+# little; the solutions do not depend on it.
+SLOPE = 1e-8
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.
 FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError, np.linalg.LinAlgError
