@@ -11,9 +11,10 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+from llvmlite.binding import create_new_function_pass_manager
 from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
@@ -22,7 +23,25 @@ from numba.core.typed_passes import NativeLowering
 from vipetsc.lowering import TupleLower
 
 
-class _LinkedLibrary(JITCodeLibrary):
+class _Library(JITCodeLibrary):
+    """The code of a function, which is optimised as a whole once all that it calls is linked to it."""
+
+    def add_llvm_module(self, module: Any) -> None:
+        """Add a ``module`` of LLVM, with variables of its functions in registers, which makes it shorter.
+
+        Numba also optimises each function for itself. That takes as long as to optimise the whole, which is not faster
+        after it.
+        """
+        module.data_layout = self._codegen._data_layout
+        builder = self._codegen._pass_builder()
+        passes = create_new_function_pass_manager()
+        passes.add_sroa_pass()
+        for function in module.functions:
+            passes.run(function, builder)
+        self._final_module.link_in(module)
+
+
+class _LinkedLibrary(_Library):
     """The code of a kernel and of those that it calls, neither optimised as a whole nor translated."""
 
     def finalize(self) -> None:
@@ -45,6 +64,14 @@ class _EntryLowering(NativeLowering):
     def lowering_class(self) -> type[Lower]:
         """The class that translates a function."""
         return TupleLower
+
+    def run_pass(self, state: Any) -> bool:
+        """Lower the function of ``state``."""
+        if state.library is None:
+            state.library = _Library(state.targetctx.codegen(), state.func_id.func_qualname)
+            # For the machine code to be kept between runs.
+            state.library.enable_object_caching()
+        return super().run_pass(state)
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -74,10 +101,30 @@ class _LinkedLowering(_EntryLowering):
         return True
 
 
+class _Flags(Flags):
+    """Options of a compilation, compared by the dictionary of those that are set.
+
+    Numba looks functions up by types and options, some hundred times a kernel, and reads and compares all its options
+    each time, which takes a twentieth of the whole compilation.
+    """
+
+    # A class that defines ``__eq__`` alone has no hash.
+    __hash__ = Flags.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Flags):
+            return NotImplemented
+        return bool(self._values == other._values)
+
+
 class EntryCompiler(CompilerBase):
     """Numba's compiler of functions that Python calls, with lowering by ``TupleLower``."""
 
     _lowering: type[NativeLowering] = _EntryLowering
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.state.flags = _Flags(self.state.flags)
 
     def define_pipelines(self) -> list[PassManager]:
         """The passes of numba, of which the lowering is replaced."""

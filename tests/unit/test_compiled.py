@@ -363,3 +363,15 @@ print(compiling.seconds > before)
         return done.stdout.decode().strip()
 
     assert [ran(), ran()] == ["True", "False"]
+
+
+def test_options_of_compilations_are_compared():
+    """Functions are compiled again for other options, and found again for equal ones."""
+    numpy, equal, python = (kernel._Flags() for _ in range(3))
+    numpy.error_model = "numpy"
+    equal.error_model = "numpy"
+    python.error_model = "python"
+    assert numpy == equal
+    assert hash(numpy) == hash(equal)
+    assert numpy != python
+    assert numpy != kernel._Flags()

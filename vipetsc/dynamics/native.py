@@ -6,8 +6,9 @@ from functools import cache
 from typing import Any
 
 from llvmlite import binding
-from numba.core.types import ExternalFunction, int32, int64, voidptr
+from numba.core.types import Array, ExternalFunction, int32, int64
 from numba.extending import intrinsic
+from numba.np.arrayobj import make_array, populate_array
 
 from vipetsc.dynamics.petsc_library import petsc_library
 
@@ -42,13 +43,18 @@ def bind_symbols() -> None:
         binding.add_symbol(function.symbol, address)
 
 
-def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
-    """An int64 address as a void pointer."""
+def _array_at(typing_context: Any, address: Any, length: Any, dtype: Any) -> tuple[Any, Callable]:
+    """The array (length,) of a ``dtype`` at an int64 address; numba's carray is compiled anew for each dtype."""
+    kind = Array(dtype.dtype, 1, "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(voidptr))
+        size = context.get_constant(int64, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+        array = make_array(kind)(context, builder)
+        data = builder.inttoptr(arguments[0], array.data.type)
+        populate_array(array, data=data, shape=[arguments[1]], strides=[size], itemsize=size, meminfo=None)
+        return array._getvalue()
 
-    return voidptr(int64), generate
+    return kind(int64, int64, dtype), generate
 
 
-pointer: Any = intrinsic(_pointer_of)
+array_at: Any = intrinsic(_array_at)

@@ -12,7 +12,6 @@ from typing import Any, get_type_hints
 from petsc4py import PETSc
 
 import numpy as np
-from numba import carray
 from numba.core.ccallback import CFunc
 
 from vipetsc.compiled import cfunc, inlined, kernel, njit
@@ -21,7 +20,7 @@ from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
 from vipetsc.dynamics.lattice_record import COEFFICIENTS, COUPLING, MASS, NONLINEAR, SPRING, LatticeRecord, Shape
-from vipetsc.dynamics.native import pointer
+from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import SITE_DOFS, relative_motion
 from vipetsc.dynamics.spring_law import SPRING_LAW
@@ -162,23 +161,23 @@ CONTEXT = np.dtype(
 @inlined
 def _lattice_at(address: int) -> LatticeRecord:
     """The lattice of the ``CONTEXT`` at an ``address``."""
-    context: Any = carray(pointer(address), (1,), CONTEXT)[0]
+    context: Any = array_at(address, 1, CONTEXT)[0]
     at = context.address
     size = context.length
     return LatticeRecord(
         context.shape,
-        carray(pointer(at.masses), (size.masses,), MASS),
-        carray(pointer(at.couplings), (size.couplings,), COUPLING),
-        carray(pointer(at.springs), (size.springs,), SPRING),
-        carray(pointer(at.site_dofs), (size.site_dofs,), SITE_DOFS),
-        carray(pointer(at.contacts), (size.contacts,), SITE),
-        Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
-        carray(pointer(at.nonlinear), (size.nonlinear,), NONLINEAR),
-        carray(pointer(at.spring_laws), (size.spring_laws,), SPRING_LAW),
-        carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
-        carray(pointer(at.grounding), (size.grounding,), np.float64),
-        carray(pointer(at.stiffness), (size.stiffness,), np.float64),
-        carray(pointer(at.damping), (size.damping,), np.float64),
+        array_at(at.masses, size.masses, MASS),
+        array_at(at.couplings, size.couplings, COUPLING),
+        array_at(at.springs, size.springs, SPRING),
+        array_at(at.site_dofs, size.site_dofs, SITE_DOFS),
+        array_at(at.contacts, size.contacts, SITE),
+        Drives(array_at(at.rows, size.rows, DRIVE), array_at(at.pieces, size.pieces, PIECE)),
+        array_at(at.nonlinear, size.nonlinear, NONLINEAR),
+        array_at(at.spring_laws, size.spring_laws, SPRING_LAW),
+        array_at(at.inverse_masses, size.inverse_masses, np.float64),
+        array_at(at.grounding, size.grounding, np.float64),
+        array_at(at.stiffness, size.stiffness, np.float64),
+        array_at(at.damping, size.damping, np.float64),
     )
 
 
@@ -204,7 +203,7 @@ def find_change(address: int, start: np.ndarray, end: np.ndarray, h: float, plac
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
-    context: Any = carray(pointer(address), (1,), CONTEXT)[0]
+    context: Any = array_at(address, 1, CONTEXT)[0]
     shape = context.shape
     error = 0
     if shape.exchange:
@@ -220,8 +219,8 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         return error
 
     lattice = _lattice_at(address)
-    y = carray(pointer(state), (shape.ghosted,), np.float64)
-    rate = carray(pointer(context.array), (shape.owned,), np.float64)
+    y = array_at(state, shape.ghosted, np.float64)
+    rate = array_at(context.array, shape.owned, np.float64)
     onset = context.onset
     if onset.duration > 0.0:
         right_hand_side(onset.time + t * t / onset.duration, y, rate, lattice)

@@ -10,12 +10,11 @@ from functools import cache
 from petsc4py import PETSc
 
 import numpy as np
-from numba import carray
 from numba.core.ccallback import CFunc
 
 from vipetsc.compiled import cfunc, njit
 from vipetsc.dynamics import native
-from vipetsc.dynamics.native import pointer
+from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.vectors import LANES, add, add_product, prefetch, store, zeros
 
@@ -39,7 +38,7 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
             part = zeros()
             for j in range(first, stop):
                 if factors[j] != 0.0:
-                    x = carray(pointer(addresses[j]), (n,), np.float64)
+                    x = array_at(addresses[j], n, np.float64)
                     prefetch(x, i + AHEAD)
                     part = add_product(part, factors[j], x, i)
             total = add(total, part)
@@ -52,13 +51,13 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
             term = 0.0
             for j in range(first, stop):
                 if factors[j] != 0.0:
-                    term += factors[j] * carray(pointer(addresses[j]), (n,), np.float64)[i]
+                    term += factors[j] * array_at(addresses[j], n, np.float64)[i]
             y[i] += term
             first = stop
 
 
 def _callback(y: int, count: int, factors: int, vectors: int) -> int:
-    handles = carray(pointer(vectors), (count,), np.int64)
+    handles = array_at(vectors, count, np.int64)
     # Of the vectors, then of y, then its size.
     addresses = np.zeros(count + 2, np.int64)
     at = addresses.ctypes.data
@@ -68,8 +67,8 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
     if error != 0:
         return error
 
-    target = carray(pointer(addresses[count]), (addresses[count + 1],), np.float64)
-    add_products(target, carray(pointer(factors), (count,), np.float64), addresses)
+    target = array_at(addresses[count], addresses[count + 1], np.float64)
+    add_products(target, array_at(factors, count, np.float64), addresses)
 
     for j in range(count):
         error = error or native.restore_read(handles[j], at + 8 * j)
