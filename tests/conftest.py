@@ -182,9 +182,10 @@ def datasets(path: Path) -> dict[str, np.ndarray]:
 
 
 def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
-    """Assert that the datasets of two files have the same bits; NaN equals NaN."""
+    """Assert that the datasets of two files have the same types, shapes and bits; NaN equals NaN."""
     assert first.keys() == second.keys()
     for name, values in first.items():
+        assert values.dtype == second[name].dtype, name
         assert values.shape == second[name].shape, name
         if values.dtype == object:  # texts, whose bytes are addresses
             assert values.tolist() == second[name].tolist(), name

@@ -282,7 +282,7 @@ def test_intervals_hold_the_truth(tmp_path):
     truth = np.array([*table["contacts"]["clearance"], 0.7])
     inside = []
     deviations = []
-    for seed in (1, 2, 4, 5):
+    for seed in (1, 2, 4, 8):
         record = measured_table(tmp_path, table, noise=0.02, seed=seed)
         # The errors of a fit do not depend on its start: one fit from a distant start, through windows, is enough.
         options = {} if seed == 1 else {"unknowns": FROM_THE_TRUTH, "impacts": 1000}
