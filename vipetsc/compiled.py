@@ -99,12 +99,12 @@ class _MachineCode(CompileResultCacheImpl):
     def reduce(self, cres: Any) -> Any:
         """Numba's tuple for a function, without the code of LLVM, and with the environments that are used.
 
-        Numba would read the code of LLVM at each start for other kernels to link it; kernels link each other as
-        ``Kernel`` says. It has an environment of every function that was linked into this one, and would import their
-        modules; few functions ever look at theirs.
+        From the code of LLVM other kernels could link the function, and numba would read it at each start; kernels link
+        each other as ``Kernel`` says instead. Numba also stores an environment for every function that was linked into
+        this one, and would import the modules of all of them at each start. Few functions ever read theirs.
         """
         (name, kind, (machine_code, _)), description, *parts, environments = super().reduce(cres)
-        # Numba asks the code of LLVM which functions there are: Python calls this one.
+        # Numba reads from the code of LLVM which functions there are. Python calls only the wrapper.
         entry = parse_assembly(f'define void @"{description.llvm_cpython_wrapper_name}"() {{ ret void }}')
 
         # Each environment is named where it is declared, and where it is read.

@@ -27,10 +27,10 @@ class _Library(JITCodeLibrary):
     """The code of a function, which is optimised as a whole once all that it calls is linked to it."""
 
     def add_llvm_module(self, module: Any) -> None:
-        """Add a ``module`` of LLVM, with variables of its functions in registers, which makes it shorter.
+        """Add a ``module`` of LLVM, after a pass that moves variables into registers and so makes the code shorter.
 
-        Numba also optimises each function for itself. That takes as long as to optimise the whole, which is not faster
-        after it.
+        Numba also optimises each function by itself. This takes as long as the optimisation of the whole kernel, and
+        the kernel is no faster for it.
         """
         module.data_layout = self._codegen._data_layout
         builder = self._codegen._pass_builder()

@@ -64,9 +64,9 @@ class SecondProcess:
         copies = cores if draws_alone else cores - 1
         pairs = [socket.socketpair(type=socket.SOCK_SEQPACKET) for _ in range(copies)]
         self._channels = [ours for ours, _ in pairs]
-        # Until it waits, this process computes on one of the cores.
-        self._beside = self._channels[: cores - 1]
-        self._instead = self._channels[cores - 1 :]
+        # Until it waits, this process computes on one of the cores: the copy for that core gets its requests then.
+        self._early = self._channels[: cores - 1]
+        self._late = self._channels[cores - 1 :]
 
         self._file = os.memfd_create("turns")
         alive, self._alive = os.pipe()
@@ -106,12 +106,12 @@ class SecondProcess:
         paths = [str(folder) for folder in folders]
         request = {"source": source, "folders": paths, "names": names, "options": options, "number": number}
         self._messages.append(json.dumps(request).encode())
-        for channel in self._beside:
+        for channel in self._early:
             _send(channel, self._messages[-1:])
 
     def drawn(self) -> Drawn | None:
         """Wait for all that was asked for, and return it; None if anything failed."""
-        for channel in self._instead:
+        for channel in self._late:
             _send(channel, self._messages)
         answers = [_received(channel) for channel in self._channels for _ in self._messages]
         self.requests.clear()

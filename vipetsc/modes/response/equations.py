@@ -28,9 +28,9 @@ from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
 from vipetsc.modes.response.state import Response
 
-# Relative step of the central difference in frequency. A pole of A w at the relative distance d makes an error of
-# (SLOPE/d)^2, as a mode that hardly moves the pairs, and rounding one of 1e-16/SLOPE, which slows Newton's method by as
-# little; the solutions do not depend on it.
+# Relative step of the central difference in frequency. Its relative error is (SLOPE/d)^2 at the relative distance d
+# from a pole of A w, and 1e-16/SLOPE by rounding. A mode that hardly moves the pairs makes A w large close to its pole
+# alone. Such errors slow Newton's method by as little; the solutions do not depend on them.
 SLOPE = 1e-8
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.
