@@ -347,6 +347,19 @@ def plain_pictures(monkeypatch):
 
 
 @pytest.fixture
+def with_figures(monkeypatch):
+    """A function that leaves only the figures of the given names in the registry, where fewer are enough for a test."""
+
+    # Most tests draw nothing, and need no matplotlib.
+    from vipetsc.figures import registry
+
+    def leave(*names: str) -> None:
+        monkeypatch.setattr(registry, "FIGURES", {name: registry.FIGURES[name] for name in names})
+
+    return leave
+
+
+@pytest.fixture
 def petsc_options():
     """Set PETSc options for one test."""
     from petsc4py import PETSc

@@ -15,7 +15,6 @@ import pytest
 
 from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified, set_words
 from vipetsc.cli.verbs.doctor_verb import doctor_table
-from vipetsc.figures.registry import FIGURES
 
 SMALL = """
 [lattice]
@@ -42,7 +41,7 @@ def case(tmp_path) -> Path:
 
 @pytest.mark.usefixtures("plain_pictures")
 @alone_and_on_two_ranks
-def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monkeypatch, case, tmp_path, ranks):
+def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, with_figures, case, tmp_path, ranks):
     """A run leaves its files, a summary that says what was computed by what, and pictures."""
     ended = on_ranks(ranks, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 0, ended.stderr
@@ -68,8 +67,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
 
     # The rest concerns files only, and two pictures are enough for it.
     if not ranks:
-        for name in FIGURES.keys() - {"ledger", "modal_energies"}:
-            monkeypatch.delitem(FIGURES, name)
+        with_figures("modal_energies", "ledger")
         assert_the_same_command_finishes_what_is_missing(in_process, case, tmp_path / "out")
 
 

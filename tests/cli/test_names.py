@@ -13,7 +13,6 @@ import pytest
 
 from tests.conftest import clean_environment
 from tests.faults.scenarios import SCENARIOS, prepare, words_of
-from vipetsc.figures import registry
 from vipetsc.io.names import path_named, readable
 
 # Without the last two variables Python would replace the locale by UTF-8.
@@ -101,13 +100,13 @@ def test_an_ascii_locale_takes_names_in_utf_8(by_shell, tmp_path, verb, options,
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("verb", ["run", "sweep", "law", "nnm", "bands", "plot", "export"])
-def test_a_folder_may_have_bytes_that_are_no_text(in_process, monkeypatch, tmp_path, verb):
+def test_a_folder_may_have_bytes_that_are_no_text(in_process, monkeypatch, with_figures, tmp_path, verb):
     """Verbs write results and pictures into a folder whose name is not valid text, and read them there."""
     scenario = SCENARIOS[verb]
     case = prepare(scenario, tmp_path)
     out = tmp_path / NO_TEXT
     # All pictures of a run go into one folder: one is enough.
-    monkeypatch.setattr(registry, "FIGURES", {"ledger": registry.FIGURES["ledger"]})
+    with_figures("ledger")
     for words in filter(None, (scenario.before, scenario.words)):
         call = words_of(words, case, out)
         # Results record the command of the process.

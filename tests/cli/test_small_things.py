@@ -17,7 +17,6 @@ from vipetsc.case.design import DesignCase
 from vipetsc.cli.tables import duration
 from vipetsc.cli.verbs.bands_verb import damping_report, damping_table
 from vipetsc.cli.verbs.plot_verb import pictures_of
-from vipetsc.figures.registry import FIGURES
 from vipetsc.lattice import UnitCell
 from vipetsc.lattice.cell import Spring
 
@@ -36,11 +35,10 @@ def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("verb", "text"), [("nnm", BRANCHES), ("design", DESIGN)])
-def test_branches_and_searches_need_not_be_drawn(in_process, monkeypatch, tmp_path, verb, text):
+def test_branches_and_searches_need_not_be_drawn(in_process, with_figures, tmp_path, verb, text):
     """With output.figures=false there are no pictures; the same command without it draws them."""
     # One picture of a search is enough.
-    for name in {"cost_maps", "dispersion_against_lambda", "dispersion_against_eta"}:
-        monkeypatch.delitem(FIGURES, name)
+    with_figures("branch", "deflections")
     case = tmp_path / "case.toml"
     case.write_text(text)
     out = tmp_path / "out"

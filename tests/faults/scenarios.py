@@ -255,8 +255,7 @@ def shrink_pictures() -> None:
     from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
-    for name in registry.FIGURES.keys() - {*DRAWN}:
-        del registry.FIGURES[name]
+    registry.FIGURES = {name: spec for name, spec in registry.FIGURES.items() if name in DRAWN}
     # The record is frozen, and the verb holds it already: it is changed in place.
     object.__setattr__(run_verb.PICTURES, "unmeasured", tuple({*run_verb.PICTURES.unmeasured} & {*DRAWN}))
     measures_of = measure_pages.measures_of

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import xarray as xr
@@ -136,7 +137,8 @@ _SPECS = (
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
     *(FigureSpec(draw.__name__, IDENTIFIED, draw) for draw in identified.FIGURES),
 )
-FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
+# Nothing may take a figure out and put it back: pictures, and messages about them, come in the order of this table.
+FIGURES: Mapping[str, FigureSpec] = MappingProxyType({spec.name: spec for spec in _SPECS})
 reserve(FIGURE, FIGURES)
 
 
