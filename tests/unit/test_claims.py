@@ -1,4 +1,4 @@
-"""Verdicts on the paper's claims follow from numbers and thresholds, and the thresholds are those specified."""
+"""Verdicts on the paper's claims follow from numbers and thresholds, and the thresholds are those listed here."""
 
 import json
 from types import SimpleNamespace
@@ -102,8 +102,8 @@ def test_a_curve_that_stays_on_its_floor_does_not_grow():
     assert np.isnan(floor.growth_ratio(10.0, 0.55))
 
 
-# The table of thresholds of SPEC.md, lines "claim | quantity | comparison | threshold"; * stands for both laws.
-
+# The thresholds, apart from the file that the program reads: who changes one has to change both. A line is "claim |
+# quantity | comparison | threshold"; * stands for both laws.
 SPECIFIED = """
 C1 | ridge's largest distance from the optical branch | <= | 1
 C1 | loudest wavenumber's distance from 5 pi/9 | <= | 1
@@ -169,7 +169,7 @@ CRITERIA = [(claim, criterion) for claim, spec in CLAIMS.items() for criterion i
 
 
 def test_thresholds_are_those_specified():
-    """Quantities, comparisons and thresholds of all claims are those of SPEC.md, each with its source."""
+    """Quantities, comparisons and thresholds of all claims are those of ``SPECIFIED``, each with its source."""
     expected = set()
     for line in SPECIFIED.strip().splitlines():
         claim, quantity, comparison, bounds = line.split(" | ")
@@ -187,15 +187,15 @@ def test_thresholds_are_those_specified():
 
 
 def test_constants_inside_of_quantities_are_those_specified():
-    """Constants within the definitions of quantities are those of SPEC.md."""
+    """Constants within the definitions of quantities have these values, and Hertz's limit is that of its formula."""
     assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE) == (0.95, 0.9)
     assert (FEWEST, constants.SEVERAL) == (4, 3)
     assert (constants.QUIET, constants.PEAK, constants.HIGH) == (0.1, (0.9, 1.8), 10.0)
     assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
     assert (constants.HALF_WIDTH, constants.NATIVE) == (0.02, (7, 8))
     assert (PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
-    assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")
-    # The paper's (n - 1)/(2 (n + 1)) for the exponent n = 3/2 of Hertz's law.
+    assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 3")
+    # (n - 1)/(2 (n + 1)) for the exponent n = 3/2 of Hertz's law.
     assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == constants.HERTZ_LIMIT
 
 

@@ -11,7 +11,7 @@ from vipetsc.lattice.bands import BlochPoint, bloch
 from vipetsc.lattice.cell import Reading, UnitCell, four_band
 
 COSTS = ("deflection", "group_velocity", "weighted")
-PAPER_CELL = (0.1, 0.5)  # the (lambda, eta) that the paper takes (SPEC 11, C10; Suppl. 3)
+PAPER_CELL = (0.1, 0.5)  # the (lambda, eta) that the paper takes (sec. III.A; Suppl. 3)
 DRIVEN = 2  # the band, from 1, of the wave that closes the contacts; group velocities count from this band upwards
 # Product of two displacements, of vectors of unit norm, below which their phase has no meaning: at the zone's border
 # one of them vanishes by symmetry, and comes out as a rounding error of either sign.

@@ -1,3 +1,3 @@
-"""The paper's seventeen claims (SPEC.md 11) and one on its outlook, each measured from files."""
+"""The paper's seventeen claims and one on its outlook (``claims.toml``), each measured from files."""
 
 from vipetsc.paper.claims.measure import measure_claims, write_claims

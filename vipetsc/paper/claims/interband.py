@@ -22,7 +22,7 @@ FIELDS = 16
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C10: the best (lambda, eta) of the search, on the paper's coarse grid and on the whole grid (Suppl. 3, Fig. S3).
+    """C10: the best (lambda, eta) of the search, on a coarse grid and on the whole one (Suppl. 3, Fig. S3).
 
     Raises MissingEvidence if results are missing.
     """
@@ -44,7 +44,8 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
         for symbol in ("lambda", "eta"):
             result.value[f"{symbol} at the optimum, {name}"] = search[f"optimum_{symbol}"].values[row, i]
 
-    # The paper searched a coarse grid, and a finer one has its optimum between the points of that.
+    # The paper does not state its grid. One of the spacing ``GRID`` has the paper's optimum, which on a finer one lies
+    # between the points of that.
     rows = _on_grid(lam)
     columns = _on_grid(eta)
     coarse = np.where(out_of_phase, cost, -np.inf)[np.ix_(rows, columns)]
