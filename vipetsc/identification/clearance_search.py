@@ -16,9 +16,9 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
 from vipetsc.identification.precision import EXACT, Tolerances
 
-# Clearances that are tried, over the largest motion without the stop: out of reach, where the lattice would not have
-# touched; just within reach, where the first impact grazes; and further in, where a valley may begin that a fit from a
-# graze does not reach.
+# Clearances that are tried, over the largest motion without the stop. The first is out of reach, so that nothing
+# touches. At the second the first impact grazes. The others are further in: a fit that begins at a graze may not reach
+# a valley there.
 OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
 # Sides on which a clearance has its stops: 0 is that of w > 0, 1 that of w < 0.
 SIDES = {"clearance": [0], "clearance_minus": [1]}
@@ -33,10 +33,12 @@ def reached_by(misfit: Misfit, z: np.ndarray, ends: Sequence[float], tolerances:
     largest = np.zeros((len(misfit.plan.base.model().chain.sites), 2))
     for number, (table, end) in enumerate(zip(misfit.plan.options.records, ends, strict=True)):
         if table.contact and (misfit.records[number].times <= end).any():
-            response = misfit.alone(z, number, end, tolerances)
+            response = misfit.motion(z, number, end, tolerances)
             largest = np.maximum(largest, response.reached)
-            touched = response.episodes["site"], (response.episodes["side"] < 0).astype(int)
-            largest[touched] = np.nan
+            sites = response.episodes["site"]
+            sides = (response.episodes["side"] < 0).astype(int)
+            # It stays NaN, whatever later records reach: the maximum of NaN and a number is NaN.
+            largest[sites, sides] = np.nan
     return largest
 
 

@@ -92,8 +92,9 @@ class CoefficientSlopes:
 
         None also if no case has the values at the start.
         """
-        # Taken at the start of the case, wherever the fit is: one that goes on after a stop has the same bits.
-        z = np.array([each.to_coordinate(each.start) for each in self._parameters])
+        # The difference is taken at the start values of the case, not where the fit is: a fit that goes on after a stop
+        # then has the same bits.
+        z = np.array([parameter.to_coordinate(parameter.start) for parameter in self._parameters])
         below, above = self._neighbours(z, p)
         low, high = (self._values_with(z, p, x) for x in (below, above))
         try:

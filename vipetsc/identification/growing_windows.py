@@ -33,21 +33,22 @@ LEAST_NOISE = 1e-9
 # Least weight of the prior over the norm of the Jacobian. Where a clearance is not reached, a column of the Jacobian is
 # zero; without full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
-# A window is repeated at half its growth if its misfit is so many times that of the one before, and that of noise,
-# until it grows by less than this fraction of the record. In eight fits (5 % noise, starts up to 2.3 times off, records
-# that begin in an unknown motion) 1, 2 and 4 lead to the same parameters. With 1, noise alone shortens windows: there
-# are up to 73 of them instead of 19, at seven times the CPU. With 4, one fit has a window less than with 2.
+# A window is repeated at half its growth if its misfit is more than RISE times that of the window before (or times 1,
+# the misfit of noise, if that is larger). It is repeated until it grows by less than SHORTEST of the record. In eight
+# fits (5 % noise, starts up to 2.3 times off, records that begin in an unknown motion) 1, 2 and 4 lead to the same
+# parameters. With 1, noise alone shortens windows: there are up to 73 of them instead of 19, at seven times the CPU.
+# With 4, one fit has a window less than with 2.
 RISE = 2.0
 SHORTEST = 0.01
 # Length over that of the record of the first window of a record without contact, or whose initial state is estimated.
 FIRST = 0.1
-# Samples of a window, at least; every record has twice as many.
+# Samples of a window, at least, before it is shortened (RISE); every record has twice as many.
 LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown: with one for each, noise would be fitted exactly.
 # In four records that begin in an unknown motion 0.75 and 3 give the same windows, whose ends are those of contacts.
 DATA_EACH = 1.5
-# Fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise one such fit comes within
-# 5e-5 standard errors of the values after five, and two come within 2e-6.
+# Number of fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise one such fit
+# comes within 5e-5 standard errors of the values after five, and two come within 2e-6.
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1
@@ -88,6 +89,9 @@ class GrowingWindows:
     ``keep`` is called with the number and the solution (coordinate,) of every least-squares problem. A later fit that
     is given the solutions as ``solved`` takes them as they are and goes on with the next problem, to the same bits. The
     ``noise`` of the misfit is set here, and stays that of the fit.
+
+    ``last`` (record) are the last times of the records' clocks in s, the ends of the window of all data; ``low`` and
+    ``high`` (coordinate,) are the bounds.
     """
 
     def __init__(
@@ -209,13 +213,16 @@ class GrowingWindows:
         Returns the coordinates (coordinate,); windows are appended to ``windows``.
         """
         options = self.misfit.plan.options
-        impacts = float(options.impacts)
-        begin = self._first()
-        least = 1.0
-        ends = self._ends(z, int(impacts), self._first_lengths())
+        first = self._first()
+        # The ends of the window before this one, and its misfit, at least that of noise.
+        begin = first
+        misfit_before = 1.0
+        ends = self._ends(z, options.impacts, self._first_lengths())
         while True:
             is_last = ends == self.last
-            precision = FINAL if is_last else GROWING
+            precision = GROWING
+            if is_last:
+                precision = FINAL
             fitted = self.solve(z, ends, self._every(), precision)
             window = self._window(fitted, ends, precision)
             other = None
@@ -227,23 +234,25 @@ class GrowingWindows:
                 window = self._window(fitted, ends, precision)
 
             # A misfit that rises shows that the window has grown beyond the valley in which the fit began.
-            shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
-            grown = max((b - a) / (c - a0) for a, b, c, a0 in zip(begin, ends, self.last, self._first(), strict=True))
-            if window.misfit > RISE * least and grown > SHORTEST:
-                ends = shorter
+            growths = []
+            for record_first, record_last, before, end in zip(first, self.last, begin, ends, strict=True):
+                growths.append((end - before) / (record_last - record_first))
+            if window.misfit > RISE * misfit_before and max(growths) > SHORTEST:
+                ends = [(before + end) / 2 for before, end in zip(begin, ends, strict=True)]
                 continue
 
             windows.append(window)
             z = fitted
-            least = max(1.0, window.misfit)
+            misfit_before = max(1.0, window.misfit)
             if is_last:
                 return z
             begin = ends
             # Contacts of each record, as ``_ends`` counts them; at least one more, if the growth does not give one.
-            impacts = max(options.growth * window.most_impacts, window.most_impacts + 1)
-            lengths = [options.growth * (end - first) for first, end in zip(self._first(), ends, strict=True)]
-            ends = [max(a, b) for a, b in zip(ends, self._ends(z, int(impacts), lengths), strict=True)]
-            # The next contact lies beyond the window, so that an end moves; should none do so, the fit still ends.
+            impacts = int(max(options.growth * window.most_impacts, window.most_impacts + 1))
+            lengths = [options.growth * (end - start) for start, end in zip(first, ends, strict=True)]
+            # No end moves back: with the new parameters a contact may come earlier.
+            ends = [max(end, later) for end, later in zip(ends, self._ends(z, impacts, lengths), strict=True)]
+            # The next contact lies beyond the window, so that an end moves. If none moves, the fit still ends.
             if ends == begin:
                 ends = self.last
 
@@ -252,9 +261,9 @@ class GrowingWindows:
         return [float(record.times[0]) for record in self.misfit.records]
 
     def _first_lengths(self) -> list[float]:
-        """The longest first windows in s of the records: longer if an initial state that is estimated needs the data.
+        """The largest lengths (record) in s of the first window in each record: longer if the unknowns need more data.
 
-        They bind records whose initial state is estimated (``_ends``).
+        ``_ends`` keeps to them in records whose initial state is estimated.
         """
         lengths = []
         for number, record in enumerate(self.misfit.records):
@@ -289,7 +298,7 @@ class GrowingWindows:
         They are those from the record's first sample to its time ``end``; none where the model has no motion.
         """
         try:
-            onsets = self.misfit.alone(z, number, end, tolerances).episodes["onset"]
+            onsets = self.misfit.motion(z, number, end, tolerances).episodes["onset"]
         except (CaseError, MotionError):
             return np.zeros(0)
         first = self.misfit.times(z, number, end)[0]

@@ -34,7 +34,8 @@ def least_residuals(
     residuals are evaluated ``steps`` times at most. Raises what ``residuals`` and ``jacobian`` raise.
     """
     latest = np.zeros(0)
-    taken: list[_Step] = []
+    # The step that SciPy has taken last, by the state in which it began.
+    step: _Step | None = None
 
     def evaluate(x: np.ndarray) -> np.ndarray:
         nonlocal latest
@@ -42,11 +43,12 @@ def least_residuals(
         return latest
 
     def differentiate(x: np.ndarray) -> np.ndarray:
+        nonlocal step
         # SciPy calls this at the start and after every step that is taken: the latest residuals are those at x.
-        if taken and taken[-1].ends_at(x, latest, precision):
+        if step is not None and step.ends_at(x, latest, precision):
             raise _FitEnd(x.copy())
         slopes = jacobian(x)
-        taken[:] = [_Step(x.copy(), latest, slopes)]
+        step = _Step(x.copy(), latest, slopes)
         return slopes
 
     low, high = bounds

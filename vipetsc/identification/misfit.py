@@ -65,7 +65,7 @@ class Misfit:
         self.records = records
         self.compute = compute
         self._trials = [plan.trials(number) for number in range(len(records))]
-        self._alone = lru_cache(maxsize=KEPT)(self._new_alone)
+        self._kept_motion = lru_cache(maxsize=KEPT)(self._new_motion)
         self._slopes = [CoefficientSlopes(plan.parameters, trials) for trials in self._trials]
         self.sizes = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
         self.noise = list(self.sizes)
@@ -119,25 +119,27 @@ class Misfit:
         )
 
     def columns(self, number: int, active: Iterable[int]) -> tuple[list[int], list[int]]:
-        """The ``active`` coordinates that have a column in the motion of record ``number``.
+        """The ``active`` coordinates by which the motion of record ``number`` is differentiated, in two lists.
 
-        They are parameters of the equations of motion, then coordinates of its initial state.
+        The first are parameters of the equations of motion, all but offsets, which only shift the motion in time. The
+        second are coordinates of the record's initial state.
         """
         active = list(active)
-        inner = [p for p in active if p < self.count and not self._is(p, "offset")]
+        inner = [p for p in active if p < self.count and not self._is_of(p, "offset")]
         state = self.states.get(number)
         return inner, [p for p in active if state and p in state.indices]
 
-    def alone(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> RecordedMotion:
-        """The motion of record ``number`` at its sensors up to the time ``end`` in s of its clock, without derivatives.
+    def motion(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> RecordedMotion:
+        """The motion of record ``number`` at ``z`` (coordinate,), at its sensors, without derivatives.
 
-        Raises CaseError, MotionError.
+        It goes up to the time ``end`` in s of the record's clock. The latest ``KEPT`` motions are kept. Raises
+        CaseError, MotionError.
         """
         samples = int(np.sum(self.records[number].times <= end))
-        return self._alone(tuple(z.tolist()), number, samples, tolerances)
+        return self._kept_motion(tuple(z.tolist()), number, samples, tolerances)
 
-    def _new_alone(self, z: tuple[float, ...], number: int, samples: int, tolerances: Tolerances) -> RecordedMotion:
-        """The motion of ``alone`` at ``z`` (coordinate,) over so many ``samples``; a cache needs a tuple of numbers."""
+    def _new_motion(self, z: tuple[float, ...], number: int, samples: int, tolerances: Tolerances) -> RecordedMotion:
+        """The ``motion`` at ``z`` over so many ``samples``, computed; a cache needs a tuple of numbers."""
         end = float(self.records[number].times[samples - 1])
         return self.respond(np.array(z), number, end, tolerances=tolerances)
 
@@ -153,9 +155,9 @@ class Misfit:
     ) -> RecordedMotion:
         """The motion of record ``number`` up to the time ``end`` in s of its clock, at ``z`` (coordinate,).
 
-        It has derivatives by those of the ``active`` coordinates that ``columns`` names, in that order. It is that of
-        the masses ``watched`` (mass,), by default those of the sensors, at every ``stride``-th sample. Raises
-        CaseError, MotionError.
+        It has derivatives with respect to those of the ``active`` coordinates that ``columns`` names, in that order. It
+        is sampled at the masses ``watched`` (mass,), by default those of the sensors, and at every ``stride``-th sample
+        of the record. Raises CaseError, MotionError.
         """
         table = self.plan.options.records[number]
         model = self.model(z, number)
@@ -228,7 +230,7 @@ class Misfit:
         if active:
             response = self.respond(z, number, end, active, tolerances=tolerances)
         else:
-            response = self.alone(z, number, end, tolerances)
+            response = self.motion(z, number, end, tolerances)
         table = self.plan.options.records[number]
         motion = response.motion
         inner, estimated = self.columns(number, active)
@@ -244,10 +246,11 @@ class Misfit:
                 values[:, k] = motion[:, k, row, 0]
                 rate = motion[:, k, row + 1, 0]
 
-            # The amplitude that is sought is the first drive's, unless the record has one of its own.
+            # The amplitude that is sought is the first drive's, unless the record has one of its own. No other
+            # parameter changes a drive's force, which is proportional to its amplitude.
             is_of_amplitude = sensor.drive in (None, 1) and "amplitude" not in table.drive
             for column, p in enumerate(active):
-                if self._is(p, "offset"):
+                if self._is_of(p, "offset"):
                     # A later beginning of the drive shifts the whole motion to later times.
                     parameter = self.plan.parameters[p]
                     is_own = parameter.members == (number,)
@@ -255,12 +258,12 @@ class Misfit:
                 elif sensor.quantity != "force":
                     if p in column_of:
                         slopes[:, k, column] = motion[:, k, ROWS[sensor.quantity], column_of[p]]
-                elif self._is(p, "amplitude") and is_of_amplitude:
+                elif self._is_of(p, "amplitude") and is_of_amplitude:
                     parameter = self.plan.parameters[p]
                     slopes[:, k, column] = values[:, k] / parameter.from_coordinate(z[p]) * parameter.slope(z[p])
         return values, slopes
 
-    def _is(self, p: int, quantity: str) -> bool:
+    def _is_of(self, p: int, quantity: str) -> bool:
         """Whether coordinate ``p`` is that of a parameter of this ``quantity``."""
         return p < self.count and self.plan.parameters[p].quantity == quantity
 
@@ -312,14 +315,14 @@ class Misfit:
             parts += [(number, relevant[k : k + length]) for k in range(0, len(relevant), length)]
         columns = self.compute([partial(slopes_of, number, part) for number, part in parts])
 
-        place = {p: column for column, p in enumerate(active)}
+        column_of = {p: column for column, p in enumerate(active)}
         blocks = []
         for number in self._used(ends):
             samples = int((self.records[number].times <= ends[number]).sum())
             block = np.zeros((samples * len(self.watched[number]), len(active)))
             for (owner, part), values in zip(parts, columns, strict=True):
                 if owner == number:
-                    block[:, [place[p] for p in part]] = values
+                    block[:, [column_of[p] for p in part]] = values
             blocks.append(block)
         return np.concatenate(blocks)
 

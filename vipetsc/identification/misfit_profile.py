@@ -15,8 +15,8 @@ from vipetsc.identification.uncertainty import uncertainty_of
 
 # Distance in standard errors of the outermost values of a profile.
 REACH = 3.0
-# The cost, about the number of data, rises by about ten over the reach of a profile (by 9 where the problem is linear).
-# The relative tolerance of 1e-5 is one of 0.01 for a thousand data.
+# The cost is about the number of data, and rises by about ten over the reach of a profile: by REACH^2 = 9 where the
+# problem is linear. For a thousand data the relative tolerance of 1e-5 is an error of 0.01 in the cost.
 PRECISION = Precision(steps=30, cost=1e-5, derivatives=1e-5, is_rough=True)
 # A step to the next value that changes the contacts is halved, down to this fraction of the distance: four halvings.
 # Contacts that change within a smaller step are taken to change in the motion of the least misfit, too.
@@ -58,8 +58,7 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
     reach = np.where(uncertainty.determined, REACH * errors, np.inf)
     low = np.maximum(z - reach, windows.low)[sought]
     high = np.minimum(z + reach, windows.high)[sought]
-    # Of a linear problem the least misfit with one coordinate held at a distance of 1 moves coordinate j by
-    # cov_ij/cov_ii.
+    # In a linear problem the fit with coordinate i held at a distance of 1 has coordinate j moved by cov_ij/cov_ii.
     along = (uncertainty.correlation * errors / errors[:, None])[sought]
     along = np.where(uncertainty.determined[sought, None], along, 0.0)
     return MisfitProfile(np.linspace(low, high, count, axis=1), along)

@@ -24,8 +24,8 @@ from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
 
 # Errors are relative to the largest value so far, and to this fraction of the linear wave's size at least. Derivatives
-# by a clearance are zero up to an onset. After it their acceleration grows, by Hertz's law, as the root of the time:
-# relative to values near zero no step would resolve that.
+# by a clearance are zero up to an onset, after which their acceleration grows, by Hertz's law, as the root of the time.
+# Without the floor an error would be relative to values near zero, and no step would be short enough.
 FLOOR = 1e-2
 
 
@@ -54,8 +54,7 @@ class MotionCoefficients(NamedTuple):
         """The coefficients of a ``model``."""
         chain = model.chain
         # Trial cases differ in their contacts more often than in their cells: the matrices of equal cells are kept. A
-        # lattice whose cells differ is described by arrays, by which nothing can be looked up; its cells are never
-        # sought.
+        # lattice whose cells differ is described by arrays, which cannot be keys of a cache.
         matrices = _matrices(chain)
         if chain.variation is None:
             matrices = _matrices_of_equal_cells(chain.cell, chain.cells, chain.ends)
@@ -234,18 +233,18 @@ def respond(
     columns = 1 + len(slopes.linear)
     rows = 2 * len(coefficients.masses)
     tracker = ImpactTracker(sites, range(len(sites)))
-    state = create_motion(rows, columns, len(sites), model.scale, tolerances)
+    moving = create_motion(rows, columns, len(sites), model.scale, tolerances)
     instant = 0.0
     if begin is not None:
         instant = begin.time
-        state.state[:, 0] = begin.state
-        state.state[:, 1:] = begin.slopes
-        begin_contacts(lattice, state, tracker)
+        moving.state[:, 0] = begin.state
+        moving.state[:, 1:] = begin.slopes
+        begin_contacts(lattice, moving, tracker)
     # Times of every n-th sample are not contiguous, and for arrays of another layout the kernels would be compiled
     # once more.
     instants = np.ascontiguousarray(times)
     outcome, tracks, motion, reached = integrate(
-        lattice, state, tracker.tracks, fastest(coefficients), instant, instants, watched
+        lattice, moving, tracker.tracks, fastest(coefficients), instant, instants, watched
     )
     if outcome != DONE:
         raise MotionError("the steps of the integration became too small")

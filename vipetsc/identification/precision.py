@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 TOLERANCE = 1e-12  # relative change of cost or coordinates; a sum of a thousand squares is rounded at 1e-14
-# The tolerance of a rough motion over the smallest noise, which is relative to the size of its channel. Impacts amplify
-# an error some hundred times: it is then a hundredth of the noise.
+# The tolerance of a rough motion over the smallest noise, both relative to the size of a channel. Impacts amplify an
+# error some hundred times, so that it ends at a hundredth of the noise.
 OF_NOISE = 1e-4
 # Largest tolerance of a rough motion. 1e-7 costs a tenth less, and its errors reach 2e-6 over 39 impacts.
 ROUGHEST = 1e-8
