@@ -22,7 +22,7 @@ from vipetsc.paper.draw import draw_paper
 from vipetsc.paper.paper_figures import RELATED, TRANSFER, PaperFigure
 from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, fingerprint, read_json
 from vipetsc.paper.report import ReportContents, write_report
-from vipetsc.paper.steps import duration, make_steps, noted
+from vipetsc.paper.steps import make_steps, noted, rough_time
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 from vipetsc.wording import counted
@@ -180,9 +180,9 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
     for step in plan.steps:
         left = step.left(root) / ranks
         total += left
-        lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
+        lines.append(f"{step.name:<26}{step.state(root):<10}{rough_time(left):>9}  {' '.join(plan.claims_of(step))}")
     all_steps = f"all steps on {counted(ranks, 'rank')}"
-    lines += [f"{all_steps:<36}{duration(total):>9}", ""]
+    lines += [f"{all_steps:<36}{rough_time(total):>9}", ""]
 
     width = max([len("paper"), *(len(figure.label) for figure in plan.figures)]) + 2
     lines.append(f"{'figure':<8}{'paper':<{width}}{'pictures':<10}{'state':<9}claims      shows")

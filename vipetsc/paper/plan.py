@@ -42,7 +42,7 @@ FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
 SEED = 2024  # of the choice of members that the engine ts simulates too
-TS_COST = 2.5  # CPU time in s of one of these by ts
+TS_COST = 2.5  # CPU time in s of such a member by ts
 IN_PHASE = 10  # cost of the in-phase branch, which goes through all tongues, over that of the out-of-phase branch
 RELATION = "backbone.h5"  # the relation of a sweep to branches, in the folder of the sweep
 
@@ -148,10 +148,10 @@ class PaperStep:
             assert isinstance(case, DesignCase)
             yield PartMaker(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
 
-    def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
-        """Compute what is missing of a sweep or prediction on all ranks, all of it if ``afresh``.
+    def compute_together(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
+        """Compute what is missing of a step without parts, a sweep or a prediction, on all ranks.
 
-        A request to ``stop`` ends it early. Returns warnings about the results.
+        With ``afresh`` all of it is computed. A request to ``stop`` ends it early. Returns warnings about the results.
         """
         if isinstance(self.case, PredictCase):
             predict(self.case, self.folder(root), comm, force=afresh, stop=stop)
@@ -226,7 +226,7 @@ class PaperStep:
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def failures(self, root: Path) -> int:
-        """Number of members or branches of a step that failed; the step is DONE."""
+        """Number of members or branches that failed, of a step whose state is DONE."""
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
         if isinstance(self.case, Sweep):
@@ -394,6 +394,6 @@ def read_json(path: Path) -> Any:
 
 def fingerprint(*parts: str | bytes) -> str:
     """Hash of all ``parts`` together, in this order."""
-    # Digests have one length, so that no text can move from one part to the next unseen.
+    # Digests have one length: a text that moves from the end of one part to the beginning of the next changes the hash.
     digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
     return hashlib.sha256(" ".join(digests).encode()).hexdigest()

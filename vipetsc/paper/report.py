@@ -29,8 +29,8 @@ WIDTH = 1000  # pixels
 QUALITY = 50  # of WebP
 # A picture in the page: the hash of its file, and its data URI.
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
-# The verdicts as verbs for several claims: "12 hold".
-OF_SEVERAL = {HOLDS: "hold", IN_PART: "hold in part", FAILS: "do not hold", UNMEASURED: "not measured"}
+# The verdicts in the plural: "12 hold".
+PLURALS = {HOLDS: "hold", IN_PART: "hold in part", FAILS: "do not hold", UNMEASURED: "not measured"}
 VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 
 
@@ -81,7 +81,7 @@ def write_report(path: Path, contents: ReportContents) -> None:
         versions=contents.versions,
         rows=by_reading(contents.claims),
         readings=readings,
-        of_several=OF_SEVERAL,
+        plurals=PLURALS,
         counts={r: [(v, verdicts[r, v]) for v in VERDICTS if verdicts[r, v]] for r in readings},
         figure_of=figure_of,
         sweeps={name: row for name, row in statistics.items() if "members" in row},

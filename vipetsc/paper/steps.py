@@ -47,13 +47,13 @@ def make_steps(
     left = on_root(comm, lambda: plan.left(root))
     states = on_root(comm, lambda: {step.name: step.state(root) for step in plan.steps})
     stale = {name for name, state in states.items() if state == STALE}
-    # Of these the time that is on record, if any is, was spent on results that are gone.
+    # If a time is on record for one of these steps, it was spent on results that are gone.
     afresh = {name for name, state in states.items() if state in (STALE, MISSING)}
     missing = [step for step in plan.steps if step.name in left]
 
     def announce(*names: str) -> None:
         if comm.rank == 0:
-            tell(f"{', '.join(names)}: about {duration(sum(left[name] for name in names) / comm.size)}")
+            tell(f"{', '.join(names)}: about {rough_time(sum(left[name] for name in names) / comm.size)}")
 
     finished: list[str] = []
     parted = [step for step in missing if step.parts]
@@ -73,7 +73,7 @@ def make_steps(
         with noted(comm, step.name, notes):
             sys.audit("vipetsc.member", step.name)
             begin = time.process_time()
-            warnings = step.sweep(root, comm, stop, step.name in stale)
+            warnings = step.compute_together(root, comm, stop, step.name in stale)
             notes += [f"warning: {step.name}: {warning}" for warning in warnings]
             finished.append(step.name)
             _account(root, comm, {step.name: time.process_time() - begin}, afresh)
@@ -82,7 +82,10 @@ def make_steps(
 
 
 class PartJob(NamedTuple):
-    """A part of a step, by its number, that one rank computes; ``cost`` in s comes first: jobs are sorted by it."""
+    """The ``part`` with this number of a ``step``, which one rank computes at a ``cost`` in s of CPU time.
+
+    The cost comes first, because jobs are sorted by it.
+    """
 
     cost: float
     step: str
@@ -153,8 +156,11 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: Col
     on_root(comm, write)
 
 
-def duration(seconds: float) -> str:
-    """A time as text, in seconds or from two minutes on in minutes; a dash for none."""
+def rough_time(seconds: float) -> str:
+    """An estimated time as text, in whole seconds or from two minutes on in whole minutes; a dash if it is not above 0.
+
+    Further digits would claim an accuracy that an estimate does not have.
+    """
     if seconds <= 0:
         return "-"
     if seconds < 120:
