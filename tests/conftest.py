@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,8 @@ DIFFERING = {
 
 
 def with_sections(table: dict[str, Any], sections: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The ``table`` of a case with its sections updated by ``sections``; neither is changed."""
+    """The ``table`` of a case with its sections updated by ``sections``; a copy, which a test may change."""
+    table = deepcopy(table)
     return table | {name: table.get(name, {}) | values for name, values in sections.items()}
 
 
