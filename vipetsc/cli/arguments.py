@@ -35,5 +35,7 @@ QUIET = argument("--quiet", action="store_true", help="print only warnings and e
 VERBOSE = argument("--verbose", action="store_true", help="print every phase and all statistics")
 LOG = argument("--log", type=Path, metavar="FILE", help="append all messages to FILE, with the time")
 
-OF_STUDIES = SET, OUT, FORCE, RESUME  # of all verbs that compute results of a case, besides the case
-OF_EVERY_VERB = QUIET, VERBOSE, LOG
+# Arguments of all verbs that compute results of a case, after the case itself.
+STUDY_ARGUMENTS = SET, OUT, FORCE, RESUME
+# Arguments of every verb.
+COMMON_ARGUMENTS = QUIET, VERBOSE, LOG

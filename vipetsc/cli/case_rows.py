@@ -66,21 +66,21 @@ def describe_ends(case: Case) -> str:
         else:
             reflections.append(f"no wave reaches it at {omega:.6g} rad/s; it reflects {everything}")
 
-    which = "both ends absorbing"
+    ends = "both ends absorbing"
     if absorbing.end != "both":
-        which = f"{lattice.ends} ends, the {absorbing.end} one absorbing"
-    return f"{which} over {absorbing.cells} cells: {'; '.join(dict.fromkeys(reflections))}"
+        ends = f"{lattice.ends} ends, the {absorbing.end} one absorbing"
+    return f"{ends} over {absorbing.cells} cells: {'; '.join(dict.fromkeys(reflections))}"
 
 
 def describe_losses(case: Case) -> str:
     """The least, largest and mean loss of each band over its wavenumbers, as text; empty if no loss is prescribed.
 
-    The loss is twice the damping ratio; that which the case asks for stands behind.
+    The loss is twice the damping ratio. The loss that the case requests of a band, if it does, follows in brackets.
     """
     sentences = []
-    for band, (asked, least, mean, most) in enumerate(losses(case.lattice), 1):
+    for band, (requested, least, mean, most) in enumerate(losses(case.lattice), 1):
         sentence = f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}"
-        if np.isfinite(asked):
-            sentence += f" (requested {asked:.3g})"
+        if np.isfinite(requested):
+            sentence += f" (requested {requested:.3g})"
         sentences.append(sentence)
     return "; ".join(sentences)

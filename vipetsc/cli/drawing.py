@@ -79,9 +79,9 @@ def second_process(
     """A second process for ``pictures``, or None where it is of no use; as a context.
 
     It is of use for pictures that take long, those of a run that are not restricted to ``names``, and where this
-    process is the only rank of ``comm`` and a core is idle. If this process has no other work meanwhile it draws as
-    well, sooner than one that has yet to begin; else the second one ``draws_alone``, which has loaded its tools by the
-    time that the results are there.
+    process is the only rank of ``comm`` and a core is idle. ``draws_alone`` should be true if this process computes
+    first: the second one has then loaded matplotlib by the time that there are results. If this process has only
+    pictures to draw, both should draw, since the second one has yet to begin.
     """
     if pictures.unmeasured and not names and comm.size == 1 and SecondProcess.is_useful():
         return SecondProcess(draws_alone)
@@ -89,8 +89,8 @@ def second_process(
 
 
 def draw_unmeasured(pictures: Pictures, folder: Path, helper: Helper) -> None:
-    """Let the ``helper`` draw, of new results in ``folder``, the pictures that need no measures, which come next."""
-    # Pictures carry the warnings of the measures that are there: earlier ones are not those of these results.
+    """Ask the ``helper`` for the pictures of new results in ``folder`` that need no measures, while these are taken."""
+    # A picture carries the warnings of the measures in its folder, and those of earlier results would be wrong.
     if not (folder / MEASURES).exists():
         helper.ask(pictures.source, [folder], names=pictures.unmeasured)
 
@@ -134,9 +134,10 @@ def draw_pictures(
         with reading(pictures, folders):
             if helper:
                 here = [draw(**request.options, turns=request.turns, files=files) for request in helper.requests]
-                others = helper.drawn()
-                if others:
-                    return [*chain.from_iterable(here), *marked_as_new(others.files)]
+                by_helper = helper.drawn()
+                if by_helper:
+                    return [*chain.from_iterable(here), *marked_as_new(by_helper.files)]
+            # Without a helper, or if it has failed, all pictures are drawn here.
             turns = count(comm.rank, comm.size)
             return draw(pictures.source, folders, names, formats, newest=newest, files=files, turns=turns)
 

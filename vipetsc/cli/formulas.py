@@ -28,7 +28,7 @@ ACCENTS = {
     "tilde": "\N{COMBINING TILDE}",
 }
 # Commands that change the typeface of their argument, and commands that change sizes; both leave the text as it is.
-LOOKS = ("mathrm", "mathbf", "boldsymbol", "text", "operatorname", "mathcal", "mathit")
+TYPEFACES = ("mathrm", "mathbf", "boldsymbol", "text", "operatorname", "mathcal", "mathit")
 SIZES = ("left", "right", "big", "Big", "bigl", "bigr", "displaystyle")
 FRACTIONS = ("frac", "tfrac", "dfrac")
 RAISED = dict(zip("0123456789+−=()ijkmnptx*′ᵀ", "⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻⁼⁽⁾ⁱʲᵏᵐⁿᵖᵗˣ*′ᵀ", strict=True))
@@ -108,7 +108,7 @@ def _command(name: str, tokens: list[str]) -> str:
     if name == "text" and tokens[:1] == ["{"]:
         tokens.pop(0)
         return "".join(_group(tokens)).replace("\\", "")
-    if name in LOOKS:
+    if name in TYPEFACES:
         return _argument(tokens)
     if name in SIZES:
         return ""

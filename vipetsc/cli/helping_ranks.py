@@ -20,11 +20,11 @@ from vipetsc.parallel import SharedCounter, StopRequest, on_root
 T = TypeVar("T")
 MOST_REQUESTS = 2  # of rank 0: for pictures that need no measures, and for the others
 TAG = 1  # of all messages of this module
-LOOK_EVERY = 1e-3  # s between two looks for a message: MPI's own wait would keep a core busy
+LOOK_EVERY = 1e-3  # s between two looks for a message; MPI's own wait would keep a core busy
 
 
 class DrawMessage(NamedTuple):
-    """A call of ``vipetsc.figures.registry.draw`` with ``options``; all ranks share the turns of this ``number``."""
+    """A call of ``vipetsc.figures.registry.draw`` with ``options``, for the request with this ``number``, from 0."""
 
     number: int
     options: dict[str, Any]
@@ -37,8 +37,9 @@ class AnswerRequest:
 class HelpingRanks:
     """The other ranks of ``comm``, as rank 0 uses them.
 
-    ``requests`` are those for which ``drawn`` has not waited: rank 0 draws what is left of them when it has computed.
-    Each takes its turns from those of ``turns`` that no earlier one has.
+    ``turns`` are ``MOST_REQUESTS`` sequences of picture numbers (see ``vipetsc.figures.style.draw_each``), one for each
+    request, which all ranks share: each number goes to one rank. ``requests`` are those for which ``drawn`` has not
+    waited: rank 0 draws pictures that are left of them when it has computed.
     """
 
     draws_alone = False
@@ -123,7 +124,7 @@ def _help(comm: MPI.Comm, stop: StopRequest, turns: Sequence[Iterator[int]]) -> 
 
 
 def _drawn(options: dict[str, Any], turns: Iterator[int]) -> list[Path]:
-    """Draw the pictures of these ``turns``; ``options`` are those of ``vipetsc.figures.registry.draw``."""
+    """Draw the pictures with the numbers ``turns``; ``options`` are those of ``vipetsc.figures.registry.draw``."""
     from vipetsc.figures.registry import draw
 
     return draw(**options, turns=turns)

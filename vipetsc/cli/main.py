@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import CaseError, Problem
-from vipetsc.cli.arguments import OF_EVERY_VERB
+from vipetsc.cli.arguments import COMMON_ARGUMENTS
 from vipetsc.cli.messages import echo, reporting
 from vipetsc.cli.streams import report_unwritten
 from vipetsc.cli.verb import BAD_INPUT, STOPPED
@@ -119,7 +119,7 @@ def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None
 
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS.values():
-        of_verb = subparsers.add_parser(
+        verb_parser = subparsers.add_parser(
             verb.name,
             help=verb.text,
             description=verb.text,
@@ -127,12 +127,12 @@ def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         # The verb `completion` makes a parser of its own with this function, to describe it to a shell.
-        of_verb.set_defaults(parser=_parser)
+        verb_parser.set_defaults(parser=_parser)
         if called not in (None, verb.name):
             continue
 
-        for flag, keywords in (*verb.arguments, *OF_EVERY_VERB):
-            added = of_verb.add_argument(flag, **keywords)
+        for flag, keywords in (*verb.arguments, *COMMON_ARGUMENTS):
+            added = verb_parser.add_argument(flag, **keywords)
             if complete and flag in complete:
                 added.complete = complete[flag]  # type: ignore[attr-defined]
     return parser

@@ -27,8 +27,11 @@ from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
-# 2 is what argparse exits with; EX_TEMPFAIL asks a batch script to queue the job again.
-DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
+# Exit codes.
+DONE = 0
+FAILED = 1
+BAD_INPUT = 2  # as argparse exits for wrong arguments
+STOPPED = os.EX_TEMPFAIL  # asks a batch script to queue the job again
 
 Rows = list[tuple[str, str]]
 Function = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
@@ -72,10 +75,10 @@ class PlainVerb(Verb):
 
 @dataclass
 class Work:
-    """Arguments of a study besides its case: the parsed ``options``, the ``folder`` of its results, ranks, stop.
+    """Arguments of a study besides its case: the parsed ``options``, the ``folder`` of its results, the ranks ``comm``.
 
-    A ``helper``, if there is one, can draw pictures while the study computes. ``warned`` are the warnings that were
-    printed.
+    ``stop`` is a request to stop, which the study looks at. A ``helper``, if there is one, can draw pictures while the
+    study computes. ``warned`` are the warnings that were printed.
     """
 
     options: argparse.Namespace
@@ -145,7 +148,7 @@ class StudyVerb(Verb):
 
         folder = options.out or Path("runs") / path_named(f"{case.name}{self.suffix}")
         work = Work(options, folder, comm, stop)
-        # Found on rank 0 alone, since warnings compute the bands of the cell.
+        # Computed on rank 0 alone: warnings need the bands of the cell, which take a moment.
         work.warn(on_root(comm, case.warnings))
 
         # Where no pictures are drawn, the other ranks could not help one that computes alone.

@@ -14,7 +14,7 @@ from vipetsc.case import NnmCase
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.cli.arguments import CASE, OF_STUDIES, case_with
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, case_with
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.messages import echo_warnings
@@ -283,7 +283,7 @@ NNM = StudyVerb(
     name="nnm",
     text="compute nonlinear normal modes as frequency-energy branches",
     example="nnm runs/examples/nnm-hertz.toml --quiet --log nnm.log",
-    arguments=(case_with("nnm"), *OF_STUDIES),
+    arguments=(case_with("nnm"), *STUDY_ARGUMENTS),
     case=NnmCase,
     study=follow_modes,
     table=nnm_rows,
@@ -295,7 +295,7 @@ NFRC = StudyVerb(
     name="nfrc",
     text="compute steady states under a wave or a force, and their stability",
     example="nfrc runs/examples/nfrc.toml",
-    arguments=(CASE, *OF_STUDIES),
+    arguments=(CASE, *STUDY_ARGUMENTS),
     case=NfrcCase,
     study=follow_responses,
     table=nfrc_rows,

@@ -1,7 +1,7 @@
 """The verb ``design``: repeat the paper's (lambda, eta) search for the four-band cell."""
 
 from vipetsc.case import DesignCase
-from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import SEARCH
@@ -26,7 +26,7 @@ VERB = StudyVerb(
     name="design",
     text="repeat the paper's (lambda, eta) search for the four-band cell",
     example="design runs/examples/design.toml --set design.lambda.count=10",
-    arguments=(CASE, *OF_STUDIES),
+    arguments=(CASE, *STUDY_ARGUMENTS),
     case=DesignCase,
     study=search_cells,
     table=design_rows,

@@ -1,7 +1,7 @@
 """The verb ``identify``: parameters of a case from measured records, with their uncertainty."""
 
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -33,7 +33,7 @@ VERB = StudyVerb(
     name="identify",
     text="find parameters from measured records",
     example="identify runs/examples/identify.toml",
-    arguments=(case_with("identify"), *OF_STUDIES),
+    arguments=(case_with("identify"), *STUDY_ARGUMENTS),
     case=IdentifyCase,
     study=identify_parameters,
     table=identify_rows,

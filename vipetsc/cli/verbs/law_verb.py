@@ -1,14 +1,14 @@
 """The verb ``law``: the scattering law of one site."""
 
 from vipetsc.case import LawCase
-from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import LAW
 
 
-def take_law(case: LawCase, work: Work) -> Outcome:
+def compute_law(case: LawCase, work: Work) -> Outcome:
     """Compute the scattering law, refined to the tolerance of the case."""
     from vipetsc.studies.one_site import make_law
 
@@ -28,9 +28,9 @@ VERB = StudyVerb(
     name="law",
     text="compute the scattering law of one site with adaptive refinement",
     example="law runs/examples/law.toml --set law.tolerance=0.02",
-    arguments=(CASE, *OF_STUDIES),
+    arguments=(CASE, *STUDY_ARGUMENTS),
     case=LawCase,
-    study=take_law,
+    study=compute_law,
     table=law_rows,
     results=LAW,
     pictures=Pictures(source="law", file="law.h5", noun=LAW.noun),

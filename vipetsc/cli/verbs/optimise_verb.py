@@ -1,7 +1,7 @@
 """The verb ``optimise``: the best clearances, sites, restitution or cell for an objective."""
 
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -38,7 +38,7 @@ VERB = StudyVerb(
     name="optimise",
     text="search for the best design for an objective",
     example="optimise runs/examples/optimise-clearances.toml --set optimise.budget=40",
-    arguments=(case_with("optimise"), *OF_STUDIES),
+    arguments=(case_with("optimise"), *STUDY_ARGUMENTS),
     case=OptimiseCase,
     study=search_designs,
     table=optimise_rows,

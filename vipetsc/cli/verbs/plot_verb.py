@@ -24,7 +24,7 @@ MOVIE_FORMATS = "gif", "mp4"
 
 
 def positive(text: str) -> float:
-    """The number in ``text``; raises ArgumentTypeError if it is not positive and finite, ValueError if it is none."""
+    """The positive number in ``text``; raises ArgumentTypeError for one that is not positive, ValueError for none."""
     value = float(text)
     if not 0 < value < float("inf"):
         # argparse prints the text of this exception; in place of that of a ValueError it prints its own.
@@ -41,7 +41,7 @@ def window(text: str) -> tuple[int, int]:
 
 
 # Arguments of movies, by the field of `figures.movie_frames.Shot` that each of them sets.
-OF_MOVIES: dict[str, Argument] = {
+MOVIE_ARGUMENTS: dict[str, Argument] = {
     "speed": argument(
         "--speed",
         type=positive,
@@ -65,20 +65,22 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     # A folder can be plotted while another command works in it, and is therefore not locked.
     on_root(comm, lambda: remove_abandoned(folders[0] / "figures"))
     formats = set(options.format or ())
-    of_movie = {name: getattr(options, name) for name in OF_MOVIES if getattr(options, name) is not None}
+    movie_options = {name: getattr(options, name) for name in MOVIE_ARGUMENTS if getattr(options, name) is not None}
 
     if options.movie:
-        wrong = formats - {*MOVIE_FORMATS} or (options.fig and {"--fig"})
-        if wrong:
-            raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {min(wrong)}")
+        unsuitable = sorted(formats - {*MOVIE_FORMATS})
+        if options.fig:
+            unsuitable.append("--fig")
+        if unsuitable:
+            raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {unsuitable[0]}")
         # On rank 0 alone: all frames go into one file, in their order.
-        paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, of_movie, formats))
+        paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, movie_options, formats))
         echo_paths(comm, paths)
         if missing:
             echo(comm, f"vipetsc: {missing}", sys.stderr)
         return DONE
 
-    misplaced = [OF_MOVIES[name].flag for name in of_movie]
+    misplaced = [MOVIE_ARGUMENTS[name].flag for name in movie_options]
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
         raise FolderError(f"{misplaced[0]}: applies only to movies; add --movie")
@@ -197,7 +199,7 @@ VERB = PlainVerb(
             const="energy",
             help="make a movie of a run: energy of the bands by cell, or velocity of the host masses",
         ),
-        *OF_MOVIES.values(),
+        *MOVIE_ARGUMENTS.values(),
     ),
     function=plot,
 )

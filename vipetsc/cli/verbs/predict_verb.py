@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.predict import PredictCase
-from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -83,7 +83,7 @@ VERB = StudyVerb(
     name="predict",
     text="predict several sites from the response of one, and compare with simulations",
     example="predict runs/examples/predict.toml",
-    arguments=(CASE, *OF_STUDIES),
+    arguments=(CASE, *STUDY_ARGUMENTS),
     case=PredictCase,
     study=compose_sites,
     table=predict_rows,

@@ -11,7 +11,7 @@ import numpy as np
 
 from vipetsc.case import Case, Sweep
 from vipetsc.case.waveforms import DEFAULT
-from vipetsc.cli.arguments import CASE, OF_STUDIES, argument
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures, draw_unmeasured
 from vipetsc.cli.messages import logger
@@ -24,6 +24,7 @@ from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
+    from vipetsc.studies.linear_history import MemberHistory
 
 MEMBER = argument(
     "--member",
@@ -33,7 +34,7 @@ MEMBER = argument(
 
 
 def load(options: argparse.Namespace) -> Case:
-    """The case of the file, or that of a member of the sweep whose file or folder is given; raises CaseError."""
+    """The case of the file, or of one member if ``--member`` names it and CASE is a sweep; raises CaseError."""
     if options.member is None:
         return Case.load(options.case, options.set)
 
@@ -52,13 +53,11 @@ def _sweep_of(options: argparse.Namespace) -> Sweep:
 
 
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
-    """Simulate the case, and measure its fields if they are stored."""
+    """Simulate the case, and measure its fields and the motion of its named points, as far as they are stored."""
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
-    from vipetsc.studies.analysis_options import is_measured
     from vipetsc.studies.linear_history import MemberHistory
-    from vipetsc.studies.reanalysis import measure_run
 
     # As in its sweep, a member begins from its linear run, and so has the same bits.
     linear = None
@@ -78,25 +77,39 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     # Measures need a second sample: a run that fails in its first has none.
     has_two_samples = result.statistics["samples"] > 1
     has_fields = bool(case.output.fields) and has_two_samples
+    has_points = bool(case.output.points) and has_two_samples
     if has_fields and work.helper:
         draw_unmeasured(PICTURES, work.folder, work.helper)
-    if has_fields or (case.output.points and has_two_samples):
-        if not on_root(work.comm, lambda: is_measured(work.folder)):
-            if linear:
-                # As in its sweep, the member is measured from the arrival of the wave of its linear run, which the
-                # folder of the sweep has on record.
-                sweep = Path(work.options.case)
-                if sweep.is_file():
-                    sweep = sweep.parent
-                measure_run(work.folder, sweep, comm=work.comm, find_arrival=linear.arrival)
-            else:
-                measure_run(work.folder, comm=work.comm)
+    if has_fields or has_points:
+        measure_unless_measured(work, linear)
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
         measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
         work.warn(unsettled)
         if measured:
             work.report(measured)
     return Outcome(complete=result.complete, drawable=has_fields)
+
+
+def measure_unless_measured(work: Work, linear: "MemberHistory | None") -> None:
+    """Measure the run in the folder of ``work`` if its measures are missing or older than the run; collective.
+
+    ``linear`` is the linear run of a member of a sweep, None for a run that is no member.
+    """
+    from vipetsc.studies.analysis_options import is_measured
+    from vipetsc.studies.reanalysis import measure_run
+
+    if on_root(work.comm, lambda: is_measured(work.folder)):
+        return
+    if linear is None:
+        measure_run(work.folder, comm=work.comm)
+        return
+
+    # As in its sweep, the member is measured from the arrival of the wave of its linear run, which the folder of the
+    # sweep has on record.
+    sweep = Path(work.options.case)
+    if sweep.is_file():
+        sweep = sweep.parent
+    measure_run(work.folder, sweep, comm=work.comm, find_arrival=linear.arrival)
 
 
 def one_rank_suffices(case: Case, ranks: int) -> bool:
@@ -304,7 +317,7 @@ VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",
     example="run runs/examples/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
-    arguments=(CASE, MEMBER, *OF_STUDIES),
+    arguments=(CASE, MEMBER, *STUDY_ARGUMENTS),
     case=Case,
     load=load,
     study=simulate_and_measure,

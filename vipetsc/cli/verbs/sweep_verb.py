@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vipetsc.case import Sweep
-from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -92,7 +92,7 @@ VERB = StudyVerb(
     name="sweep",
     text="simulate every combination of the values in [sweep]",
     example="sweep runs/examples/interband-amplitudes.toml --set sweep.ranks=1",
-    arguments=(case_with("sweep"), *OF_STUDIES),
+    arguments=(case_with("sweep"), *STUDY_ARGUMENTS),
     case=Sweep,
     study=simulate_members,
     table=sweep_rows,
