@@ -219,6 +219,21 @@ def test_a_run_that_ends_within_its_burst_or_ramp():
     assert endless(0.06) == ["time.end = 0.06 s is before the end of the drive's ramp, at 0.0628319 s"]
 
 
+def test_a_run_that_ends_within_the_drive_of_cells_that_contacts_alone_join():
+    """Grains without waves have the warning too; a run that ends with its pulse has none, and a pulse is no burst."""
+
+    def of_grains(end: float) -> list[str]:
+        return Case(
+            lattice={"cell": {"masses": [1.0]}, "cells": 8},
+            contacts={"stiffness": 1e6, "sites": [1, 2, 3], "clearance": 1e-5, "pair": [1, 1], "next_cell": True},
+            drive={"waveform": "impulse", "amplitude": 1.0, "duration": 0.01},
+            time={"end": end, "sample_interval": 1e-4},
+        ).warnings()
+
+    assert [text for text in of_grains(0.01) if "before" in text] == []
+    assert "time.end = 0.004 s is before the end of the drive, at 0.01 s" in of_grains(0.004)
+
+
 def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
     """A run has a warning if the burst reaches the site on a ring a second time.
 

@@ -11,7 +11,7 @@ import numpy as np
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
 from vipetsc.case.schema import LatticeTable, OutputTable
-from vipetsc.lattice import Chain, bloch, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 from vipetsc.lattice.drive import main_frequency, spectrum
 
@@ -138,13 +138,9 @@ def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) 
 
 def length_warnings(model: Model) -> Iterator[str]:
     """Warnings of waves that are long for the lattice, and of a run that ends before its drive."""
-    cell = model.chain.cell
     drive = model.drive
     cells = model.chain.cells
-    if model.is_driven and not cell.joins_cells:
-        return
-
-    waves = waves_at(cell, drive.frequency)
+    waves = waves_at(model.chain.cell, drive.frequency)
     if model.is_driven and waves:
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
         wavelength = 2 * pi / max(kappa, 1e-300)
@@ -154,11 +150,13 @@ def length_warnings(model: Model) -> Iterator[str]:
                 f" cells, and resolve wavenumbers to {2 * pi / cells:.3g} rad/cell;"
                 f" {WAVELENGTHS * wavelength:.0f} cells or more resolve the wave"
             )
-    if model.end <= drive.settled:
+    if model.end < drive.settled:
         # A drive that goes on has no end but that of its ramp.
         part = "drive's ramp"
-        if np.isfinite(drive.duration):
+        if isinstance(drive, ToneBurst):
             part = "burst"
+        elif np.isfinite(drive.duration):
+            part = "drive"
         yield f"time.end = {model.end:.6g} s is before the end of the {part}, at {drive.settled:.6g} s"
 
 
