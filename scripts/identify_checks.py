@@ -88,7 +88,7 @@ def exact(folder: Path) -> None:
     ]
     work = work_of(identify_table(table, computed_record(table, folder), unknowns=unknowns))
     record = work.fit(0)
-    windows, z = work.placed(record)
+    windows, z = work.solution(record)
     truth = [*CLEARANCES, STIFFNESS, 0.7]
     print(f"{len(record['windows'])} windows, {record['windows'][-1]['impacts']} impacts in the last")
     for parameter, value, true in zip(work.plan.parameters, windows.misfit.values(z), truth, strict=True):
@@ -207,7 +207,7 @@ def length(folder: Path, seeds: int) -> None:
             record = computed_record(timed, folder, noise=0.02, seed=seed) | {"begin": 1.0}
             work = work_of(identify_table(timed, record, unknowns=unknowns))
             fit = work.fit(0)
-            windows, z = work.placed(fit)
+            windows, z = work.solution(fit)
             found.append(windows.misfit.values(z) / truth - 1)
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(2)))
         stated = uncertainty.errors * [p.slope(x) for p, x in zip(work.plan.parameters, z, strict=True)] / truth

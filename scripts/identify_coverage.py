@@ -51,7 +51,7 @@ def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
     for seed in range(seeds):
         plan = IdentifyCase.from_table(identify_table(table, measured_table(folder, table, noise=noise, seed=seed)))
         work = Identification(plan, read_records(plan), StopRequest())
-        windows, z = work.placed(work.fit(0))
+        windows, z = work.solution(work.fit(0))
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
         # Intervals are symmetric in the coordinates of the fit, which are logarithms of positive quantities.
         expected = [p.to_coordinate(value) for p, value in zip(plan.parameters, truth, strict=True)]

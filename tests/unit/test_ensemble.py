@@ -94,6 +94,13 @@ def test_a_sample_is_compared_member_by_member(folder, tmp_path):
             assert row["largest"] == pytest.approx(5e-4 if row["agrees"] else 2e-3)
 
 
+def test_a_sample_needs_amplitudes_to_be_drawn_from():
+    """A sweep in which the amplitude does not vary is refused with its name, instead of a bare StopIteration."""
+    table = {"name": "lengths", "lattice": {"preset": "four-band"}, "sweep": {"lattice": {"cells": [60, 80]}}}
+    with pytest.raises(ValueError, match=r"lengths: drive\.amplitude does not vary"):
+        sampled(Sweep.from_table(table), 2, 1)
+
+
 @pytest.mark.slow
 def test_every_member_stands_at_the_values_of_its_keys(folder):
     """Every member has its place by the values of its keys, zipped ones too; a failed member has NaN and a status."""

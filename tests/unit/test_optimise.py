@@ -356,7 +356,7 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
     for _ in range(2):
         # All three errors become an OSError, which ends the study.
         with pytest.raises(OSError, match=r"Unable|full|0 problem"):
-            recorded().make(["stalls", "short"], work, failures=True)
+            recorded().make(["stalls", "short"], work, allow_failures=True)
 
         records = recorded().records
         assert [*records] == ["stalls"]

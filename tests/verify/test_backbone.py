@@ -14,7 +14,7 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import RecordFile
 from vipetsc.studies import backbone
-from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
+from vipetsc.studies.backbone import BRANCH, LAYOUT, LEAST_FITTED, align, initiation_of, read_slope, relate_folders
 from vipetsc.studies.linear_run import LinearRun, linear_name
 
 GRAZING = 0.03
@@ -170,7 +170,7 @@ def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
     transfer = np.array([1e-4, 0.3, 0.1])
 
     found = align(work, transfer, INITIATION, 1e-4, slope)
-    assert found["fitted"].values.sum() < FEWEST
+    assert found["fitted"].values.sum() < LEAST_FITTED
     assert not found.attrs
 
     short = slope.isel(point=slope["branch/energy"].values < 1.5 * GRAZING)

@@ -18,7 +18,7 @@ from vipetsc.identification.uncertainty import errors_with_sensor, quantile, unc
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.identification import Identification, read_records, run_identification
+from vipetsc.studies.identification import Identification, read_measured_records, run_identification
 
 UNKNOWNS = [
     {"quantity": "clearance", "of": [[1], [2, 3]], "bounds": [1e-4, 2e-3], "start": 4e-4},
@@ -41,7 +41,7 @@ FROM_THE_TRUTH = [
 def fits_of(table) -> Identification:
     """The identification that ``table`` asks for, with its records read."""
     plan = IdentifyCase.from_table(table)
-    return Identification(plan, read_records(plan), StopRequest())
+    return Identification(plan, read_measured_records(plan), StopRequest())
 
 
 def results_of(folder, table):
@@ -287,7 +287,7 @@ def test_intervals_hold_the_truth(tmp_path):
         # The errors of a fit do not depend on its start: one fit from a distant start, through windows, is enough.
         options = {} if seed == 1 else {"unknowns": FROM_THE_TRUTH, "impacts": 1000}
         work = fits_of(identify_table(table, record, **options))
-        windows, z = work.placed(work.fit(0))
+        windows, z = work.solution(work.fit(0))
         known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
         expected = [p.to_coordinate(v) for p, v in zip(work.plan.parameters, truth, strict=True)]
         deviations.append((z - expected) / known.errors)

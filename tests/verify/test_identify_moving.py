@@ -13,7 +13,7 @@ from tests.independent_lattice import ScipyLattice, Stop, chain_matrices
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.misfit import Misfit
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.studies.identification import read_records, run_identification
+from vipetsc.studies.identification import read_measured_records, run_identification
 
 pytestmark = pytest.mark.slow
 
@@ -212,7 +212,7 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
         {"quantity": "mass", "of": [[2, 3]], "bounds": [1e-4, 1.0]},
     ]
     plan = IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns))
-    misfit = Misfit(plan, read_records(plan))
+    misfit = Misfit(plan, read_measured_records(plan))
     state = misfit.states[0]
     generator = np.random.default_rng(5)
     z = np.array([p.to_coordinate(p.start) for p in plan.parameters])

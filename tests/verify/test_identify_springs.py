@@ -15,7 +15,7 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionCoefficients, MotionError, no_slopes, respond, stacked_slopes
 from vipetsc.identification.motion_begin import MotionBegin
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.studies.identification import read_records, run_identification
+from vipetsc.studies.identification import read_measured_records, run_identification
 
 COUNT = 3
 STRIKE = 0.8  # m/s of the second mass
@@ -103,7 +103,7 @@ def test_derivatives_are_differences_of_scipy(record):
     table = table_of(record, unknowns)
     table["identify"]["records"][0]["offset"] = [-1e-3, 1e-3]
     plan = IdentifyCase.from_table(table)
-    misfit = Misfit(plan, read_records(plan))
+    misfit = Misfit(plan, read_measured_records(plan))
     z = np.array([p.to_coordinate(p.start) for p in plan.parameters])
     values, slopes = misfit.predicted(z, 0, 1.0, range(len(z)))
     exact = measured(motion_of(TRUTH))
@@ -130,7 +130,7 @@ def test_derivatives_are_differences_of_scipy(record):
 def test_a_motion_that_fails_is_worse_than_a_wrong_one(record, monkeypatch):
     """Also where the noise that is given is a billionth of the data: the wrong motion has residuals of 1e9 then."""
     plan = IdentifyCase.from_table(table_of(record, [{"quantity": "spring", "bounds": [1e4, 1e5]}], spring=6e4))
-    misfit = Misfit(plan, read_records(plan))
+    misfit = Misfit(plan, read_measured_records(plan))
     misfit.noise = [1e-9 * size for size in misfit.noise]
     z = np.array([plan.parameters[0].to_coordinate(plan.parameters[0].start)])
     wrong = misfit.residuals(z, [1.0])
@@ -152,7 +152,7 @@ def test_derivatives_by_an_unknown_state_are_differences_of_scipy(record):
     table = table_of(record, unknowns)
     table["identify"]["records"][0] |= {"initial": "estimate", "begin": 1e-3}
     plan = IdentifyCase.from_table(table)
-    records = read_records(plan)
+    records = read_measured_records(plan)
     misfit = Misfit(plan, records)
     begin = motion_of(TRUTH)[:2, 2].ravel()
     matrix = misfit.states[0].matrix

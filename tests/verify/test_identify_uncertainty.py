@@ -13,7 +13,7 @@ from vipetsc.identification.uncertainty import marginal_jacobian, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
 from vipetsc.studies import identified as identified_module
-from vipetsc.studies.identification import Identification, read_records, run_identification
+from vipetsc.studies.identification import Identification, read_measured_records, run_identification
 
 UNKNOWNS = [
     {"quantity": "clearance", "of": [[1], [2]], "bounds": [1e-4, 2e-3]},
@@ -86,7 +86,7 @@ def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
     SciPy's ``least_squares`` fits the other parameters, with differences for derivatives.
     """
     plan, z, results = identified
-    misfit = Identification(plan, read_records(plan), StopRequest()).windows().misfit
+    misfit = Identification(plan, read_measured_records(plan), StopRequest()).windows().misfit
     ends = [float(misfit.records[0].times[-1])]
     misfit.noise = [np.full(3, 0.02)]
     least = float(np.sum(misfit.residuals(z, ends) ** 2))
@@ -108,7 +108,7 @@ def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
 def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
     """Errors with a further sensor, computed from every third sample to save memory, are about those from all."""
     plan, z, results = identified
-    windows = Identification(plan, read_records(plan), StopRequest()).windows()
+    windows = Identification(plan, read_measured_records(plan), StopRequest()).windows()
     known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(3)))
     samples = len(windows.misfit.records[0].times)
     monkeypatch.setattr(identified_module, "MOST_NUMBERS", samples * 24 * 3 * 4 // 3 + 1)

@@ -28,6 +28,16 @@ Side = Literal["below", "above"]
 SIDES: tuple[Side, ...] = ("below", "above")
 
 
+class ProfileCosts(NamedTuple):
+    """The least ``costs`` (parameter, place) with each parameter held at the coordinates ``places`` (parameter, place).
+
+    Costs are NaN on a side of the fit on which they could not be computed.
+    """
+
+    places: np.ndarray
+    costs: np.ndarray
+
+
 class MisfitProfile(NamedTuple):
     """Coordinates ``places`` (parameter, place) at which each parameter is held.
 

@@ -1,9 +1,9 @@
-"""The measures of one run: reads ``run.h5``, writes ``analysis.h5``.
+"""The measures of one run: the content of ``analysis.h5`` from that of ``run.h5``.
 
-Kinetic energy in space and time, wavenumber content, dispersion (of the whole record, and of the cells before and
-after the first site), wavenumber partition and entropy (wavelets over the cells), energies of the pass bands and
-gaps, the inter-band targeted energy transfer, and the energies of the linear modes. The measures themselves are in
-``vipetsc.spectra``.
+They are the kinetic energy in space and time, the wavenumber content, the dispersion (of all cells, and of those before
+and after the first site), the wavenumber partition and entropy (by wavelets over the cells), the energies of the pass
+bands and gaps, the inter-band targeted energy transfer, and the energies of the linear modes. ``vipetsc.spectra`` has
+the formulas; ``studies.reanalysis`` writes the file.
 """
 
 import json
@@ -40,12 +40,11 @@ FORMAT_VERSION = 3
 SNAPSHOTS = 500
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: a window of cells is needed
 
-# Measures of a run whose fields are stored; "maps" are the space-time maps of the other measures.
-# "motion" are the measures of named points and the largest force, "statistics" those of the run's ledger and log.
-FULL = (
-    *("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps"),
-    *("motion", "statistics"),
-)
+# Measures of a run's fields; "maps" are the space-time maps of the others.
+OF_FIELDS = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps")
+# Measures of a run whose fields are stored: "motion" are those of named points and the largest force, "statistics"
+# those of the run's ledger and log.
+FULL = (*OF_FIELDS, "motion", "statistics")
 # Measures of a sweep's member whose fields are stored, by the sweep's ``measures``, as its pictures need them.
 WHOLE = {
     "entropy": ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "maps"),
@@ -136,6 +135,7 @@ def analyse(
     record.warnings += numbers.warnings
     about["left_out"] = "; ".join(record.left_out + record.warnings)
     about["warnings"] = json.dumps(record.warnings)
+    # Attributes of the file itself stand under the name "", since they belong to no variable.
     about |= record.attributes.pop("", {})
 
     # Axes are written only where some variable needs them.
@@ -159,7 +159,11 @@ def _dataset(
 
 
 class Numbers(NamedTuple):
-    """Measures of the registry: rows of a layout, values and attributes by name; warnings about them."""
+    """Measures of ``spectra.measures`` that are single numbers of a run, or one number for each part of the bands.
+
+    ``layout``, ``values`` and ``attributes`` have the rows of the layout, the values and the attributes of the
+    variables by name; ``warnings`` are sentences about them.
+    """
 
     layout: dict[str, tuple[str, str, str]]
     values: dict[str, Any]
@@ -168,7 +172,7 @@ class Numbers(NamedTuple):
 
 
 def _numbers(run: xr.Dataset, case: Case, options: AnalysisTable, measures: Collection[str]) -> Numbers:
-    """The numbers of a ``run`` by those ``measures`` that are in the registry."""
+    """The numbers of a ``run`` by those ``measures`` that ``spectra.measures`` has."""
     record = record_of(run, case, options)
     taken = take(record, measures)
     layout: dict[str, tuple[str, str, str]] = {}
@@ -208,37 +212,49 @@ def _measure(
     measures = set(measures)
     samples, cells = record.velocity.shape[:2]
 
-    def maps(part: VelocityRecord) -> dict[str, Any]:
-        return _maps(part, measures) if {"kinetic", "wavenumber"} & measures else {}
+    # Each kind enters its attributes and what it leaves out into a blank copy of the record: ranks take different
+    # kinds.
+    def maps(blank: VelocityRecord) -> dict[str, Any]:
+        if {"kinetic", "wavenumber"} & measures:
+            return _maps(blank, measures)
+        return {}
 
-    def dispersions(part: VelocityRecord) -> dict[str, Any]:
+    def dispersions(blank: VelocityRecord) -> dict[str, Any]:
         if samples < 2:
-            part.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
+            blank.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
             return {}
-        return dispersions_by_side(part) if "dispersion" in measures else {}
+        if "dispersion" in measures:
+            return dispersions_by_side(blank)
+        return {}
 
-    def bands(part: VelocityRecord) -> dict[str, Any]:
-        return band_energies(part, measures) if samples > 1 and "bands" in measures else {}
+    def bands(blank: VelocityRecord) -> dict[str, Any]:
+        if samples > 1 and "bands" in measures:
+            return band_energies(blank, measures)
+        return {}
 
-    def wavelets(part: VelocityRecord) -> dict[str, Any]:
-        return by_wavelets(part, measures) if samples > 1 and cells > 1 else {}
+    def wavelets(blank: VelocityRecord) -> dict[str, Any]:
+        if samples > 1 and cells > 1:
+            return by_wavelets(blank, measures)
+        return {}
 
-    def modes(part: VelocityRecord) -> dict[str, Any]:
+    def modes(blank: VelocityRecord) -> dict[str, Any]:
+        values: dict[str, Any] = {}
         # The energies of the modes at an instant need no second sample.
-        values = modal_energies(run, part, measures) if {"modal", "transfers"} & measures else {}
+        if {"modal", "transfers"} & measures:
+            values = modal_energies(run, blank, measures)
         if cells == 1:
-            part.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+            blank.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
         return values
 
     def measured(kind: Callable[[VelocityRecord], dict[str, Any]]) -> MeasuredKind:
-        part = record.blank()
-        return MeasuredKind(kind(part), part.attributes, part.left_out)
+        blank = record.blank()
+        return MeasuredKind(kind(blank), blank.attributes, blank.left_out)
 
     values: dict[str, Any] = {}
-    for part in divided(comm, [partial(measured, kind) for kind in (maps, dispersions, bands, wavelets, modes)]):
-        values |= part.values
-        record.attributes |= part.attributes
-        record.left_out += part.left_out
+    for of_kind in divided(comm, [partial(measured, kind) for kind in (maps, dispersions, bands, wavelets, modes)]):
+        values |= of_kind.values
+        record.attributes |= of_kind.attributes
+        record.left_out += of_kind.left_out
     return values
 
 
@@ -347,6 +363,7 @@ def _estimated_arrival(record: VelocityRecord) -> float:
     distance = 0
     if record.site is not None:
         distance = int(cells_between(record.site - 1, record.model.drive_cell, chain.cells, chain.ends))
+    # Cells that contacts alone join have no waves, and the speed 0: no travel time is known, and none is added.
     return float(0.5 * record.model.drive.duration + distance / (record.model.speed or np.inf))
 
 

@@ -32,7 +32,7 @@ from vipetsc.studies.linear_run import factor, first_site_cell, is_proportional,
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
 VIBRO_IMPACT = 3  # number of the region III
-FEWEST = 3  # points of a fit; which fits are called power laws `vipetsc.spectra.doubt` decides
+LEAST_FITTED = 3  # points of a fit; which fits are called power laws `vipetsc.spectra.doubt` decides
 
 # Dimensions, units and description of what the group of a curve holds.
 LAYOUT = {
@@ -145,27 +145,31 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     order = np.argsort(work[valid], kind="stable")
     energy = work[valid][order] * (branch.attrs["grazing"] / initiation)
     ibtet = ibtet[valid][order]
-    slope = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
+    log_slopes = log_slope(
+        energy,
+        branch_energy=branch["branch/energy"].values,
+        slope=branch["branch/slope"].values,
+        region=branch["branch/region"].values,
+    )
     # Before its peak the transfer still grows as contacts set in.
-    fitted = np.isfinite(slope) & (np.arange(len(energy)) >= np.argmax(ibtet))
+    fitted = np.isfinite(log_slopes) & (np.arange(len(energy)) >= np.argmax(ibtet))
     values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
     aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="override")
-    if fitted.sum() < FEWEST:
+    if fitted.sum() < LEAST_FITTED:
         return aligned
 
     log_transfer = np.log(ibtet[fitted])
-    slope = slope[fitted]
+    log_slopes = log_slopes[fitted]
 
     def misfit(log_divisor: float) -> float:
-        return float(np.sum((np.log(np.exp(slope - log_divisor) + floor) - log_transfer) ** 2))
+        return float(np.sum((np.log(np.exp(log_slopes - log_divisor) + floor) - log_transfer) ** 2))
 
-    # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor. The bracket
-    # grows from its first step, 0.5.
-    start = float(np.mean(slope - log_transfer))
-    # In ln s, over which the misfit has one minimum, and in which a bracket has no sign to respect.
+    # The search is one for ln s, so that no divisor is negative. Without a floor ln s is the mean of the differences;
+    # the floor only makes it larger. From there and its first step of 0.5 the bracket grows as far as it must.
+    start = float(np.mean(log_slopes - log_transfer))
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
     law = power_law(energy[fitted], ibtet[fitted])
-    slope_law = power_law(energy[fitted], np.exp(slope))
+    slope_law = power_law(energy[fitted], np.exp(log_slopes))
     low, high = law.exponent_interval
     return aligned.assign_attrs(
         divisor=float(np.exp(best.x)),
@@ -238,7 +242,8 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     if "exponent" not in aligned.attrs:
         count = int(aligned["fitted"].sum())
         remedy = "follow the branch to more energy (nnm.energy), or sweep more amplitudes"
-        return f"amplitudes beyond the peak that lie in region III of the branch: {count}, of {FEWEST} needed; {remedy}"
+        counted = f"amplitudes beyond the peak that lie in region III of the branch: {count}"
+        return f"{counted}, of {LEAST_FITTED} needed; {remedy}"
     return aligned.assign_attrs(
         case=case.to_toml(),
         branch_reading=slope.attrs["reading"],

@@ -10,13 +10,16 @@ the waves from the other sites and from the ends,
     c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j,    f1 = Phi1(z) c,    z = |c|/D,
 
 with the clearance D and Phi1 in N/m of ``studies.response``. GMRES solves this with Phi1 fixed, and it is iterated with
-the Phi1 of the solution until it converges.
+the Phi1 of the solution until it converges. Phi1 is that of the frequency Om. At other frequencies omega of the burst a
+site is taken to send out the same multiple of the wave that arrives, so that its force is f1 times g''(Om)/g''(omega),
+where g'' is the imaginary part of g, by which waves leave the site. (With the same force instead, energies change by
+0.005 decades in a short lattice.)
 
-Third harmonics, about 3 Om, have envelopes c3 and f3. f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a
-closed contact does not yield to those of other sites, which adds -c3/g to f3. They press on contacts:
-z = (|c| + |c3|)/D. The energy that the upper bands carry past a site in contact loses the fraction that a driven wave
-of that amplitude loses. Waves that are not harmonics add by energies. G and g are those of the lattice with its
-dashpots; ``studies.wave_losses`` has what these take until the end.
+Third harmonics, about 3 Om, have envelopes c3 and f3. The forces f3 = Phi3(z) |c| (c/|c|)^3 of the sites send out waves
+that add with their phases. A closed contact does not yield to the waves c3 of other sites, which adds -c3/g to its f3.
+The waves also press on contacts: z = (|c| + |c3|)/D. The energy that the upper bands carry past a site in contact loses
+the fraction that a driven wave of that amplitude loses. Waves that are not harmonics add by energies. G and g are those
+of the lattice with its dashpots; ``studies.wave_losses`` has what these take until the end.
 """
 
 from typing import NamedTuple
@@ -84,10 +87,19 @@ class Arriving(NamedTuple):
 class Network:
     """The sites of a ``model`` and the linear lattice between them; solved once for all amplitudes.
 
-    The frequencies ``offset`` in rad/s are relative to the middle of a line; their transform is over ``time`` in s,
-    twice as long as the run. Arrays (site, site, offset) have the site that sends first. ``clearance`` (site,) in m is
-    that of the side where it is less. ``power`` and ``power3`` (site, 1) are the powers in W/m^2 of travelling waves at
-    the drive's frequency and three times it over the |w|^2 of each site's pair.
+    The frequencies ``offset`` in rad/s are relative to the middle of a ``line``; their transform is over ``time`` in s,
+    twice as long as the run, of which ``during`` is true while the run lasts. Arrays (site, site, offset) have the site
+    that sends first, and are 0 where no wave propagates. ``clearance`` (site,) in m is that of the side where it is
+    less.
+
+    About the drive's frequency ``om`` in rad/s, ``linear`` (site, time) in m is the envelope c0 under 1 N. ``between``
+    (site, site, offset) is the wave that arrives over the one that is sent out, (G - delta g)/(i g'') with the g of the
+    sender, and ``radiated`` (site, 1) in m/N is i g'' at ``om``; it is a number where all sites have the same.
+
+    About three times ``om``, if there is a wave ``third``: ``response3`` (site, site, offset) is G, ``g3`` (site,
+    offset) is g and ``centre`` (site, 1) its middle; ``received3`` and ``between3`` (site, site, offset) are G/g -
+    delta with the g of the receiver and of the sender. ``power`` and ``power3`` (site, 1) are the powers in W/m^2 of
+    travelling waves at ``om`` and three times it over the |w|^2 of each site's pair.
     """
 
     def __init__(self, model: Model) -> None:
@@ -117,7 +129,7 @@ class Network:
         inside = self._propagates(self.om)
         radiated = 1j * g.imag  # the part of g that leaves as waves
         eye = np.eye(len(chain.sites))
-        # Over what the site that sends, the last axis, radiates.
+        # The last axis is that of the site that sends.
         others = (response[:, :, :sites] - g.T[:, :, None] * eye) / radiated.T[:, None]
         self.between = np.where(inside, others.T, 0)
         self.radiated = _of_sites(radiated[:, most])
@@ -131,7 +143,7 @@ class Network:
             self.g3 = g
             self.centre = _of_sites(g[:, most])
             self.response3 = response[:, :, :sites].T
-            # Over the g of the site that receives a wave, or of the one that sends it: the same for equal pairs.
+            # Both are the same where all sites have equal pairs, and so one g.
             received = response[:, :, :sites] / g.T[:, :, None]
             sent = response[:, :, :sites] / g.T[:, None]
             self.received3 = np.where(inside, received.T - eye[:, :, None], 0)
@@ -155,13 +167,13 @@ class Network:
                 break
 
             state = sites.at(z)
-            # The last c is near the next: GMRES begins with it.
+            # GMRES begins with the last c, which is near the next one.
             arriving = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
             change = float(np.abs(arriving - c).max()) / size
             step = 1.0
             if i >= FULL_STEPS:
                 step = 0.5
-            # Full steps come near, half ones converge: Phi1 depends on c, and full steps may swing about the solution.
+            # Full steps come near the solution, but may swing about it, since Phi1 depends on c; half steps converge.
             c = c + step * (arriving - c)
 
             if self.third:
@@ -188,9 +200,10 @@ class Network:
         return np.asarray(2 * transform / self.time[1])
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
-        """Response of w at the sites to forces at the sites and of the drives (frequency, site, force); of one alone.
+        """Compliances in m/N at the frequencies of a line about ``middle`` in rad/s.
 
-        The second (site, frequency) is that of a site in an infinite lattice to a pair of forces at itself.
+        The first (frequency, site, force) is that of w at the sites to forces at the sites, then to those of the
+        drives. The second (site, frequency) is g, that of a site in an infinite lattice to a pair of forces at itself.
         """
         omega = middle + self.offset - 1j * self.line.decay
         response = self._compliance().response(omega)

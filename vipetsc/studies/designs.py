@@ -31,9 +31,10 @@ class Design:
 
 
 class OptimumSearch:
-    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the ``start`` if that differs.
+    """The ``designs`` tried so far, on one rank: number 0 is the case to begin with, 1 the ``start`` if that differs.
 
-    ``asked`` are those that are not judged yet, by ``objective``, the runs of all designs; ``start`` is (dimension,).
+    ``asked`` are the designs that are not judged yet: at first these, then those that the ``sampler`` has asked for.
+    ``objective`` has the runs of all designs and judges by them; ``start`` are values (variable,).
     """
 
     def __init__(self, plan: OptimiseCase, objective: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:
@@ -60,7 +61,10 @@ class OptimumSearch:
         return [run for design in self.asked for run in design.runs]
 
     def tell_and_ask(self) -> bool:
-        """Judge the designs whose runs are recorded, report to the sampler, and ask for more; whether there are any."""
+        """Judge the ``asked`` designs, whose runs are recorded, report to the sampler, and ask it for more.
+
+        Returns False if the budget is spent, and no more designs are asked for.
+        """
         for design in self.asked:
             options = self.plan.options
             design.losses = [np.nan] * len(options.objective)
@@ -87,8 +91,9 @@ class OptimumSearch:
     def _tell(self) -> None:
         """Give the sampler the losses of the designs that it asked for.
 
-        One that misses a constraint is worse than all that miss none, the more so the more it misses (Deb 2000, Comput.
-        Methods Appl. Mech. Eng. 186, 311); one that failed is worse than all others.
+        A design that misses a constraint is worse than all that miss none, the more so the more it misses (Deb 2000,
+        Comput. Methods Appl. Mech. Eng. 186, 311). A design that failed is as bad as the one that misses most, or worse
+        than all others if none misses any.
         """
         judged = self.feasible_losses()
         # Over all designs so far, not those of this generation: losses that the sampler has must stay comparable. One

@@ -69,7 +69,8 @@ def _windows(record: VelocityRecord) -> dict[str, spectra.CellWindow]:
         record.left_out.append("dispersion_before, dispersion_after: on a ring the wave travels in both directions")
     else:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
-        # A wave that crosses the border of a window would smear over all wavenumbers, but for wide flanks.
+        # A window with sharp borders would smear a wave that crosses one over all wavenumbers: wide flanks taper it
+        # off.
         lower = spectra.CellWindow(slice(0, low), taper=0.5)
         upper = spectra.CellWindow(slice(high, len(record.cells)), taper=0.5)
         # The wave may travel to lower cells: before and after refer to its direction.

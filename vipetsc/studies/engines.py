@@ -28,8 +28,10 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     """``count`` members of ``sweep`` for the engine ``ts``, on as many of its curves over the amplitude.
 
     Curves are drawn from ``seed``, and of the amplitudes, cut into ``count`` equal parts, one in each: few members go
-    from no contact to hard contact. They lie on one axis. Raises StopIteration if the amplitude does not vary.
+    from no contact to hard contact. They lie on one axis. Raises ValueError if the amplitude does not vary.
     """
+    if not any(AMPLITUDE in axis for axis in sweep.axes):
+        raise ValueError(f"{sweep.name}: {AMPLITUDE} does not vary, over which members would be drawn")
     random = np.random.default_rng(seed)
     number = np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
     along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)

@@ -25,6 +25,8 @@ from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
 FORMAT_VERSION = 2
+# Members of a curve, and points from its peak on, for which a power law is fitted: two lie on one of any kind.
+LEAST_FITTED = 3
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
 COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
@@ -117,6 +119,7 @@ class Results:
         run = LinearRun.from_record(record)
         name = record["linear"]
         self.linear[name] = run.joined(self.linear.get(name))
+        # A run may have several records, each with the measures for other first sites: all of them are kept.
         self.lines[f"{name} {[*run.measures]}"] = line
 
     def _enter(self, number: int, record: Record, line: Line) -> None:
@@ -334,8 +337,8 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     order = np.argsort(np.abs(amplitude[valid]), kind="stable")
     x = np.abs(amplitude[valid])[order]
     y = curve[valid][order]
-    # Two points fit any line; a constant has no peak to begin at.
-    if len(y) < 3 or np.ptp(y) == 0:
+    # A constant has no peak to begin at.
+    if len(y) < LEAST_FITTED or np.ptp(y) == 0:
         return row
 
     peak = int(np.argmax(y))
@@ -343,7 +346,7 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     row["peak"] = y[peak]
     row["points"] = len(y) - peak
     row["is_power_law"] = 0.0
-    if row["points"] < 3:
+    if row["points"] < LEAST_FITTED:
         return row
 
     if normalise:

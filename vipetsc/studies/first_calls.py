@@ -81,26 +81,26 @@ def compile_kernels(comm: MPI.Comm) -> float:
 
 
 def run(engine: str) -> None:
-    """A run by one of the engines, and its measures."""
-    case = Case.from_table(RUN | {"time": {**RUN["time"], "engine": engine}})
-    run = simulate(case, comm=MPI.COMM_SELF).dataset
-    assert run is not None
-    analyse(run)
+    """Simulate a run by one of the engines, and measure it."""
+    case = Case.from_table(RUN | {"time": RUN["time"] | {"engine": engine}})
+    recorded = simulate(case, comm=MPI.COMM_SELF).dataset
+    assert recorded is not None
+    analyse(recorded)
 
 
 def follow(table: dict[str, Any]) -> None:
-    """Two points of a branch, whatever it comes to."""
+    """Follow the branches of a case ``table`` for two points, whether they converge or not."""
     # The branch itself is of no use: its kernels are what is left.
     with tempfile.TemporaryDirectory() as folder:
         follow_all(NnmCase.from_table(table), Path(folder), MPI.COMM_SELF)
 
 
 def identify() -> None:
-    """One step of a fit to a record."""
+    """Take one step of a fit to a record."""
     with tempfile.TemporaryDirectory() as folder:
         run_identification(IdentifyCase.from_table(IDENTIFIED), Path(folder), MPI.COMM_SELF)
 
 
 def find_fonts() -> None:
-    """Matplotlib's list of the machine's fonts, which is written where the module is loaded first."""
+    """Have Matplotlib list the machine's fonts, which it does, and stores, when the module is first loaded."""
     import_module("matplotlib.font_manager")

@@ -6,8 +6,8 @@ are estimated. Fits begin at several starts, since the misfit may have several v
 parameter is held at a row of values while all others are fitted: the cost over these values is its profile.
 
 Ranks divide the starts, then the fits of the profiles; with more ranks than starts, the ranks of a team divide the
-records and derivatives of a start. The solution of each window is kept at once, so that an identification that was
-stopped goes on where it was. The same files, to the bit, on any number of ranks.
+records and derivatives of a start. The solution of each window is recorded at once, so that an identification that was
+stopped goes on where it was. The files are the same, to the bit, on any number of ranks.
 """
 
 import sys
@@ -27,7 +27,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured, MeasuredError, read_measured
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import Misfit
-from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, Side, profile_about, profile_costs
+from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, ProfileCosts, Side, profile_about, profile_costs
 from vipetsc.identification.motion import MotionError
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import IDENTIFIED, claimed, provenance
@@ -59,7 +59,7 @@ def run_identification(
         path = claim.folder / "identified.h5"
         # A file that was cut off is written again, from the records of its fits.
         if not on_root(comm, lambda: is_whole(path, [])):
-            measured = on_root(comm, lambda: read_records(plan))
+            measured = on_root(comm, lambda: read_measured_records(plan))
             _identify(Identification(plan, measured, stop or StopRequest()), claim.folder, comm, progress)
         claim.publish()
 
@@ -70,8 +70,8 @@ def run_identification(
         return on_root(comm, summary)
 
 
-def read_records(plan: IdentifyCase) -> list[Measured]:
-    """The records of ``plan``; raises CaseError for one that is not as it was when the case was read."""
+def read_measured_records(plan: IdentifyCase) -> list[Measured]:
+    """The measured records of ``plan``; raises CaseError for one that is not as it was when the case was read."""
     records = []
     for number, table in enumerate(plan.options.records, 1):
         at = f"identify.records[{number}]"
@@ -97,11 +97,11 @@ class Identification:
         self.team = team
 
     def windows(self) -> GrowingWindows:
-        """A fit that nothing has been asked of yet."""
+        """A fit that begins anew: no window is solved, and solutions are not recorded."""
         return self._windows((), lambda number, z: None)
 
     def _windows(self, solved: Sequence[Sequence[float]], keep: Callable[[int, np.ndarray], None]) -> GrowingWindows:
-        """A fit whose first windows are ``solved``, and which gives ``keep`` the solutions of the others."""
+        """A fit whose first windows are ``solved``; the numbers and solutions of the others are given to ``keep``."""
         return GrowingWindows(
             Misfit(self.plan, self.measured, compute=lambda jobs: divided(self.team, jobs)),
             check=lambda: self.stop.check(self.team),
@@ -157,20 +157,20 @@ class Identification:
             ],
         }
 
-    def placed(self, record: Record) -> tuple[GrowingWindows, np.ndarray]:
-        """A fit with the noise of a ``record``, and the record's coordinates (coordinate,)."""
+    def solution(self, record: Record) -> tuple[GrowingWindows, np.ndarray]:
+        """The fit of a ``record``, with the noise that it found, and its coordinates (coordinate,)."""
         windows = self.windows()
         windows.misfit.noise = [np.array(noise) for noise in record["noise"]]
         return windows, np.array(record["coordinates"])
 
     def profile(self, record: Record) -> MisfitProfile:
-        """The profiles to be taken of the misfit of a ``record``."""
-        windows, z = self.placed(record)
+        """The values at which each parameter is held about the fit of a ``record``."""
+        windows, z = self.solution(record)
         return profile_about(windows, z, self.plan.options.profile)
 
-    def profiled(self, record: Record, profile: MisfitProfile, number: int, side: Side) -> Record:
-        """The costs of the profile of parameter ``number`` on one ``side`` of the fit of a ``record``."""
-        windows, z = self.placed(record)
+    def profile_record(self, record: Record, profile: MisfitProfile, number: int, side: Side) -> Record:
+        """The record of the ``costs`` with parameter ``number`` held on one ``side`` of the fit of a ``record``."""
+        windows, z = self.solution(record)
         return {"costs": profile_costs(windows, z, profile, number, side)}
 
 
@@ -188,24 +188,27 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
     profile = on_root(comm, lambda: work.profile(fits[best]))
 
     def take_profile(key: Key) -> Record:
-        _, number, side = str(key).split()
-        return work.profiled(fits[best], profile, int(number), "below" if side == "below" else "above")
+        _, number, name = str(key).split()
+        side: Side = "above"
+        if name == "below":
+            side = "below"
+        return work.profile_record(fits[best], profile, int(number), side)
 
     keys = [f"profile {number} {side}" for number in range(len(plan.parameters)) for side in SIDES]
-    recorded.make(keys, take_profile, what="profiles", progress=progress, failures=True)
+    recorded.make(keys, take_profile, what="profiles", progress=progress, allow_failures=True)
     costs = _profile_costs(recorded.records, profile, np.array(fits[best]["coordinates"]))
     recorded.finish()
-    on_root(comm, lambda: _write(work, fits, best, (profile.places, costs), folder, comm))
+    on_root(comm, lambda: _write(work, fits, best, costs, folder, comm))
 
 
-def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.ndarray) -> np.ndarray:
-    """The costs (parameter, place) of a ``profile`` about ``z``; NaN where a side could not be computed."""
+def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.ndarray) -> ProfileCosts:
+    """The costs of a ``profile`` about the fit ``z`` (coordinate,), from the ``records`` of its sides."""
     costs = np.full(profile.places.shape, np.nan)
     for number in range(len(costs)):
         for side in SIDES:
             places = profile.outwards(number, float(z[number]), side)
             costs[number, places] = records[f"profile {number} {side}"].get("costs", np.nan)
-    return costs
+    return ProfileCosts(places=profile.places, costs=costs)
 
 
 def _recorded_runs(work: Identification, folder: Path, comm: MPI.Comm, ranks: int) -> RecordedRuns:
@@ -230,23 +233,21 @@ def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm,
 
         return by_team.fit(int(str(key).split()[-1]), solved, keep)
 
-    recorded.make(starts, fit, what="starts", progress=progress, failures=True)
+    recorded.make(starts, fit, what="starts", progress=progress, allow_failures=True)
     recorded.finish()
     return [recorded.records[key] for key in starts]
 
 
 def _write(
-    work: Identification,
-    fits: list[Record],
-    best: int,
-    profile: tuple[np.ndarray, np.ndarray],
-    folder: Path,
-    comm: MPI.Comm,
+    work: Identification, fits: list[Record], best: int, profile: ProfileCosts, folder: Path, comm: MPI.Comm
 ) -> None:
-    """Write the case that was fitted, then ``identified.h5``, whose presence says that all is done."""
+    """Write the case that was fitted, then ``identified.h5``, whose presence says that all is done.
+
+    ``best`` is the number of the best one of the ``fits``.
+    """
     sys.audit("vipetsc.conclude", str(folder))
     plan = work.plan
-    windows, z = work.placed(fits[best])
+    windows, z = work.solution(fits[best])
     case = plan.case_of(windows.misfit.values(z), name=f"{plan.name}-identified")
     write_text(folder / "identified.toml", case.to_toml())
 

@@ -11,6 +11,7 @@ from vipetsc.case.measured import UNITS
 from vipetsc.identification.clearance_search import largest_towards, reached_by
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
+from vipetsc.identification.misfit_profile import ProfileCosts
 from vipetsc.identification.uncertainty import (
     DETERMINED,
     Uncertainty,
@@ -32,7 +33,7 @@ BEYOND_NOISE = 1.2
 IMPROBABLE = 0.01
 # Residuals below this fraction of their channel are those of rounding and steps, not noise.
 EXACT = 1e-6
-# Fits whose coordinates agree to this, or to three standard errors, lie in one valley.
+# Fits whose coordinates differ by at most this, or by three standard errors if these are more, lie in one valley.
 SAME_VALLEY = 1e-3
 # Sensors are sought on so many masses at most, evenly over the lattice.
 MOST_CANDIDATES = 400
@@ -41,11 +42,11 @@ MOST_NUMBERS = 20_000_000
 
 
 def identified_values(
-    windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: tuple[np.ndarray, np.ndarray]
+    windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: ProfileCosts
 ) -> dict[str, Any]:
     """All values by name in ``LAYOUT``, at the best fit's coordinates ``z`` (coordinate,).
 
-    ``fits`` are the records of the starts, ``profile`` coordinates and costs (parameter, place).
+    ``fits`` are the records of the starts, of which number ``best`` is the best, ``profile`` the costs about it.
     """
     jacobian = windows.misfit.whole_jacobian(z, windows.last)
     uncertainty = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
@@ -56,14 +57,15 @@ def identified_values(
     values |= _channel_values(windows, z)
     values |= _state_values(windows, z, jacobian)
 
-    places, costs = profile
     parameters = windows.misfit.plan.parameters
     cost = windows.misfit.cost(z, windows.last)
-    rows = [[parameter.from_coordinate(x) for x in row] for parameter, row in zip(parameters, places, strict=True)]
+    held = np.zeros(profile.places.shape)
+    for number, parameter in enumerate(parameters):
+        held[number] = [parameter.from_coordinate(x) for x in profile.places[number]]
     return values | {
-        "place": np.arange(places.shape[1]),
-        "profile/value": np.array(rows).reshape(places.shape),
-        "profile/cost": costs - cost,
+        "place": np.arange(profile.places.shape[1]),
+        "profile/value": held,
+        "profile/cost": profile.costs - cost,
     }
 
 
@@ -110,7 +112,7 @@ def _sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertai
     plan = misfit.plan
     tables = plan.options.records
     record = next((number for number, table in enumerate(tables) if table.contact), 0)
-    # It measures what the first sensor of motion does, with the mean of their noise.
+    # The new sensor measures what the first sensor of motion does, with the mean noise of all sensors of motion.
     sensors = [number for number, sensor in enumerate(tables[record].sensors) if sensor.quantity != "force"]
     quantity = "velocity"
     noise = 1.0

@@ -127,13 +127,13 @@ class MemberHistory:
     def arrival(self) -> float | None:
         """The time in s at which the linear wave arrives at the member's first site; None without sites."""
 
-        def arrival() -> float | None:
+        def arrival_on_root() -> float | None:
             linear = LinearRun.of(self._history.run, self._history.statistics, sites=(), names=())
             return linear.arrival_at(first_site_cell(self._case))
 
-        # Simulated by all ranks, taken from the dataset that the first one has.
+        # All ranks simulate the run together, before the first one, which has its dataset, reads the time from it.
         _ = self._history
-        return on_root(self._comm, arrival)
+        return on_root(self._comm, arrival_on_root)
 
     @cached_property
     def _history(self) -> LinearHistory:

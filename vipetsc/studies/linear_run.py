@@ -93,7 +93,10 @@ class LinearRun(NamedTuple):
         return reached(self.envelope, case)
 
     def joined(self, other: "LinearRun | str | None") -> "LinearRun":
-        """The run with the measures that another record of it holds as well."""
+        """The run with the measures that another record of it, ``other``, holds as well.
+
+        Without such a record, ``other`` is None or the reason why that run failed.
+        """
         if isinstance(other, LinearRun):
             return self._replace(measures=other.measures | self.measures)
         return self

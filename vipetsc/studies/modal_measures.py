@@ -153,5 +153,5 @@ def _clusters(run: xr.Dataset, time: np.ndarray) -> Clusters:
         clusters = Clusters(*cluster_samples(onset, separation, time, stride), stride=stride)
         if len(np.unique(clusters.bounds)) <= MOST_BRACKETS:
             return clusters
-        # By one, not by two: the number of bounds does not fall evenly as the stride grows.
+        # The next stride, not twice the stride: how many bounds fall together does not grow evenly with it.
         stride += 1

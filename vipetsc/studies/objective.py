@@ -82,8 +82,8 @@ class ObjectiveRuns:
     def make(self, runs: Iterable[Case]) -> None:
         """Simulate those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
         cases: dict[Key, Case] = {case_id(case): case for case in runs}
-        # With failures: a design that fails is a bad one, and the search goes on.
-        self.recorded.make(cases, lambda name: self._record(cases[name]), failures=True)
+        # A design that fails is a bad one, and the search goes on.
+        self.recorded.make(cases, lambda name: self._record(cases[name]), allow_failures=True)
 
     def _record(self, case: Case) -> Record:
         """The record of measured values of a run, or of frequency responses, which its whole team computes."""
@@ -175,13 +175,15 @@ def _means(table: MeasuredTable, design: Case, records: Mapping[Condition, Recor
 def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
     """Values of a ``run`` that objectives and constraints, the ``tables``, need, by their names; and some of all runs.
 
-    ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work and the energy at t = 0;
-    ``transmitted``: that beyond the last site; ``dissipated``, ``episodes``.
+    The values of all runs are fractions of the energy that the lattice received, the drive's work and the energy of the
+    motion at t = 0: ``bands`` (pass band), ``upper_share_at_end`` (bands above the driven one) and ``transmitted``
+    (cells beyond the last site) at the end, and ``dissipated`` in all; and the number of contact ``episodes``.
     """
     model = Case.of(run).model()
     # The ledger counts the energy of the motion at t = 0 as work.
     work = float(run["energy/work"][-1])
-    u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
+    u = run["displacement"].values[-1:]
+    v = run["velocity"].values[-1:]
     # All of these are measured whatever is asked for: the pictures compare designs by them.
     values: dict[str, Any] = {
         "episodes": statistics["episodes"],

@@ -5,23 +5,26 @@ at the end: Bloch amplitudes give band and direction of each at an instant (``sp
 once the last contact has ended.
 
 **Fractions.** E0 (band, direction) are the energies of the run without a site under 1 N, E those of a run under the
-amplitude A, over A^2; E_in is what of E0, in the drive's band and forward (from the drive towards the site), is fast
-enough to have arrived. The fraction of a band and direction is (E - E0)/E_in, plus 1 in the drive's band forward: T. It
-is R backward, and U in the bands above. With the dissipated energy and what a closed contact holds, over A^2 E_in, the
-fractions sum to 1, to the ledger's accuracy, since the drive works as without a site; T = 1 where nothing is touched.
+amplitude A, over A^2. Forward is the direction from the drive towards the site. E_in is the energy that arrives: the
+part of E0 in the drive's band, forward, whose waves are fast enough to be past the site at the end. The fraction of a
+band and direction is (E - E0)/E_in; in the drive's band forward, 1 is added to it. It is called T in the drive's band
+forward, R in this band backward, and U in all bands above. With the dissipated energy and what a closed contact holds,
+over A^2 E_in, the fractions sum to 1, to the ledger's accuracy, since the drive does the same work as without a site;
+T = 1 where nothing is touched.
 
-**Dashpots.** Energies are then those that flow past the site (``studies.site_waves``), and E_in is what arrives there:
-what dashpots take before and after is in no fraction. What they take at the site, where the waves overlap, is a
-fraction of its own: what the others leave. It goes to zero with the dashpots, to the accuracy of the contact's force.
+**Dashpots.** In a lattice with dashpots the energies are those that flow past the site (``studies.site_waves``), and
+E_in is what arrives there: what dashpots take before and after is in no fraction. What they take at the site, where the
+waves overlap, is a fraction of its own: 1 less all others. It goes to zero with the dashpots, to the accuracy of the
+contact's force.
 
 **z** is the largest |w| of the linear wave at the site over the clearance. The bilinear law scales exactly: with a
 given z, the fractions do not depend on the clearance. Hertz's does through its stiffness kc D^(1/2): the law is that of
 one clearance, by default the geometric mean of the sites'.
 
-**Refinement.** z = 1, then two points an octave; the point in the middle (in log z) of two is computed, and if T, R, U
-or the dissipated fraction lies further from the line between them than the tolerance and than its scatter, or T falls
-from 1 between them, both halves are treated likewise, until they are finer than asked for. Mean and deviation at z are
-those of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
+**Refinement.** The first points are z = 1 and two an octave beyond. Then the point in the middle (in log z) of each two
+neighbours is computed. If T, R, U or the dissipated fraction there differs from the mean of both neighbours by more
+than the tolerance and the scatter, or if T falls from 1 between them, both halves are treated likewise, until they are
+finer than asked for. Mean and deviation at z are those of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
 """
 
 import itertools
@@ -49,7 +52,7 @@ from vipetsc.studies.scattering_law import BACKWARD, DAMPED, FORWARD, LAYOUT, NE
 from vipetsc.studies.site_waves import SiteWaves
 
 LINEAR = 0.0  # the z of the run without a site
-STEP = np.sqrt(2.0)  # between neighbouring points to begin with
+STEP = np.sqrt(2.0)  # ratio of neighbouring points to begin with: two an octave
 REFINED = ("transmitted", "reflected", "upper", "dissipated")  # what is to lie near the line between two points
 
 
@@ -326,7 +329,10 @@ class ScatteringRuns:
 
 
 def refine(runs: ScatteringRuns, progress: bool = False) -> dict[float, float]:
-    """Compute the points of the law; returns the distance of each from the line between its neighbours (NaN: first)."""
+    """Compute the points of the law; returns the distance of each from the line between its neighbours, by z.
+
+    It is NaN for the first points, which are not between others.
+    """
     options = runs.case.law
     intervals = max(int(np.ceil(np.log(options.largest) / np.log(STEP))), 1)
     first = np.geomspace(1, options.largest, 1 + intervals).tolist()
@@ -362,7 +368,7 @@ def _distance_from_line(runs: ScatteringRuns, z: float, low: float, high: float)
         largest = max(largest, distance)
         if distance > max(tolerance, float(deviation[name])):
             bent = True
-    # The onset, which the middle may miss: T is 1 below it, and near 1 above.
+    # The middle may miss the onset, at which T begins to fall from 1.
     if left["transmitted"] > 1 - tolerance >= right["transmitted"]:
         bent = True
     return largest, bent

@@ -68,7 +68,7 @@ class TaskPool:
         progress: Progress | None = None,
         fail: Callable[[Job, str], None] = lambda job, reason: None,
     ) -> int:
-        """Do all ``jobs``, those that come first first; returns how many were done. Collective.
+        """Do all ``jobs``, begun in their order; returns how many were done. Collective.
 
         ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
         the disk is full, or after an exception that is no failure.

@@ -49,7 +49,7 @@ LAYOUT = {
 }
 MEASURED = ("bands", "upper", "other", "dissipated", "dashpots", "absorbed")
 LAYOUT |= {f"simulated/{name}": LAYOUT[f"predicted/{name}"] for name in MEASURED}
-LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes; NaN where a run failed")
+LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes")
 
 
 def predict(
@@ -200,16 +200,17 @@ def _sums(bands: np.ndarray, driven: int) -> dict[str, np.ndarray]:
 
 
 def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
-    """Errors of a prediction with ``values`` (amplitude,) by name, judged by simulations with contacts.
+    """Errors of a prediction by its simulations, with ``values`` (amplitude,) by name in ``LAYOUT``.
 
-    Root mean square and worst, in decades, of the energies of upper and other bands; worst of the fractions dissipated
-    in contacts and in dashpots.
+    ``rms_`` and ``worst_`` of ``upper`` and ``other`` are in decades of the energies of these bands, over the
+    amplitudes with contacts. ``worst_dissipated`` and ``worst_dashpots`` are differences of fractions of the work, over
+    all amplitudes.
     """
     touched = values["simulated/contact_episodes"] > 0
     summary: dict[str, float] = {}
     for name in ("upper", "other"):
         pair = np.array([values[f"{kind}/{name}"] for kind in ("predicted", "simulated")])
-        # Decades need positive energies, and members without contact have no error to judge.
+        # Decades need positive energies; without contacts the predicted energies are those of the linear run.
         comparable = touched & (pair > 0).all(axis=0)
         if comparable.any():
             decades = np.abs(np.diff(np.log10(pair[:, comparable]), axis=0))

@@ -149,7 +149,7 @@ class PredictionRuns:
         run = ring.run_at_site(amplitude, with_site=True)
         motion = ring.motion(run)
 
-        # Without a contact there is no force, whose beginning and end these are.
+        # The times between which the contact's force acts; NaN without a contact.
         first_contact = np.nan
         last_contact = np.nan
         separation = run["impacts/separation"].values

@@ -97,15 +97,15 @@ class RecordedRuns:
         *,
         what: str = "runs",
         progress: bool = False,
-        failures: bool = False,
+        allow_failures: bool = False,
     ) -> None:
         """Compute the missing records of ``keys``; ``work`` returns that of a key. Collective.
 
-        All ranks of a team call ``work`` for the same key. A run that fails is recorded with its ``reason`` if
-        ``failures`` are allowed, and otherwise raises RuntimeError on all ranks once the others have ended. Raises
-        OSError on all ranks, without a record, if memory or disk is short or an error is none of the run itself: the
-        next call may succeed. Raises StoppedError on all ranks after a request to stop; what has ended by then is
-        recorded. ``what`` names the runs in messages and in the bar that ``progress`` shows.
+        All ranks of a team call ``work`` for the same key. With ``allow_failures`` a run that fails is recorded with
+        its ``reason``; otherwise it raises RuntimeError on all ranks once the others have ended. Raises OSError on all
+        ranks, without a record, if memory or disk is short, or for an exception that is not among those that count as a
+        failure of a run: the next call may succeed. Raises StoppedError on all ranks after a request to stop; what has
+        ended by then is recorded. ``what`` names the runs in messages and in the bar that ``progress`` shows.
         """
         # A key that is given twice is computed once; the order stays, the same on all ranks.
         missing = [key for key in dict.fromkeys(keys) if key not in self.records]
@@ -123,7 +123,7 @@ class RecordedRuns:
             self.file.append(recorded[key])
 
         def fail(key: Key, reason: str) -> None:
-            if failures:
+            if allow_failures:
                 keep(key, {"reason": reason})
             else:
                 failed.append(f"{key}: {reason}")

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 RESOLVED = 1e-4  # of the range between the bounds: impacts turn a finer change into noise
-LARGEST = 8  # times the first population: reached after three restarts, each of which looks at a larger part
+# Largest population over the first one. It is reached after three restarts, each with twice the population, which looks
+# at a larger part of the cube.
+LARGEST = 8
 # Least standard deviation of a whole number, in steps of it: a normal deviate exceeds half a step in one design of ten,
 # which then has a neighbouring number.
 WHOLE = 0.3
