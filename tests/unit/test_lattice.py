@@ -256,11 +256,26 @@ def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
             assert chain.wave_scale(burst, cell=driven, mass=mass) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize("ends", ["fixed", "free"])
+@pytest.mark.parametrize("driven", [0, 1, 199, 200, 300, 500, 700, 799, 800, 999])
+def test_the_scale_of_the_wave_in_a_long_lattice_is_that_of_the_driven_cell(ends, driven, monkeypatch):
+    """A lattice of 1000 cells is cut to 400 with the driven cell as far from its ends, wherever that cell is."""
+    chain = Chain(four_band(), 1000, ends)
+    # The waves of ten cycles decay within the 200 cells that the cut leaves to either side.
+    burst = ToneBurst(1.0, 1206.34, 10)
+    cut = chain.wave_scale(burst, cell=driven)
+    monkeypatch.setattr("vipetsc.lattice.chain.LONGEST", chain.cells)
+    assert cut == pytest.approx(chain.wave_scale(burst, cell=driven), rel=1e-9)
+
+
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
-def test_a_contacts_force_is_the_slope_of_its_potential(law):
-    """The force of a contact is the derivative of its potential; it begins as x^(3/2) or x."""
+@pytest.mark.parametrize("d", [2e-3, -2.5e-3])
+def test_a_contacts_force_is_the_slope_of_its_potential(law, d):
+    """The force of a contact is the derivative of its potential; it begins as x^(3/2) or x.
+
+    With a negative clearance both stops are pressed at rest.
+    """
     contact = Contact(law, 1e6)
-    d = 2e-3
     # Elongations in m beyond either stop, just beyond it, and between the stops.
     w = np.array([-3e-3, -2.2e-3, -1e-3, 0.0, 1e-3, 2.2e-3, 3e-3])
     h = 1e-8

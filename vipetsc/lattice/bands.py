@@ -1,7 +1,6 @@
 """Bloch bands of a unit cell: frequencies, eigenvectors, group velocities, pass bands and gaps."""
 
 import itertools
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -16,16 +15,16 @@ from vipetsc.lattice.cell import UnitCell
 # Wavenumbers between which extremes and waves are searched. What is found is refined off the grid: with half or twice
 # as many, edges and speeds of the four-band cell stay within 1e-8.
 GRID = np.linspace(0, np.pi, 721)
-# Cells of more masses have fewer of them, as each costs the cube: bands of long cells are folded, and nearly straight.
-# For 64 masses the whole grid costs 40 times as much, and edges are the same to 3e-15; they are with 31 and 122 as
-# well.
+# Cells of more masses get fewer wavenumbers, since each costs the cube of the masses: bands of long cells are folded,
+# and nearly straight. For 64 masses the whole grid costs 40 times as much, and the edges are the same to 3e-15, as they
+# are with 31 and with 122 wavenumbers.
 MANY_MASSES = 32
 FEWEST = 61
 BLOCK = 16  # wavenumbers whose matrices are held at once: with 8 a seventh slower, with 32 a twentieth faster
 # A band whose largest speed on the grid is below this fraction of the largest of all is not refined. Refinement raises
 # a speed by far less than a tenth: 0.8 and 0.95 find the same.
 NEARLY_FASTEST = 0.9
-FLAT = 1e-12  # part of a frequency by which rounding moves it
+FLAT = 1e-12  # a band whose frequencies differ by less than this fraction is flat to rounding
 # Part of the highest frequency of a cell's modes below which one is 0: rounding of its square, 1e-16 of the highest,
 # makes it 1e-8.
 STILL = 1e-7
@@ -139,7 +138,7 @@ def _speed(cell: UnitCell, band: int, kappa: float) -> float:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
     squared, vector = _eigenpair(cell, band, kappa)
     slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
-    return abs(slope) / (2 * float(np.sqrt(max(squared, sys.float_info.min))))
+    return abs(slope) / (2 * float(np.sqrt(max(squared, np.finfo(float).tiny))))
 
 
 def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:

@@ -87,17 +87,17 @@ class Chain:
     def is_linear(self) -> bool:
         """Whether no spring has a quadratic or a cubic part."""
         arrays = [self._varied.get(name, self._reference[name]) for name in SpringTerms._fields]
-        return not any(array.any() for array in arrays) and all(spring.is_linear for spring in self._of_left_wall)
+        return not any(array.any() for array in arrays) and all(spring.is_linear for spring in self._left_wall_springs)
 
     @property
     def is_odd(self) -> bool:
         """Whether the force of every spring at the elongation -z is minus that at z."""
         quadratic = self._varied.get("quadratic", self._reference["quadratic"])
-        return not quadratic.any() and all(spring.is_odd for spring in self._of_left_wall)
+        return not quadratic.any() and all(spring.is_odd for spring in self._left_wall_springs)
 
     @property
-    def _of_left_wall(self) -> list[Spring]:
-        """The springs to a wall on the left, which are as the reference cell's whatever the cells have."""
+    def _left_wall_springs(self) -> list[Spring]:
+        """The springs to a wall on the left: those of the reference cell, since no cell's ``variation`` has them."""
         return [spring for spring in self.cell.springs if spring.next_cell and self.ends == "fixed"]
 
     def linearised(self) -> "Chain":
@@ -125,7 +125,7 @@ class Chain:
 
     @property
     def resonator_cells(self) -> tuple[int, ...]:
-        """The cell of each site's resonator; behind the last cell of a ring comes the first."""
+        """The cell of each site's resonator; after the last cell of a ring comes the first."""
         cells = [site + pair.next_cell for site, pair in zip(self.sites, self.contact_pairs, strict=True)]
         return tuple(cell % self.cells if self.ends == "periodic" else cell for cell in cells)
 
@@ -146,32 +146,33 @@ class Chain:
         return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
-        """Whether no cell from ``start`` to ``stop`` differs from the reference cell; a ring's go on behind."""
+        """Whether no cell from ``start`` to ``stop`` differs from the reference cell.
+
+        On a ring the numbers go on beyond the last cell, and then stand for the first cells again.
+        """
         if self.variation is None:
             return True
         cells = np.arange(start, self.cells if stop is None else stop)
         return not self.differs[cells[self._exist(cells)] % self.cells].any()
 
     def _exist(self, cells: np.ndarray) -> np.ndarray:
-        """Whether the lattice has each of ``cells``; a ring has all, as those behind its last are its first again."""
+        """Whether the lattice has each of ``cells`` (cell,); on a ring every number stands for one of its cells."""
         return (cells >= 0) & (cells < self.cells) | (self.ends == "periodic")
 
     @cached_property
     def _reference(self) -> dict[str, np.ndarray]:
         """Arrays (dof,) or (spring,) of the reference cell, by the names in ``Coefficients`` and ``SpringTerms``."""
         cell = self.cell
-        of_springs = ("stiffness", "damping", "quadratic", "cubic")
-        return {
-            "masses": np.array(cell.masses),
-            "grounding": np.array(cell.grounding or np.zeros(cell.dofs)),
-            **{name: np.array([getattr(s, name) for s in cell.springs], float) for name in of_springs},
-        }
+        reference = {"masses": np.array(cell.masses), "grounding": np.array(cell.grounding or np.zeros(cell.dofs))}
+        for name in ("stiffness", "damping", "quadratic", "cubic"):
+            reference[name] = np.array([getattr(spring, name) for spring in cell.springs], float)
+        return reference
 
     def coefficients(self, start: int, stop: int) -> Coefficients:
         """Masses, springs and dashpots of the cells ``start`` to ``stop``.
 
-        Cells beyond the ends are those of the ring, or as the reference cell: the spring to a wall on the left
-        belongs to cell -1.
+        On a ring, numbers beyond the ends stand for the cells at the other end. In other lattices the cells beyond the
+        ends are as the reference cell: the spring to a wall on the left belongs to cell -1.
         """
         return Coefficients(*self._arrays(Coefficients._fields, start, stop))
 
@@ -260,7 +261,7 @@ class Chain:
             columns += [here[held], neighbour[inside] % n * d + coupling.other]
             entries += [value[held], -value[inside]]
 
-        return Entries(np.concatenate(rows), np.concatenate(columns), np.concatenate(entries))
+        return Entries(rows=np.concatenate(rows), columns=np.concatenate(columns), values=np.concatenate(entries))
 
     def stiffness_entries(self) -> Entries:
         """The entries of the stiffness in N/m of all masses, for sums in another order than that of sparse matrices."""
@@ -272,7 +273,11 @@ class Chain:
         springs = self._entries(0, self.cells, coefficients.damping)
         ground = coefficients.grounding[1:].ravel()
         masses = np.arange(len(ground))
-        return Entries(*map(np.concatenate, zip(springs, (masses, masses, ground), strict=True)))
+        return Entries(
+            rows=np.concatenate([springs.rows, masses]),
+            columns=np.concatenate([springs.columns, masses]),
+            values=np.concatenate([springs.values, ground]),
+        )
 
     def masses(self) -> np.ndarray:
         """Masses (cells dofs,) in kg of all cells, in their order."""
@@ -283,13 +288,16 @@ class Chain:
 
         With the drive's main frequency Om and its Nc cycles it is the largest steady response to the peak force at the
         complex frequency Om (1 - i/Nc), whose imaginary part stands for the finite burst; Om times that is the scale of
-        velocities. It scales exactly with the drive's amplitude. Of a lattice longer than ``LONGEST`` cells so many are
-        kept: at a complex frequency waves decay before they reach the cut.
+        velocities. It scales exactly with the drive's amplitude. A lattice of more than ``LONGEST`` cells is cut to so
+        many: at a complex frequency waves decay before they reach the cut.
         """
         cells = min(self.cells, LONGEST)
-        driven = cell
-        if cell >= cells // 2:
-            driven = max(cells - (self.cells - cell), 0)  # as far from the right end as in the whole lattice
+        # As far from the nearer end as in the whole lattice, or in the middle if both ends are farther away than that.
+        middle = cells // 2
+        driven = min(cell, middle)
+        to_right_end = self.cells - cell
+        if to_right_end <= cells - middle:
+            driven = cells - to_right_end
 
         # A burst of Nc cycles has a spectrum of about Om/Nc in width: a response with a decay as fast has its
         # sharpness.
@@ -297,7 +305,7 @@ class Chain:
         return _largest_response(self.cell, cells, self.ends, driven * self.cell.dofs + mass, omega) * drive.peak
 
 
-# The cases of a sweep or a fit, of which most differ in their contacts or the drive's amplitude, have it in common.
+# Kept, since most cases of a sweep or a fit differ in their contacts or in the drive's amplitude alone.
 @lru_cache(maxsize=64)
 def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega: complex) -> float:
     """Largest displacement in m of a lattice of equal cells under 1 N at the complex frequency ``omega`` in rad/s.

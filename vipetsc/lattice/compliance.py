@@ -106,18 +106,18 @@ class WaveCompliance:
         return chain.resonator_cells
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s, on or below the axis.
+        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
 
-        Real for a finite lattice at real frequencies.
+        They lie on or below the real axis. The result is real for a finite lattice at real frequencies.
         """
         omega, mirrored = _right_half(omegas)
         loads = self._loads()
         pairs = loads[:, : len(self.chain.sites)]
-        answer = pairs.T @ self._solve(omega, loads).unknowns[:, : len(loads)]
+        motions = pairs.T @ self._solve(omega, loads).unknowns[:, : len(loads)]
 
         if not self.infinite and np.all(omega.imag == 0):
-            return np.asarray(answer.real)
-        return np.where(mirrored[:, None, None], answer.conj(), answer)
+            return np.asarray(motions.real)
+        return np.where(mirrored[:, None, None], motions.conj(), motions)
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N, see ``response``."""
@@ -205,7 +205,7 @@ class WaveCompliance:
         return np.where(travels, np.abs(unit_flux), 0) * np.abs(amplitudes) ** 2
 
     def _transmitted(self, wave: IncidentWave, amplitude: complex, waves: BlochWaves) -> complex:
-        """Amplitude behind the last loaded cell, scaled as ``waves``, of an incident ``wave`` of ``amplitude`` in m."""
+        """Amplitude beyond the last loaded cell, scaled as ``waves``, of an incident ``wave`` of ``amplitude`` in m."""
         channel = wave.channel
         steps = self.cells[-1] + 1 - wave.origin
         if wave.direction < 0:
@@ -347,7 +347,10 @@ def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
 
 
 def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (w,) with real parts >= 0, whose answers are the complex conjugate where the second array is true."""
+    """The ``omegas`` (w,), or -conj(omega) where the real part is negative, and the mask (w,) of the latter.
+
+    The response at omega is there the complex conjugate of that at -conj(omega).
+    """
     # Waves are sorted by the direction in which they carry energy at a positive frequency: at -omega it is the other.
     omega = np.atleast_1d(np.asarray(omegas, complex))
     mirrored = omega.real < 0
@@ -368,7 +371,7 @@ def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) 
 
 
 def _states(waves: BlochWaves, stretch: Stretch, place: int) -> np.ndarray:
-    """States (omega, 2r, wave) of a stretch's waves behind its cell number ``place`` (0: before the first one).
+    """States (omega, 2r, wave) of a stretch's waves after its cell number ``place`` (0: before the first one).
 
     Waves to higher cells are counted from its beginning, waves to lower ones from its end.
     """
@@ -381,8 +384,8 @@ def _states(waves: BlochWaves, stretch: Stretch, place: int) -> np.ndarray:
         state = waves.state[:, :, half:]
         slope = waves.slope[:, :, half:]
         if stretch.left is None:
-            # A displacement linear in the cells grows without bound where there is no end: in its place at omega = 0
-            # stands the shift in common.
+            # A displacement linear in the cells grows without bound where there is no end: at omega = 0 the rigid
+            # translation takes its place.
             state = np.where(np.any(slope != 0, axis=1, keepdims=True), slope, state)
             slope = 0 * slope
         states.append(state * waves.factor[:, None, half:] ** before_end - before_end * slope)

@@ -114,7 +114,7 @@ class Contact:
     parameters: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        # So that ``exponent`` is a number for whoever computes with a law, not only for the law that takes it.
+        # ``exponent`` is then the power of every shipped law, not only of the one that takes it as a parameter.
         if self.law in ONSET_EXPONENTS:
             object.__setattr__(self, "exponent", ONSET_EXPONENTS[self.law])
 
@@ -276,7 +276,8 @@ class Contact:
 
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
         """Elastic energy (...) in J stored at relative displacements w (...) in m."""
-        return self.elastic_energy(np.abs(np.asarray(w, float)) - clearance)
+        w = np.asarray(w, float)
+        return self.elastic_energy(w - clearance) + self.elastic_energy(-w - clearance)
 
 
 PARAMETERS: Mapping[str, LawParameter] = {

@@ -21,7 +21,7 @@ from vipetsc.lattice.waves import NEUTRAL
 
 # Wavenumbers at which the loss of bands is fitted. With 30 the bands' mean losses change by 4 to 8 % of those asked,
 # with 120 by 2 to 5 %: in the lowest band a dashpot to ground has a loss as 1/omega near kappa = 0, which the smallest
-# wavenumber weighs. They are a fit, and the dashpots that it finds are what a case then has.
+# wavenumber weighs. The fit decides which dashpots a case has: with another number here it has slightly other ones.
 KAPPAS = np.pi * (np.arange(60) + 0.5) / 60
 # |lambda| below this, or above its inverse: a wave that does not reach the next cell. Those of a singular coupling are
 # 0 and infinity to rounding, 1e-15: half and twice as much select the same waves.
@@ -147,7 +147,7 @@ def damped_waves(cell: UnitCell, omega: float) -> Waves:
     # cell pulls, and v = i omega u.
     flux = omega / 2 * np.imag(factor * np.einsum("dw,de,ew->w", shape.conj(), coupling, shape))
     growth = np.log(np.abs(factor))
-    # By growth, those that decay to higher cells first; of those that do neither, the flux is the sign.
+    # By growth, those that decay to higher cells first; waves that do not decay are sorted by the sign of their flux.
     order = np.argsort(np.where(np.abs(growth) < NEUTRAL, -np.sign(flux) * NEUTRAL, growth))
     return Waves(factor=factor[order], shape=shape[:, order], flux=flux[order], dynamic=dynamic, coupling=coupling)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-RIGID = 1e-12  # squared frequencies below this fraction of the largest are those of rigid motions
+RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are 0: rigid motions
 UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
 
 

@@ -99,8 +99,14 @@ class ToneBurst:
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
         """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
         w = np.asarray(frequency, float) * (1 + 1e-7j)  # off the poles, which the first factor cancels
-        lines = {self.frequency * (1 + k / self.cycles): 1 - 1.5 * abs(k) for k in (-1, 0, 1)}
-        sines = sum(factor * line / (line**2 - w**2) for line, factor in lines.items())
+        # [1 - cos(Om t/Nc)] sin(Om t) is the sum of three sines: their weights and frequencies. The one of frequency 0,
+        # in a burst of one cycle, is 0 and must not be divided by w^2 = 0.
+        lines = (
+            (-0.5, self.frequency * (1 - 1 / self.cycles)),
+            (1.0, self.frequency),
+            (-0.5, self.frequency * (1 + 1 / self.cycles)),
+        )
+        sines = sum(weight * line / (line**2 - w**2) for weight, line in lines if line)
         return self.window_amplitude * (1 - np.exp(-1j * w * self.duration)) * np.asarray(sines)
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
@@ -174,7 +180,7 @@ class Pieces:
     def highest(self) -> float:
         """The highest angular frequency in rad/s of the pieces' sines; 0 of polynomials."""
         starts = self.table["start"]
-        ends = np.append(starts[1:], min(self.duration, self.settled))
+        ends = np.append(starts[1:], self.settled)
         # A sweep is linear in time: it is fastest at an end of its piece.
         at_start = self.table["frequency"]
         at_end = at_start + self.table["rate"] * (ends - starts)
@@ -336,9 +342,9 @@ def impulse(amplitude: float, duration: float) -> Pieces:
 
 
 def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: float, hold: bool = False) -> Pieces:
-    """``amplitude`` times the cubic spline through ``values`` (sample,) at ``times`` (sample,); 0 before and behind.
+    """``amplitude`` times the cubic spline through ``values`` (sample,) at ``times`` (sample,); 0 before and after.
 
-    Times in s begin with 0; ``frequency`` in rad/s is the main one. ``hold``: behind the last sample it stays there.
+    Times in s begin with 0; ``frequency`` in rad/s is the main one. With ``hold`` it stays at the last sample.
     """
     times = np.asarray(times, float)
     values = np.asarray(values, float)

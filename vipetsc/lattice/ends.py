@@ -2,12 +2,14 @@ r"""Waves that the cells at an end of a lattice send back when a wave comes to t
 
 The section of the last cells is condensed onto its innermost cell. From the outermost one inwards, with n counted
 outwards and B the coupling outwards, Z_n = K_nn + i omega C_nn - omega^2 M_n - B Z_{n+1}^-1 B^T. The innermost cell
-then obeys Z u = -B^T u_before, where u_before is the motion of the last cell before the section. That is a sum of waves
-that come and waves that go back; the coupling B does not distinguish u from the same sum one cell further outwards:
+then obeys Z u = -B^T u_before. Here u_before = sum_j a_j shape_j is the motion of the last cell before the section, a
+sum of waves that come and waves that go back. The equation of motion of that last cell has u in the term B u alone.
+Waves fulfil it with sum_j a_j step_j shape_j in place of u, where step_j is the factor of wave j from a cell to the
+next one outwards. Both must therefore agree,
 
-    B (sum_j a_j step_j shape_j + Z^-1 B^T sum_j a_j shape_j) = 0
+    B (sum_j a_j step_j shape_j + Z^-1 B^T sum_j a_j shape_j) = 0,
 
-gives the amplitudes a_j of those that go back, with step_j the factor of wave j from a cell to the next one outwards.
+which gives the amplitudes a_j of the waves that go back.
 """
 
 from typing import Literal, NamedTuple
@@ -42,8 +44,8 @@ class Side(NamedTuple):
         to_higher = slice(0, half)
         to_lower = slice(half, None)
         if end == "right":
-            return cls(to_higher, to_lower, waves.coupling, waves.factor)
-        return cls(to_lower, to_higher, waves.coupling.T, 1 / waves.factor)
+            return cls(towards=to_higher, back=to_lower, coupling=waves.coupling, step=waves.factor)
+        return cls(towards=to_lower, back=to_higher, coupling=waves.coupling.T, step=1 / waves.factor)
 
     def decay(self) -> np.ndarray:
         """|log| of the factors (wave,) of the waves towards the end."""
@@ -92,7 +94,8 @@ def _blocks(rows: csr_matrix, first: int, d: int) -> np.ndarray:
     cells = rows.shape[0] // d
     row = np.repeat(np.arange(cells), np.diff(blocks.indptr))
     out = np.zeros((3, cells, d, d))
-    # Outermost cells of a ring are not met: sections are those of lattices with ends.
+    # Offsets are -1, 0 or 1: those between the last and the first cell of a ring do not occur, since a section is a
+    # part of a lattice with ends.
     out[blocks.indices - first - row + 1, row] = blocks.data
     return out
 
@@ -120,8 +123,8 @@ def reflections(z: np.ndarray, waves: Waves, end: End) -> np.ndarray:
 def reflection(chain: Chain, omega: float, cells: int, end: End = "right") -> float:
     """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from the last ``cells`` at an ``end``.
 
-    The cells before go on for ever, as the reference cell; the outermost of ``cells`` must be one of them. Incoming
-    are waves that do not decay, in a damped cell the one that decays least. NaN in a gap.
+    The cells before them go on for ever, as the reference cell, and so must be the springs and dashpots that join the
+    two parts. Incoming are waves that do not decay, in a damped cell the one that decays least. NaN in a gap.
     """
     waves = damped_waves(chain.cell, omega)
     side = Side.at(end, waves)

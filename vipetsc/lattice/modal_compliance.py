@@ -4,7 +4,7 @@ With the modes phi of M u'' + K u = 0, phi^T M phi = 1, as coordinates, u = sum_
 
     q'' + D q' + Omega^2 q = phi^T f,    D = phi^T C phi.
 
-Without dashpots each mode answers for itself. With dashpots the state (S q, q'), S a diagonal scale, has the matrix
+Without dashpots these equations are not coupled. With dashpots the state (S q, q'), S a diagonal scale, has the matrix
 [[0, S], [-Omega^2/S, -D]], whose eigenvalues p and eigenvectors give the compliance as a sum over poles,
 
     G(omega) = sum_r a_r b_r / (i omega - p_r).
@@ -28,12 +28,11 @@ from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.dense_compliance import RIGID, UNMOVED
 from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
 from vipetsc.lattice.unit_loads import unit_loads
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
-RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are none
-UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
 # nearly parallel, and cancel.
 ACCURACY = 1e-8
@@ -55,8 +54,8 @@ class Poles(NamedTuple):
 class ModalCompliance:
     """Compliance of the contacts of a finite ``chain``, whose cells may differ and have dashpots.
 
-    Relative displacements of the contact pairs, and behind them elongations of the springs that are not linear, follow
-    from pairs of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
+    Relative displacements of the contact pairs, and after them elongations of the nonlinear springs, follow from pairs
+    of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
     ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none.
 
     Raises ValueError for more than ``MOST_DOFS`` masses, and where the damping is so close to critical that the modes
@@ -74,12 +73,12 @@ class ModalCompliance:
 
     @cached_property
     def springs(self) -> list[SpringPlace]:
-        """The springs that are not linear."""
+        """The nonlinear springs."""
         return nonlinear_places(self.chain)
 
     @property
     def pairs(self) -> int:
-        """Number of contact pairs and of springs that are not linear."""
+        """Number of contact pairs and of nonlinear springs."""
         return len(self.chain.sites) + len(self.springs)
 
     @cached_property
@@ -203,7 +202,7 @@ class ModalCompliance:
         if not rigid_rows.any():
             rigid_rows, rigid_columns = rigid_rows[:, :0], rigid_columns[:0]
 
-        # The same of rigid motions that dashpots oppose, whose pole is 0.
+        # Rounding is removed likewise from rigid motions that dashpots oppose, whose pole is 0.
         rows = pairs.T @ poles.output
         columns = poles.input @ loads
         still = poles.poles == 0
@@ -223,7 +222,7 @@ class ModalCompliance:
 
         damping = chain.damping_rows(0, chain.cells)
         modal_damping = vectors.T @ (damping @ vectors)
-        # Masses that no springs join have squared frequencies of 0 alone.
+        # "<=": masses that no springs join have squared frequencies of 0 alone, and a largest one of 0.
         still = np.abs(squared) <= RIGID * np.abs(squared).max()
         lossless = np.abs(modal_damping).max(axis=1) <= RIGID * np.abs(modal_damping).max(initial=0.0)
         rigid = still & lossless
@@ -263,23 +262,25 @@ def _sum_over_poles(squared: np.ndarray, damping: np.ndarray, vectors: np.ndarra
         frequency = np.sqrt(squared)
         poles = 1j * np.concatenate([frequency, -frequency])
         output = np.hstack([vectors, vectors])
-        return Poles(poles, output, (output / (2 * poles)).T, rigid)
+        return Poles(poles=poles, output=output, input=(output / (2 * poles)).T, rigid=rigid)
 
-    # A scale of the displacements by the frequencies makes the matrix one of a single size; a mode that dashpots
-    # alone hold has none, and takes a thousandth of the highest.
+    # Displacements are scaled by the frequencies: all entries of the matrix are then of one size. A mode that dashpots
+    # alone oppose has the frequency 0: a thousandth of the highest one takes its place.
     highest = np.sqrt(squared.max()) or np.abs(damping).max()
     scale = np.maximum(np.sqrt(squared), 1e-3 * highest)
     matrix = np.zeros((2 * count, 2 * count))
     matrix[:count, count:] = np.diag(scale)
     matrix[count:, :count] = np.diag(-squared / scale)
     matrix[count:, count:] = -damping
-    # What no spring holds stays where dashpots have stopped it: one pole of each such mode is 0, and without rounding,
-    # as its column is zero.
+    # A mode that no spring holds stays where dashpots have stopped it: one of its poles is 0, exactly so, since the
+    # column of its displacement is zero.
     poles, right = eig(matrix)
     left = np.linalg.inv(right)
-    return Poles(poles, vectors @ (right[:count] / scale[:, None]), left[:, count:] @ vectors.T, rigid)
+    return Poles(
+        poles=poles, output=vectors @ (right[:count] / scale[:, None]), input=left[:, count:] @ vectors.T, rigid=rigid
+    )
 
 
 def _without_rounding(motions: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The ``motions`` with 0 in the place of what is rounding beside the largest of ``sizes``."""
+    """The ``motions``, with 0 for those below the fraction ``UNMOVED`` of the largest of ``sizes``."""
     return np.where(np.abs(motions) < UNMOVED * sizes.max(initial=0.0), 0, motions)

@@ -23,13 +23,13 @@ from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Waveform
 
-MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
+MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size has 128 MB
 # Modes nearer than this fraction of the largest Om^2 are orthogonalised one by one. Of 300 four-band cells the norm of
 # random fields in all modes errs by 1e-15 with a tenth, half or twice of it as well, at the same CPU time.
 CLOSE = 1e-3
 EPS = float(np.finfo(float).eps)
 ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are accepted
-AT_REST = 1e-13  # squared frequencies below this fraction of the largest are those of a shift in common
+AT_REST = 1e-13  # squared frequencies below this fraction of the largest are those of a rigid translation
 # Inverse iterations; few, since the shift is an eigenvalue to rounding. One leaves errors of 2e-12, two of 1e-15, in a
 # fifth less of CPU time than three, which leave room for eigenvalues that are less exact; six take half as much again.
 ITERATIONS = 3
@@ -190,7 +190,7 @@ def mode_frequency(chain: Chain, number: int) -> float:
                 squared = middle
 
     if squared <= 64 * EPS * top:
-        return 0.0  # a shift in common, of free ends
+        return 0.0  # the rigid translation of a lattice with free ends
     return float(np.sqrt(squared))
 
 

@@ -14,7 +14,7 @@ whole is
 
     G_fg - G_fe S (1 + G_ee S)^-1 G_eg.
 
-Frequencies have a small negative imaginary part, as if motions had begun long ago: waves then go outwards.
+Frequencies have a small negative imaginary part: motions grow slowly from rest, so that waves go outwards.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ from vipetsc.lattice.modal_compliance import ModalCompliance
 # Imaginary part of a frequency over its size, at least. Waves then decay over 1e10 radians, and compliances change in
 # proportion: by 1e-7 of the largest for twice as much, near the edge of a band.
 DECAY = 1e-10
-# Eliminations at most: 2^MOST cells, which at that decay no wave comes through. 30 leave out four hundredths at the
-# edge of a band, where waves are slow; 120 change nothing. The loop ends earlier where the coupling is this part of the
-# stiffness.
+# Eliminations at most: 2^MOST cells, which at that decay no wave comes through. With 30 the compliance errs by four
+# hundredths at the edge of a band, where waves are slow; 120 change nothing. The loop ends earlier where the coupling
+# falls below the fraction ``NEGLIGIBLE`` of the stiffness.
 MOST = 60
 NEGLIGIBLE = 1e-15
 

@@ -14,15 +14,20 @@ from vipetsc.lattice.drive import Waveform
 WAVENUMBERS = np.linspace(0, np.pi, 8001)[1:-1]
 # Of these, one in so many is enough for a sum: with 4 a fraction changes by 2e-4, with 16 by 4e-4.
 COARSE = 8
+# Fraction of a packet's energy that counts as slower than its slow speed, and fraction that counts as faster than its
+# fast one.
+BEYOND = 1e-3
+# Weight of a wave, relative to the main one, below which it adds nothing to a sum in double precision.
+NEGLIGIBLE = 1e-18
 
 
 @lru_cache
-def packet_speeds(cell: UnitCell, burst: Waveform, mass: int, beyond: float = 1e-3) -> tuple[int, float, float]:
+def packet_speeds(cell: UnitCell, burst: Waveform, mass: int) -> tuple[int, float, float]:
     """Band (from 0) that takes most of the energy, and the speeds in cells/s of its slow and of its fast waves.
 
     A force F on one ``mass`` (0-based) gives the Bloch wave of frequency w and mass-normalised vector u an energy in
-    proportion to |F^(w)|^2 |u_mass|^2; all but a fraction ``beyond`` of the band's is faster than the slow speed, all
-    but such a fraction slower than the fast one.
+    proportion to |F^(w)|^2 |u_mass|^2. All but the fraction ``BEYOND`` of the band's energy is faster than the slow
+    speed, and all but the same fraction is slower than the fast one.
     """
     point = bloch(cell, WAVENUMBERS)
     weights = np.abs(burst.spectrum(point.frequency) * point.vectors[:, mass]) ** 2
@@ -32,7 +37,7 @@ def packet_speeds(cell: UnitCell, burst: Waveform, mass: int, beyond: float = 1e
     speed = np.abs(point.group_velocity[:, band])
     weight = weights[:, band]
     order = np.argsort(speed)
-    slow, fast = np.interp([beyond, 1 - beyond], np.cumsum(weight[order]) / weight.sum(), speed[order])
+    slow, fast = np.interp([BEYOND, 1 - BEYOND], np.cumsum(weight[order]) / weight.sum(), speed[order])
     return band, float(slow), float(fast)
 
 
@@ -90,7 +95,7 @@ def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width:
     main = -kappa * direction if backward else kappa * direction
     detuning = (k - main + np.pi) % (2 * np.pi) - np.pi
     weight = np.exp(-0.5 * (detuning * width) ** 2)
-    waves = np.flatnonzero(weight > 1e-18)
+    waves = np.flatnonzero(weight > NEGLIGIBLE)
 
     point = bloch(cell, k[waves])
     # LAPACK leaves the phase of each vector open. Turned to that of the main wave, they make one envelope.

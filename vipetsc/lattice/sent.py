@@ -150,7 +150,9 @@ def amplitudes_sent(waves: Waves, load: np.ndarray, end: End) -> tuple[np.ndarra
     half = len(waves.factor) // 2
     scale = np.abs(waves.dynamic).max()
 
-    # Unknowns are the cell's displacement and the amplitudes: equation of motion, what the couplings feel of it.
+    # Unknowns are the cell's displacement u and the amplitudes. The equations: that of motion of the loaded cell; then
+    # those of its two neighbours, in which the coupling to the loaded cell must give the same for u as for the waves
+    # on that side, continued to the loaded cell.
     matrix = np.zeros((3, d, d + 2 * half), complex)
     matrix[0, :, :d] = waves.dynamic
     matrix[0, :, d : d + half] = coupling @ (waves.shape * step)[:, towards]

@@ -1,4 +1,4 @@
-"""Where the springs of a finite lattice that are not linear lie."""
+"""The nonlinear springs of a finite lattice: which there are, and the masses that each joins."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -51,7 +51,7 @@ def nonlinear_places(chain: Chain, also: Collection[int] = ()) -> list[SpringPla
     for cell, number in nonlinear_numbers(chain, also).tolist():
         law = chain.spring(cell, number)
         ends_inside = chain.ends == "periodic" or cell + law.next_cell < chain.cells
-        # In a ring the cell behind the last one is the first.
+        # In a ring the cell after the last one is the first.
         after = (cell + law.next_cell) % chain.cells
         places.append(
             SpringPlace(

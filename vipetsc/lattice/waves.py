@@ -8,8 +8,9 @@ stretch without loads v_{n+1} = lambda v_n: with D = K_nn - omega^2 M and any s,
     [1, Q^T H Q; 0, P^T H Q] v_n = lambda [-Q^T H P, s Q^T H P; -P^T H P, s P^T H P - 1] v_n.
 
 An imaginary s, as a dashpot's, keeps H finite at all frequencies on and below the real axis. Half of the 2r Bloch waves
-decay or carry energy to higher cells, half to lower ones (omega stands for omega - i0). At omega = 0 the wave that is a
-shift in common has a linear one for its counterpart. Cf. Mead, J. Sound Vib. 27 (1973) 235.
+decay or carry energy to higher cells, half to lower ones (omega stands for omega - i0). At omega = 0 the rigid
+translation is a double root lambda = 1, and its second solution grows linearly with n. Cf. Mead, J. Sound Vib. 27
+(1973) 235.
 """
 
 from functools import lru_cache
@@ -23,7 +24,7 @@ from vipetsc.lattice.cell import UnitCell
 # |log |lambda|| below which a wave's direction is that of its energy: the root of rounding, by which the double
 # |lambda| = 1 at a band's edge is off. 5e-8 to 1e-5 sort the waves of the four-band cell alike.
 NEUTRAL = 1e-7
-PORT = 1j  # s; any imaginary number will do
+PORT = 1j  # s of the module's docstring, for which any imaginary number serves
 RANK = 1e-13  # singular values of B below this fraction of the largest are rounding
 
 
@@ -31,7 +32,8 @@ class BlochWaves(NamedTuple):
     """All 2r waves at each of some frequencies (w,): the first r of the last axis go to higher cells, r to lower ones.
 
     ``factor`` (w, 2r) is lambda, of waves to lower cells 1/lambda: at most one. ``state`` (w, 2r, 2r) holds v = (q, p)
-    of a wave in a column, ``slope`` what is added a cell (at omega = 0). ``inner`` (w, dofs, dofs) is H, ``port`` s.
+    of a wave in a column. ``slope``, of the same shape, is what the state of the linear solution at omega = 0 gains
+    from one cell to the next; 0 of all other waves. ``inner`` (w, dofs, dofs) is H, ``port`` s.
     """
 
     factor: np.ndarray
@@ -95,11 +97,12 @@ def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
     one = np.broadcast_to(np.eye(r), qq.shape)
     left = np.block([[one, qq], [np.zeros_like(qq), pq]])
     right = np.block([[-qp, PORT * qp], [-pp, PORT * pp - one]])
-    # Eigenvalues as fractions alpha/beta: lambda is 0 or infinite for waves that do not reach the next cell.
-    solved = [lapack.zggev(a, b, compute_vl=0) for a, b in zip(left, right, strict=True)]
-    alpha = np.array([answer[0] for answer in solved])
-    beta = np.array([answer[1] for answer in solved])
-    states = np.array([answer[3] for answer in solved])
+    # Eigenvalues as fractions alpha/beta: lambda is 0 or infinite for waves that do not reach the next cell. LAPACK's
+    # routine returns alpha, beta, left vectors, right vectors and its status.
+    solutions = [lapack.zggev(a, b, compute_vl=0) for a, b in zip(left, right, strict=True)]
+    alpha = np.array([solution[0] for solution in solutions])
+    beta = np.array([solution[1] for solution in solutions])
+    states = np.array([solution[3] for solution in solutions])
     states /= np.linalg.norm(states, axis=1, keepdims=True)
 
     # Waves to higher cells first: those that decay, and of those that do not, which carry energy there.
@@ -120,24 +123,24 @@ def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
 
 
 def _make_static(cell: UnitCell, waves: BlochWaves, i: int) -> None:
-    """Put the shift in common and the linear displacement in the place of the double root at omega = 0."""
+    """Put the rigid translation and the linear displacement in the place of the double root at omega = 0."""
     blocks = coupling_blocks(cell)
     p = blocks.out
     q = blocks.into
     coupling = p @ q.T
     ones = np.ones(cell.dofs)
 
-    shift = np.concatenate([q.T @ ones, p.T @ ones])
-    # The shape of the linear displacement within a cell, u_n = n + shape; a shift in common of it is free.
+    translation = np.concatenate([q.T @ ones, p.T @ ones])
+    # The shape of the linear displacement within a cell, u_n = n + shape, to which any constant may be added.
     shape = np.linalg.lstsq(blocks.stiffness + coupling + coupling.T, (coupling.T - coupling) @ ones, rcond=None)[0]
 
     # Sorted by growth, the double root is the last wave to higher cells and the first one to lower cells.
     first = p.shape[1] - 1
     second = p.shape[1]
     waves.factor[i, [first, second]] = 1
-    waves.state[i, :, first] = shift
+    waves.state[i, :, first] = translation
     waves.state[i, :, second] = np.concatenate([q.T @ shape, p.T @ (shape - ones)])
-    waves.slope[i, :, second] = shift
+    waves.slope[i, :, second] = translation
 
 
 def cell_between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: np.ndarray) -> np.ndarray:
