@@ -10,6 +10,7 @@ from typing import NamedTuple
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.image import imread
 from scipy.integrate import trapezoid
 
@@ -20,11 +21,13 @@ from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
 from vipetsc.figures.panels import label_panels
 from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
+from vipetsc.figures.runs import without_phase
 from vipetsc.figures.schematics import draw_unit_cell
 from vipetsc.figures.sources import BRANCHES, OPTIMUM
 from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
+from vipetsc.io.read import open_run
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Pair
 from vipetsc.spectra import kinetic_energy
@@ -206,6 +209,15 @@ def test_what_cannot_be_drawn_is_said(measured):
     folder, shape = measured
     # The reasons are exactly these: a further one would keep a picture from being drawn.
     assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
+
+
+def test_a_site_that_was_not_reached_has_no_portrait(tmp_path):
+    """A run that ends before a wave has reached the first site has no phase portraits, which would be empty axes."""
+    write_run(tmp_path / "run.h5")
+    with open_run(tmp_path / "run.h5") as run:
+        assert without_phase(run, None) == ""
+        at_rest = run.assign(displacement=xr.zeros_like(run["displacement"]))
+    assert without_phase(at_rest, None) == "cell 8, the first site, was at rest all the time"
 
 
 @pytest.mark.slow

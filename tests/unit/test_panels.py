@@ -46,6 +46,34 @@ def test_a_map_shows_every_value_at_its_coordinates(axes):
     assert axes.get_ylim() == (4.5, 11.5)
 
 
+@pytest.mark.parametrize(
+    ("first", "last", "shown"),
+    [
+        (0, 4, range(6)),
+        (100, 123, range(97, 127)),
+        # A twentieth of all cells is enough to be seen among all.
+        (100, 149, range(1000)),
+        (990, 999, range(989, 1000)),
+    ],
+)
+def test_a_map_of_a_long_lattice_shows_the_cells_that_have_moved(first, last, shown):
+    """Of 1000 cells of which few have moved those few are shown, with some at rest on both sides."""
+    values = np.full((len(TIME), 1000), 1e-30)
+    values[2, first] = 2.0
+    values[3, last] = 1.0
+    field = xr.DataArray(values, {"time": TIME, "cell": np.arange(1, 1001)}, ("time", "cell"))
+
+    part = panels.moved_cells(field, panels.log_norm(field))
+
+    assert part["cell"].values.tolist() == [cell + 1 for cell in shown]
+    assert part.shape[0] == len(TIME)
+
+
+def test_a_lattice_at_rest_is_shown_whole():
+    field = xr.DataArray(np.zeros((2, 30)), {"time": [0.0, 1.0], "cell": np.arange(30)}, ("time", "cell"))
+    assert panels.moved_cells(field, panels.log_norm(field)).sizes["cell"] == 30
+
+
 def test_colours_follow_the_data(axes):
     """The scale of colours ends at the largest value in any unit, and at 1 if no value is positive."""
     for largest in (1e-9, 2.0, 3e7):

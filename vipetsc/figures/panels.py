@@ -27,6 +27,8 @@ REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by numbe
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 ROUNDING = 1e-6  # degrees by which equal phases may differ
 LEAST_SPAN = 1.0  # degrees of an axis of phases
+# Of the cells in a map: fewer would take less than 20 of its 400 pixels.
+LEAST_PART = 0.05
 KAPPA = "Wavenumber κ (π rad/cell)"
 OMEGA = "Frequency ω (krad/s)"
 
@@ -121,6 +123,26 @@ def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dat
     if run is not None:
         mark_sites(axes, run, cells=cells)
     return image
+
+
+def moved_cells(field: xr.DataArray, norm: Normalize) -> xr.DataArray:
+    """Return the part of ``field`` (t, cell) that a map shows: all cells, or those that the colours of ``norm`` show.
+
+    A short run moves so few cells of a long lattice that a map of all would not show them: if they are less than
+    ``LEAST_PART`` of all, they are shown with a tenth of their number on both sides.
+    """
+    # ``vmin`` is None where the data are to set the colours.
+    moved = np.flatnonzero((field > (norm.vmin or 0.0)).any("time").values)
+    cells = field.sizes["cell"]
+    if not moved.size:
+        return field
+
+    first = int(moved[0])
+    last = int(moved[-1])
+    if last - first + 1 >= LEAST_PART * cells:
+        return field
+    margin = 1 + (last - first) // 10
+    return field.isel(cell=slice(max(first - margin, 0), last + margin + 1))
 
 
 def content_map(axes: Axes, content: xr.DataArray, norm: Normalize) -> AxesImage:

@@ -66,10 +66,14 @@ def _draw_energy(axes: Axes, run: xr.Dataset, analysis: xr.Dataset) -> None:
         axes.set(xlabel="Time (s)", ylabel=f"Kinetic energy of cell {cells[0]} (J)", xlim=time[[0, -1]])
         return
 
-    image = panels.space_time_map(axes, energy, panels.log_norm(energy), run)
+    norm = panels.log_norm(energy)
+    shown = panels.moved_cells(energy, norm)
+    image = panels.space_time_map(axes, shown, norm, run)
+    if shown.sizes["cell"] < len(cells):
+        axes.set_ylabel("Cell (others hardly move)")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     panels.colour_bar(image, axes, "Kinetic energy of a cell (J)")
-    if len(panels.recorded_sites(run)):
+    if len(panels.recorded_sites(run, shown["cell"].values)):
         dark = {"frameon": True, "facecolor": style.BLACK, "edgecolor": "none", "framealpha": 0.5}
         axes.legend(loc="upper left", labelcolor="white", handletextpad=0.3, **dark)
 
@@ -240,6 +244,8 @@ def without_phase(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
         return f"cell {cell}, the first site, was not recorded"
     if "displacement" not in run or "velocity" not in run:
         return "displacement and velocity were not both recorded"
+    if not np.any(run["displacement"].sel(cell=cell)):
+        return f"cell {cell}, the first site, was at rest all the time"
     if Case.of(run).model().chain.pairs:
         return "portraits show the cell's contact pair, but the contacts join other masses"
     return ""
@@ -256,8 +262,8 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     host = chain.cell.host
     resonator = chain.cell.resonator
     motions = (
-        Motion("(a) Host", "u_h", u[:, host], v[:, host]),
-        Motion("(b) Resonator", "u_r", u[:, resonator], v[:, resonator]),
+        Motion(f"(a) Host of cell {cell}", "u_h", u[:, host], v[:, host]),
+        Motion("(b) Resonator of the same cell", "u_r", u[:, resonator], v[:, resonator]),
         Motion("(c) Relative motion", "w", u[:, resonator] - u[:, host], v[:, resonator] - v[:, host]),
     )
     onsets = run["impacts/onset"].values[run["impacts/site"].values == site + 1]
@@ -268,7 +274,7 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     for axes, motion in zip(grid, motions, strict=True):
         by_time = _draw_portrait(axes, motion, time, first_contact)
         velocity = rf"$\dot{{{motion.symbol}}}$ (m/s)"
-        axes.set(title=f"{motion.title}, cell {cell}", xlabel=f"${motion.symbol}$ (mm)", ylabel=velocity)
+        axes.set(title=motion.title, xlabel=f"${motion.symbol}$ (mm)", ylabel=velocity)
 
     relative = grid[-1]
     _mark_stops(relative, _stops(run, site))
