@@ -334,6 +334,43 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     assert picture.name == f"{name}.png"
 
 
+def test_a_resumed_curve_finds_two_folds_in_its_first_step(tmp_path):
+    """Two folds in one step are found, to the same bits, also by a command that goes on from the beginning of it.
+
+    That they may lie there shows in the direction of the point before. An oscillator with hardening springs has two
+    folds close together, at an amplitude little above that of the first fold at all.
+    """
+    table = {
+        "lattice": {
+            "cells": 1,
+            "cell": {
+                "masses": [1.0],
+                "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.05, "next_cell": True}],
+                "contact": [1, 1],
+            },
+        },
+        "contacts": {"sites": []},
+        "drive": {"waveform": "harmonic", "amplitude": 0.05138, "frequency": 1.0, "cell": 1, "mass": 1},
+        "time": {"end": 100.0},
+        "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.05138], "harmonics": 3},
+    }
+    case = NfrcCase.from_table(table)
+    (whole,) = follow_all(case, None, MPI.COMM_SELF)
+    folds = [point for point in whole.points if point.kind == "fold"]
+    assert len(folds) == 2
+    # The number of a special point is that of the regular one after it.
+    assert folds[0].index == folds[1].index
+
+    # As many states as there are before the step with the folds, of which the start has the number 0.
+    (part,) = follow_all(varied(case, points=folds[0].index), tmp_path, MPI.COMM_SELF)
+    assert part.points[-1].index == folds[0].index - 1
+    (resumed,) = follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
+
+    assert [point.kind for point in resumed.points] == [point.kind for point in whole.points]
+    for name in ("xi", "tangent", "step", "next_step"):
+        assert np.array_equal(resumed.column(name), whole.column(name)), name
+
+
 def test_sweeps_jump_between_stable_states():
     """A sweep along an S-shaped curve with a stable upper part jumps at a fold to the nearer of two stable states."""
     parameter = np.array([0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2, 1.15, 1.05, 0.95])

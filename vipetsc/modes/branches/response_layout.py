@@ -60,6 +60,7 @@ class ResponseLayout:
             "unknown": variable("unknown", np.arange(xi.shape[1]), "1", "unknown; the last is the parameter"),
             "xi": variable(("point", "unknown"), xi, "1", "unknowns"),
             "tangent": variable(("point", "unknown"), branch.column("tangent"), "1", "unit tangent"),
+            "step": variable("point", branch.column("step"), "1", "arclength of the step that led here"),
             "next_step": variable("point", branch.column("next_step"), "1", "arclength of the next step"),
             "up": variable("up", np.arange(len(up)), "1", "place in the sweep up"),
             "down": variable("down", np.arange(len(down)), "1", "place in the sweep down"),
@@ -99,6 +100,11 @@ class ResponseLayout:
 
     def points(self, data: xr.Dataset) -> list[Response]:
         """The states of a file."""
+        # Files of earlier versions have no steps.
+        steps = np.zeros(data.sizes["point"])
+        if "step" in data:
+            steps = data["step"].values
+
         points = []
         # Numbers are not stored: a fold has that of the regular point after it.
         index = 0
@@ -125,6 +131,7 @@ class ResponseLayout:
                     xi=data["xi"].values[i],
                     tangent=data["tangent"].values[i],
                     index=index,
+                    step=float(steps[i]),
                     next_step=float(data["next_step"].values[i]),
                     kind=kind,
                     measures=measures,
@@ -165,7 +172,7 @@ def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
 
 
 def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
-    """The complex array with the parts ``real`` and ``imag``, signs of zeros included."""
+    """The complex array with the parts ``real`` and ``imaginary``, signs of zeros included."""
     # real + 1j * imag would lose them, and with them the bits of a curve that is resumed.
     out = np.empty(real.shape, complex)
     out.real = real
