@@ -22,7 +22,10 @@ MEMBERS = 4
 
 @dataclass(frozen=True)
 class Kind:
-    """A sweep of the paper: its case ``file``, ``changes`` in its tables, an ``amplitude`` in N with many contacts."""
+    """A sweep of the paper: its case ``file``, ``changes`` in its tables, what it ``measures``, and an ``amplitude``.
+
+    At the amplitude, in N, there are many contacts.
+    """
 
     file: str
     changes: dict[str, dict[str, Any]]

@@ -25,7 +25,7 @@ def engines() -> tuple[str, ...]:
     return tuple(name for name in get_args(TimeTable.model_fields["engine"].annotation) if name != "auto")
 
 
-class Flight:
+class EngineRun:
     """A run of ``case`` on the ranks of ``comm`` by the engine that it asks for, in memory.
 
     Raises RuntimeError if that engine refuses the case: a run would go on with another one, whose time would be
@@ -83,11 +83,11 @@ def solve(case: Case) -> Solution:
     """Solve ``case`` by its own engine on one rank."""
     # Only velocities are recorded, because the peers return nothing else: displacements would cost time.
     output = case.output.model_copy(update={"fields": ["velocity"]})
-    flight = Flight(case.model_copy(update={"output": output}), MPI.COMM_SELF)
-    sampled, seconds = flight.velocities()
+    run = EngineRun(case.model_copy(update={"output": output}), MPI.COMM_SELF)
+    sampled, seconds = run.velocities()
     # PETSc's objects must be freed by all ranks together, not when Python collects them.
-    flight.engine.destroy()
-    return Solution(sampled.reshape(flight.model.samples, -1), seconds)
+    run.engine.destroy()
+    return Solution(sampled.reshape(run.model.samples, -1), seconds)
 
 
 def _by_engine(case: Case, name: str) -> Case:
@@ -104,12 +104,14 @@ def own_solvers() -> dict[str, Solver]:
     return {f"vipetsc {name}": with_engine(name) for name in engines()}
 
 
-# 20,000 evaluations of about a microsecond take a fiftieth of a second, far above the resolution of the clock.
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
-    """Microseconds of CPU time that one right-hand side of the case takes through PETSc; mean over ``evaluations``."""
-    flight = Flight(_by_engine(case, "ts"), MPI.COMM_SELF)
-    ts = flight.engine.ts
-    state = flight.engine.state
+    """Microseconds of CPU time that one right-hand side of the case takes through PETSc; mean over ``evaluations``.
+
+    Evaluations take some microseconds each, so that 20,000 of them are far above the resolution of the clock.
+    """
+    run = EngineRun(_by_engine(case, "ts"), MPI.COMM_SELF)
+    ts = run.engine.ts
+    state = run.engine.state
     slope = state.duplicate()
     begin = time.process_time()
     for _ in range(evaluations):

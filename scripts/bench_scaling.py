@@ -67,7 +67,7 @@ def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
     intervals = max(10, min(200, 1_000_000 // cells))
     for _ in range(rounds):
         for ranks, found in turns.items():
-            found.append(on_ranks(ranks, "flight", engine=engine, cells=cells, intervals=intervals))
+            found.append(on_ranks(ranks, "intervals", engine=engine, cells=cells, intervals=intervals))
     rows: list[dict] = []
     for ranks, found in turns.items():
         medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}

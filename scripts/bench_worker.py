@@ -1,4 +1,7 @@
-"""Measurements of the bench under mpirun: ``bench_worker.py flight|build|large JSON``; rank 0 prints a line of JSON."""
+"""Measurements of the bench under mpirun: ``bench_worker.py TASK JSON``; rank 0 prints a line of JSON.
+
+The tasks are ``intervals``, ``build`` and ``large``, each with the arguments of its function as JSON.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from petsc4py import PETSc
 import h5py
 import numba
 import numpy as np
-from bench_ours import Flight
+from bench_ours import EngineRun
 from bench_precision import lattice_case
 
 from vipetsc.case import Case
@@ -37,13 +40,13 @@ PHASES = ("claim", "set-up", "step", "checkpoint", "flush", "assemble", "conclud
 EVENTS = ("VecScatterBegin", "TSStep", "Propagator", "ContactSearch", "Landing", "Recorder")
 
 
-class Counting(MPI.Intracomm):
+class CountingComm(MPI.Intracomm):
     """A communicator that counts the reductions by mpi4py over it, which PETSc's log does not have."""
 
     reductions: int
     __module__ = "mpi4py.MPI"  # what petsc4py asks of a communicator
 
-    def __new__(cls, comm: MPI.Intracomm) -> Counting:
+    def __new__(cls, comm: MPI.Intracomm) -> CountingComm:
         """Return a communicator with the group of ``comm`` that has counted no reduction yet."""
         counting = super().__new__(cls, comm)
         counting.reductions = 0
@@ -67,9 +70,9 @@ def triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, s: float) -> None:
         a[i] = b[i] + s * c[i]
 
 
-# Three arrays of 64 MB each exceed the caches of a processor, so that the memory itself is measured.
 def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
     """Bandwidth in GB/s of STREAM's triad on all ranks at once: the best of ``turns``, with 24 bytes an element."""
+    # By default three arrays of 64 MB each, which exceed the caches of a processor: the memory itself is measured.
     a = np.zeros(size)
     b = np.ones(size)
     c = np.ones(size)
@@ -91,30 +94,30 @@ def peak() -> float:
     return COMM.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX) / 2**20
 
 
-def flight(engine: str, cells: int, intervals: int) -> dict:
+def time_intervals(engine: str, cells: int, intervals: int) -> dict:
     """Measure an ``engine`` on a lattice of ``cells`` over so many sample ``intervals``, in the midst of a short burst.
 
     Returns milliseconds a sample interval, memory, bandwidth, and what ``counted`` counts.
     """
     # A burst of three cycles ends soon; the window of nine cells keeps what is recorded small at every length.
     case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
-    comm = Counting(COMM)
-    moving = Flight(case, comm)
-    model = moving.model
+    comm = CountingComm(COMM)
+    run = EngineRun(case, comm)
+    model = run.model
     # The time is measured from a third of the burst on: in a lattice at rest ts takes its longest steps.
     first = round(model.drive.duration / 3 / model.sample_interval)
-    moving.advance(0, first)
+    run.advance(0, first)
     COMM.Barrier()
     begin = time.perf_counter()
     begin_cpu = time.process_time()
-    moving.advance(first, first + intervals)
+    run.advance(first, first + intervals)
     COMM.Barrier()
     wall = (time.perf_counter() - begin) / intervals
     cpu = COMM.allreduce(time.process_time() - begin_cpu) / intervals
 
     # The peak is read before the triad, whose arrays may be larger than all else.
     memory = peak()
-    traffic = counted(moving, comm, first + intervals, min(intervals, 50))
+    traffic = counted(run, comm, first + intervals, min(intervals, 50))
     gigabytes = bandwidth()
     state_bytes = 2 * 8 * model.chain.cell.dofs * cells
     return {
@@ -127,10 +130,10 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
     } | traffic
 
 
-def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[str, float]:
+def counted(run: EngineRun, comm: CountingComm, done: int, intervals: int) -> dict[str, float]:
     """Messages and bytes that a rank sends to one neighbour, and reductions, in a sample interval; over ``intervals``.
 
-    ``moving`` has reached the sample ``done``. Messages are those of the scatters in PETSc's log, reductions those of
+    ``run`` has reached the sample ``done``. Messages are those of the scatters in PETSc's log, reductions those of
     its steps and those over ``comm``. The time of each of ``EVENTS`` on this rank is in ms.
     """
     # The log begins after the steps that were timed, which it would slow down.
@@ -144,7 +147,7 @@ def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[s
         return np.array([*traffic, *(1e3 * event["time"] for event in events)])
 
     before = logged()
-    moving.advance(done, done + intervals)
+    run.advance(done, done + intervals)
     # PETSc counts a message where it is sent and where it is received. Each of two ranks has one neighbour.
     messages, length, reductions, *spent = ((logged() - before) / intervals).tolist()
     found = {"messages": messages / 2, "message_bytes": length / 2, "reductions": reductions}
@@ -219,7 +222,7 @@ def large(folder: str) -> dict:
 
 
 if __name__ == "__main__":
-    task = {"flight": flight, "build": build, "large": large}[sys.argv[1]]
+    task = {"intervals": time_intervals, "build": build, "large": large}[sys.argv[1]]
     measured = task(**json.loads(sys.argv[2]))
     if COMM.rank == 0:
         print(json.dumps({"ranks": COMM.size} | measured))

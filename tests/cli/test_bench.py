@@ -78,11 +78,11 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, c
 
 @pytest.mark.mpirun
 def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch):
-    """A flight on two ranks reports times, memory, messages and reductions; a build reports its files and times."""
+    """Intervals on two ranks have times, memory, messages and reductions; a build has its files and times."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_scaling import builds, on_ranks
 
-    row = on_ranks(2, "flight", engine="ts", cells=30, intervals=3)
+    row = on_ranks(2, "intervals", engine="ts", cells=30, intervals=3)
 
     assert row["ranks"] == 2
     assert row["wall_ms"] > 0

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
+from vipetsc.figures.identified import DETERMINED, _draw_profile
 from vipetsc.figures.nfrc import lag_of
+from vipetsc.identification import uncertainty
 from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
 TIME = np.linspace(0.0, 0.3, 4)
@@ -214,3 +217,30 @@ def test_an_axis_of_a_constant_phase_does_not_show_its_rounding(axes, angles, lo
 
     assert axes.get_ylim() == pytest.approx((low, high), abs=1e-9)
     assert not axes.yaxis.get_major_formatter().get_offset()
+
+
+@pytest.mark.parametrize(("value", "label"), [(2e-3, "% from 0.002 m"), (0.0, "from 0 m")])
+def test_the_profile_of_a_parameter_whose_best_value_is_0_is_drawn(value, label):
+    """Percentages of 0 would be infinite; the parabola goes through 1 at one standard error."""
+    places = value + np.array([-1e-3, 0.0, 1e-3])
+    parameter = xr.Dataset(
+        {
+            "value": value,
+            "standard_error": 1e-3,
+            "profile/value": ("place", places),
+            "profile/cost": ("place", [1.0, 0.0, 1.0]),
+        },
+        coords={"parameter": "clearance", "unit": "m"},
+    )
+    axes = Figure().subplots()
+    _draw_profile(axes, parameter)
+    drawn, parabola = axes.lines[:2]
+    assert axes.get_xlabel() == label
+    assert np.isfinite(drawn.get_xdata()).all()
+    assert parabola.get_ydata()[[0, -1]] == pytest.approx([1.0, 1.0])
+    assert parabola.get_xdata()[[0, -1]] == pytest.approx(drawn.get_xdata()[[0, -1]])
+
+
+def test_the_line_of_undetermined_parameters_is_that_of_the_fit():
+    """The dashed line of the picture is at the error above which the fit takes a parameter for not determined."""
+    assert DETERMINED == uncertainty.DETERMINED

@@ -7,12 +7,9 @@ from collections.abc import Callable
 import h5py
 import numpy as np
 import pytest
-import xarray as xr
-from matplotlib.figure import Figure
 
 from vipetsc.case.registered import check_factors, check_law
 from vipetsc.case.waveforms import OneDrive, waveform_record
-from vipetsc.figures.identified import _draw_profile
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.sources import FILES
 from vipetsc.register import DISSIPATION, FIGURE, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
@@ -99,25 +96,3 @@ def test_registered_figures_are_found_by_every_kind_of_results(source, tmp_path)
         # Parts stay registered in this process.
         PARTS[FIGURE].pop("mine", None)
     assert (set(figures), message) == ({"mine"}, "")
-
-
-@pytest.mark.parametrize(("value", "label"), [(2e-3, "% from 0.002 m"), (0.0, "from 0 m")])
-def test_the_profile_of_a_parameter_whose_best_value_is_0_is_drawn(value, label):
-    """Percentages of 0 would be infinite; the parabola goes through 1 at one standard error."""
-    places = value + np.array([-1e-3, 0.0, 1e-3])
-    parameter = xr.Dataset(
-        {
-            "value": value,
-            "standard_error": 1e-3,
-            "profile/value": ("place", places),
-            "profile/cost": ("place", [1.0, 0.0, 1.0]),
-        },
-        coords={"parameter": "clearance", "unit": "m"},
-    )
-    axes = Figure().subplots()
-    _draw_profile(axes, parameter)
-    drawn, parabola = axes.lines[:2]
-    assert axes.get_xlabel() == label
-    assert np.isfinite(drawn.get_xdata()).all()
-    assert parabola.get_ydata()[[0, -1]] == pytest.approx([1.0, 1.0])
-    assert parabola.get_xdata()[[0, -1]] == pytest.approx(drawn.get_xdata()[[0, -1]])

@@ -7,8 +7,10 @@ from matplotlib.axes import Axes
 from vipetsc.figures import style
 from vipetsc.figures.panels import annotate_empty
 
-ROOM = 0.1  # above and below the curve of the damping ratio, over its range
-LEAST_ROOM = 0.1  # the same over its largest value: of a branch without contact the ratio is constant but for rounding
+# Room above and below the curve of the damping ratio: this fraction of its range, and at least this fraction of its
+# largest value, since without contact the ratio is constant but for rounding.
+ROOM = 0.1
+LEAST_ROOM = 0.1
 
 
 def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
@@ -32,9 +34,9 @@ def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
     if "force" not in branch or not np.isfinite(branch["force"].values).any():
         return
 
-    of_forces = axes.twinx()
-    of_forces.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
-    of_forces.set(yscale="log", ylabel="force in resonance (N)")
+    force_axes = axes.twinx()
+    force_axes.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
+    force_axes.set(yscale="log", ylabel="force in resonance (N)")
     # An empty curve for the legend, which is one for both axes.
     axes.plot([], [], color=style.VERMILION, lw=1.0, ls="--", label="force")
     axes.legend(fontsize=5.5)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.measure_panels import cell_edges
-from vipetsc.figures.panels import band_of, percentile_norm
+from vipetsc.figures.panels import percentile_norm, quantile_band
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
@@ -25,7 +25,7 @@ from vipetsc.wording import counted
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
 FACETS = ("reading", "wavenumber")
-SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1: room for the text above the peak
+SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1, with room for the text above the peak
 FEWEST = 4  # amplitudes of a sweep with pages: with fewer, a peak and a power law beyond it cannot be seen
 MOST_COLUMNS = 3  # of histories: each is then as wide as a third of a page
 FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
@@ -59,13 +59,16 @@ class EntropyCurve(NamedTuple):
 
         # ``normalised`` gives 0.01 + 0.99 (value - least) / range; the deviation and the quantiles are scaled alike.
         scale = 0.99 / np.ptp(value)
-        ends = band_of(row, f"entropy/{average}")
+        ends = quantile_band(row, f"entropy/{average}")
+        band = None
+        if ends:
+            band = [0.01 + scale * (end[valid] - value.min()) for end in ends]
         return cls(
             amplitude=row[AMPLITUDE].values[valid],
             value=normalised(value),
             error=scale * row["entropy/error"].values[valid],
             fit={name: float(row[f"fits/entropy/{average}/{name}"]) for name in FIT_VALUES},
-            band=ends and [0.01 + scale * (end[valid] - value.min()) for end in ends],
+            band=band,
         )
 
 

@@ -46,7 +46,7 @@ HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 # the tongues are labelled by their resonance instead, at their highest fold.
 MOST_MARKS = 12
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
-LEAST_DIFFERENCE = 1e-17  # shown in place of 0, which a logarithmic axis has not: below all rounding
+LEAST_DIFFERENCE = 1e-17  # drawn in place of 0, for which a logarithmic axis has no place; it is below all rounding
 
 SLOPE = r"|d$f$/d$E$| (Hz/J)"
 
@@ -297,9 +297,9 @@ def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     """Draw the neighbourhood of the point ``first``, where contact begins, in an inset that covers least of the branch.
 
-    The inset shows the branch up to where the frequency is a tenth off that of the last energy fold, or of the point
-    ``first`` if there is no fold, but at least three points beyond ``first``. Where it is so nowhere the inset
-    ends with a tenth of the largest change.
+    The inset shows the branch up to where the frequency differs by a tenth from that of the last energy fold, or of the
+    point ``first`` if there is no fold, but at least three points beyond ``first``. If the frequency differs by so much
+    nowhere, the inset ends where it has changed by a tenth of its largest change.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values

@@ -10,9 +10,13 @@ from vipetsc.figures import panels, style
 
 MOST_CHANNELS = 8  # on a page, which is 15 inches high then
 MOST_NAMES = 12  # parameters that are named in a legend, and whose correlations are written out: more would overlap
-# Samples to which the correlation of residuals is drawn: a few periods of a record, in which physics that the model
-# neglects shows.
+# Largest lag, in samples, to which the correlation of residuals is drawn: a few periods of a record, in which physics
+# that the model neglects shows.
 MOST_LAGS = 40
+# The error above which a parameter counts as not determined, as `vipetsc.identification.uncertainty.DETERMINED`, which
+# figures may not import. It is a factor of 1.6 of a positive parameter, half the range of others.
+DETERMINED = 0.5
+LARGEST_ERROR = 1e6  # drawn for a direction in the parameters' space that the record says nothing about
 
 
 def record_and_model(identified: xr.Dataset) -> Figure:
@@ -122,8 +126,7 @@ def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
 def parameter_correlation(identified: xr.Dataset) -> Figure:
     """Draw the correlation of the parameters' errors, and the error along each direction in their space.
 
-    Directions are the right singular vectors of the Jacobian; dashed is the error above which a parameter counts as not
-    determined (``vipetsc.identification.uncertainty.DETERMINED``).
+    Directions are the right singular vectors of the Jacobian; the dashed line is at ``DETERMINED``.
     """
     names = identified["parameter"].values
     count = len(names)
@@ -142,10 +145,10 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
             value = float(identified["correlation"].values[row, column])
             matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5)
 
-    # A direction that the record says nothing about has the singular value 0: its error is drawn as 1e6.
-    singular = np.maximum(identified["singular"].values, 1e-6)
+    # The error along a direction is 1 over its singular value, which may be 0.
+    singular = np.maximum(identified["singular"].values, 1 / LARGEST_ERROR)
     directions.semilogy(identified["direction"].values, 1 / singular, "o", color=style.BLUE, ms=4)
-    directions.axhline(0.5, color=style.GREY, lw=0.7, ls=style.DASHED)
+    directions.axhline(DETERMINED, color=style.GREY, lw=0.7, ls=style.DASHED)
     directions.set(xlabel="direction", ylabel="relative error along it", title="Dashed: no longer determined")
     panels.label_panels([matrix, directions])
     return figure
@@ -163,9 +166,9 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     misfit, course, starts = figure.subplots(1, 3)
     windows = identified["window"].values
     misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
+    # The number of contact episodes in each window stands at the foot of the panel.
     for number, impacts in zip(windows, identified["windows/impacts"].values, strict=True):
         misfit.annotate(str(impacts), (number, 0.02), xycoords=("data", "axes fraction"), fontsize=5, ha="center")
-    # At the foot of the panel are the numbers of contact episodes that the windows have.
     misfit.set(xlabel="window (below: contacts)", ylabel="misfit / noise", title="Misfit")
 
     values = identified["windows/value"].values

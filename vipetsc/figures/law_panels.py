@@ -1,4 +1,4 @@
-"""The scattering law of one site: energies over z, those of bands and directions, and the onset from close by."""
+"""The scattering law of one site: energies over z, energies by band and direction, and the onset enlarged."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ ENERGIES: dict[str, dict[str, Any]] = {
     "dissipated": {"label": "L, dissipated", "color": style.ORANGE, "ls": "-."},
 }
 DASHPOTS: dict[str, Any] = {"label": "D, dashpots", "color": style.GREEN, "ls": style.DASHED}
-FLOOR = 1e-5  # least fraction of the energy that arrives that a logarithmic axis shows
+FLOOR = 1e-5  # smallest fraction of the incident energy that a logarithmic axis shows
 MARKS: dict[str, dict[str, Any]] = {
     "forward": {},
     "backward": {"marker": "o", "ms": 3, "mfc": "white", "mew": 0.7, "markevery": 0.1},
@@ -28,7 +28,7 @@ LABELS_TO = 20  # largest z of an axis that has labels at 2 and 5 too: on a long
 
 
 class LawCurve(NamedTuple):
-    """A fraction of the energy that arrives, over z, and its standard deviation over the runs at each z."""
+    """A fraction of the incident energy over z, and its standard deviation over the runs at each z; both (z,)."""
 
     value: np.ndarray
     scatter: np.ndarray
@@ -38,7 +38,8 @@ def law(data: xr.Dataset) -> Figure:
     """Draw over z: T, R, U, L (and D); what leaves by band and direction; T, U and U/(1-T) from the onset on.
 
     z is the largest relative displacement that the wave would cause at the site without contact, over the clearance:
-    contact begins at z = 1. Dotted is z*, of the points with nearly the largest U/(1-T) that with the largest T.
+    contact begins at z = 1. A dotted line marks z*: among the points at which U/(1-T) is nearly largest, it is the one
+    with the largest T.
     """
     z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)

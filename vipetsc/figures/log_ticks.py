@@ -13,8 +13,8 @@ LETTER = 0.062  # width in inches of a letter of a tick's label, in the type of 
 LINE = 0.14  # height in inches of a tick's label
 PLAIN = 1e-3, 1e4  # numbers from the first up to the second are written without a power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-# Fraction of the length of an axis that the layout leaves it when it makes room for labels. Ticks are chosen before the
-# layout, which depends on them.
+# About the fraction of an axis' length that is left when the layout has made room for labels. Ticks are chosen before
+# the layout, which depends on them.
 PART = 0.8
 
 

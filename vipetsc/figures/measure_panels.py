@@ -20,10 +20,10 @@ from vipetsc.figures.swept_axes import SweptAxis
 
 MARKERS = "os^Dv*"  # of curves, in their order
 SINGLE = 4.8  # width in inches of a page with one panel
-LETTERS = 17  # of a page's title on an inch
-PANEL_LETTERS = 15  # of a panel's title on an inch; fewer, since the titles of panels side by side must not touch
-LEGEND_LETTERS = 17  # of a legend on an inch
-MOST_COLUMNS = 4  # of panels
+LETTERS = 17  # letters of a page's title that fit into an inch
+PANEL_LETTERS = 15  # letters of a panel's title on an inch; fewer, since titles side by side must not touch
+LEGEND_LETTERS = 17  # letters of a legend that fit into an inch
+MOST_COLUMNS = 4  # columns of panels
 MOST_TICKS = 8  # values of a key up to which each is a tick with a label
 SIDES = 0.9  # inches of a page's width that its labels and its colour bar take
 PANEL_HEIGHT = 1.4  # inches that a panel is high at least
@@ -31,7 +31,9 @@ USED = 0.85  # fraction of the length of an axis between the first and the last 
 # Ratio of the largest to the smallest value of a measure above which its scale is logarithmic: of the two decades the
 # lower one would have a tenth of a linear scale.
 LOG_RATIO = 100.0
-CONTOURS = 6, 3  # on a map at most: on a single one, and on one of several, whose labels have less room
+# Most contours on a map: on a single map, and on one of several, where labels have less room.
+CONTOURS_ON_ONE = 6
+CONTOURS_ON_SEVERAL = 3
 BAND = "band "
 TOGETHER = "band\u00a0"  # no line ends between a band and its number
 
@@ -234,14 +236,16 @@ def draw_maps(
     norm = _norm(np.stack(fields))
     if common:
         norm = _norm(common.values)
+    most_contours = CONTOURS_ON_ONE
+    if len(fields) > 1:
+        most_contours = CONTOURS_ON_SEVERAL
     for axes, unordered in zip(page.panels, fields, strict=True):
         values = unordered[np.ix_(y_order, x_order)]
         # The ground shows where values are missing.
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
         edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
         image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)
-        most = CONTOURS[len(fields) > 1]
-        _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm, most)
+        _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm, most_contours)
         label_positions(axes.yaxis, y, PANEL_HEIGHT)
         if common:
             axes.set_xlim(cell_edges(np.unique(common.x), x.scale)[[0, -1]])
@@ -274,7 +278,7 @@ def _norm(values: np.ndarray) -> Normalize:
 
 
 def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, most: int) -> None:
-    """Draw at ``most`` so many labelled contours of ``values`` (y, x), light where the map is dark."""
+    """Draw labelled contours of ``values`` (y, x), at most ``most``; they are light where the map is dark."""
     finite = values[np.isfinite(values)]
     if len(finite) < 4 or np.ptp(finite) == 0:
         return

@@ -18,7 +18,10 @@ PART = "part"  # the dimension of parts of the frequency axis
 
 
 class Roles(NamedTuple):
-    """Roles of the axes of a measure in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
+    """Roles of the axes of a measure: ``x`` (and ``y`` of a map) become axes of the panels, the others are compared.
+
+    Each combination of the values of ``curves`` is a curve in a panel, of ``panels`` a panel, and of ``pages`` a page.
+    """
 
     x: SweptAxis
     y: SweptAxis | None
@@ -48,12 +51,12 @@ class Roles(NamedTuple):
         # Of axes of one length the first one in the case comes first: the sort is stable.
         longest_first = sorted(axes, key=lambda axis: -axis.size)
         numbers = [axis for axis in longest_first if axis.is_number]
-        of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
+        map_axes = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
         x = (numbers or longest_first)[0]
         y = None
         taken = {x.dimension}
-        if len(of_a_map) > 1:
-            y = of_a_map[1]
+        if len(map_axes) > 1:
+            y = map_axes[1]
             taken.add(y.dimension)
 
         # The last axes of a case vary fastest: what they compare stands closest together. Pass bands are no curves if
@@ -72,7 +75,7 @@ class Roles(NamedTuple):
 
 
 def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
-    """Return as many of the last ``axes`` as have ``most`` combinations of values or fewer together."""
+    """Return as many of the last ``axes`` as together have at most ``most`` combinations of values."""
     count = 0
     while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
         count += 1

@@ -23,8 +23,8 @@ from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 
 SHAPE = 9 / 16  # height over width, that of screens
-INCHES = 8.0  # the width that type is set for
-DECADES = 4  # of energy that are shown: each then has half an inch of the panel
+INCHES = 8.0  # width of the page for which the sizes of type are chosen
+DECADES = 4  # decades of energy that are shown: each then has half an inch of the panel
 # Opacity of an impact's light below which it is not drawn: it could not be seen, and would change pixels that a GIF has
 # to store.
 FAINTEST = 0.05

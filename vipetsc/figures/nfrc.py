@@ -16,7 +16,7 @@ from vipetsc.figures import panels, style
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.wording import with_unit
 
-# Label, colour, and the line by which they differ in grey.
+# Label, colour and line of each fraction of the energy, by its name in the file; in greyscale print the lines differ.
 ENERGIES = {
     "transmitted": ("T, transmitted", style.BLUE, "-"),
     "reflected": ("R, reflected", style.SKY, style.DASHED),

@@ -23,7 +23,7 @@ SYMBOLS = {
     "ibtet": "ibtet",
     "entropy": "entropy (bit)",
 }
-MOST_LINES = 12  # variables whose names have the usual size: those of more would touch
+MOST_LINES = 12  # variables whose names have the usual size; names of more would touch
 
 
 class ComparedDesign(NamedTuple):
@@ -254,7 +254,7 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
 def _draw_energies(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase) -> None:
     """Draw bars of the energy in every band, and what was lost, of each design at the case's amplitude, or near it."""
     amplitudes = optimum["amplitude"].values
-    # By ratios: amplitudes of a curve are log-spaced.
+    # Nearest by ratio: amplitudes of a curve are spaced in logarithms.
     nearest = int(np.argmin(np.abs(np.log(amplitudes / plan.amplitude))))
     labels = [*(f"band {band}" for band in optimum["band"].values), "lost"]
 

@@ -17,10 +17,10 @@ from vipetsc.case import Model
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
-DECADES = 5  # of energy that a map shows: a decade then has 50 of its 256 colours
+DECADES = 5  # decades of energy that a map shows: each then has 50 of the map's 256 colours
 # Most rows and columns of a map. A page of maps takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
 PIXELS = 600
-MOST_LINES = 30  # of sites in a map; more lines would hide it
+MOST_LINES = 30  # lines across a map at its sites; more would hide it
 # Numerals of the rows of a grid of panels. Further rows have none.
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
@@ -33,10 +33,10 @@ KAPPA = "Wavenumber κ (π rad/cell)"
 OMEGA = "Frequency ω (krad/s)"
 
 
-def band_of(row: Mapping[Any, Any], name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the lowest and highest stored quantile (point) over the disorder samples of the measure ``name``.
+def quantile_band(row: Mapping[Any, Any], name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the ends (point) of the band between the stored quantiles of a measure over samples of disorder.
 
-    None where there are no such samples.
+    ``row`` has the variables of a sweep by name, ``name`` is that of the measure. None without such samples.
     """
     path = f"statistics/{name}/quantiles"
     if path not in row:

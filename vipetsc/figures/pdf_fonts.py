@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Ligatures, kerning and classes of letters. Matplotlib places each letter itself. Of these tables fontTools would read
-# and cut down all, which takes more than half of the time of a font, and keep letters that no picture shows.
-OF_TYPESETTING = ("GSUB", "GPOS", "GDEF")
+# Tables of ligatures, kerning and classes of letters. They are of no use, since matplotlib places each letter itself.
+# To cut them down to a picture's letters takes fontTools more than half of its time for a font, and keeps further
+# letters, to which ligatures refer.
+TYPESETTING_TABLES = ("GSUB", "GPOS", "GDEF")
 
 
 @contextmanager
@@ -15,7 +16,7 @@ def plain_fonts() -> Iterator[None]:
     from fontTools.subset import Options  # type: ignore[import-untyped]
 
     dropped = Options._drop_tables_default
-    Options._drop_tables_default = [*dropped, *OF_TYPESETTING]
+    Options._drop_tables_default = [*dropped, *TYPESETTING_TABLES]
     try:
         yield
     finally:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
 
-LEAST = 1e-4  # of the work, the smallest energy shown
-MOST_SITES = 6  # that have a name in the legend: as many as there are dashes
+LEAST = 1e-4  # smallest energy shown, over the work
+MOST_SITES = 6  # sites that have a name in the legend: as many as there are dashes
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
 LOSSES: dict[str, dict[str, Any]] = {
     "dissipated": {"label": "contacts", "color": style.BLACK, "ls": "-"},

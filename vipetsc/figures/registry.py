@@ -97,7 +97,7 @@ THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three v
 BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
 _SPECS = (
-    # Of a run those that take longest come first, so that ranks which divide them end at about the same time.
+    # The figures of a run are listed by falling duration, so that ranks which share them end at about the same time.
     FigureSpec("modal_energies", RUN, modal.modal_energies, without=modal.without_modal_energies),
     FigureSpec("spacetime", RUN, runs.spacetime, without=runs.without_spacetime),
     FigureSpec("dispersion", RUN, runs.dispersion, without=runs.without_dispersion),

@@ -78,11 +78,11 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
     keys = [_keys_of(curve) for curve in curves]
     parts: list[list[str]] = [[] for _ in curves]
     # In the order of the first curve. A key that has one value in all curves tells none from another.
-    for path in dict.fromkeys(path for of_curve in keys for path in of_curve):
-        values = [of_curve.get(path, ("", ""))[0] for of_curve in keys]
+    for path in dict.fromkeys(path for curve_keys in keys for path in curve_keys):
+        values = [curve_keys.get(path, ("", ""))[0] for curve_keys in keys]
         if len({repr(value) for value in values}) == 1:
             continue
-        unit = next(of_curve[path][1] for of_curve in keys if path in of_curve)
+        unit = next(curve_keys[path][1] for curve_keys in keys if path in curve_keys)
         texts = SweptKey(path, unit, coordinate(values)).texts
         for part, text in zip(parts, texts, strict=True):
             part.append(text)

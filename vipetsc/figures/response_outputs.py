@@ -14,12 +14,12 @@ from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, resp
 
 # Labels of the rows of the page by the quantities that they show.
 AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
-# Lines by which locations differ in grey.
+# Lines of locations, which differ in greyscale print.
 DASHES = ("-", style.DASHED, "-.", style.DOTTED)
 
 
 def without_outputs(branches: Sequence[xr.Dataset]) -> str:
-    """Return why ``branches`` have no such page together; empty if they have one."""
+    """Return why ``branches`` have no page of ``response_outputs`` together; empty if they have one."""
     if _all_have(branches, "lag") or _all_have(branches, "largest_force"):
         return ""
     return "needs [output] points or forces = true in the case of nfrc"
@@ -33,7 +33,8 @@ def _all_have(branches: Sequence[xr.Dataset], name: str) -> bool:
 def response_outputs(paths: Sequence[Path]) -> Figure:
     """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file.
 
-    Of several files masses or forces are drawn if all have them; one of both must be so (``without_outputs``).
+    The motion of masses is drawn if all files have it, and so are forces. All files must have one of the two (see
+    ``without_outputs``).
     """
     curves = responses_in(paths)
     rows: list[Callable[[Axes, xr.Dataset], None]] = []

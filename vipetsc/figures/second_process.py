@@ -27,7 +27,10 @@ MOST_CORES = 4  # to draw on: a run has seven pictures, and each core needs 60 M
 
 
 class DrawRequest(NamedTuple):
-    """A call of ``vipetsc.figures.registry.draw`` with ``options``; processes share its pictures by their ``turns``."""
+    """A call of ``vipetsc.figures.registry.draw`` with ``options``.
+
+    The processes that draw share its pictures: each takes the next number from ``turns`` when it has become free.
+    """
 
     options: Mapping[str, Any]
     turns: Iterator[int]
@@ -87,8 +90,8 @@ class SecondProcess:
     def is_useful() -> bool:
         """Whether a second process saves time: there is an idle core, and the tools for pictures are not loaded here.
 
-        If they are loaded, as in a test or a notebook, this process has drawn before a second one could begin. If other
-        work takes all cores, a second process that loads the program takes time from the first.
+        If they are loaded, as in a test or a notebook, this process is done with a picture before a second one could
+        begin. If other work takes all cores, a second process that loads the program takes time from the first.
         """
         # macOS has neither affinities nor files in memory (``os.memfd_create``).
         if not sys.platform.startswith("linux"):

@@ -1,4 +1,4 @@
-"""Sizes, type and colours of all pictures; an empty figure; how figures become files, and which rank draws which."""
+"""Sizes, type and colours of all pictures; empty figures; how figures become files, and how ranks share pictures."""
 
 import json
 import sys
@@ -26,9 +26,9 @@ from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN = 3.4  # width of one journal column in inches
 PAGE = 7.0  # width of two
-NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
-LETTERS = 19  # of a note on an inch of its width
-HEADING_LETTERS = 15  # of a heading on an inch
+NOTE = 0.165  # height in inches that a line of a note takes in the strip below a picture
+LETTERS = 19  # letters of a note that fit into an inch of its width
+HEADING_LETTERS = 15  # letters of a heading that fit into an inch
 COMPRESSION = 3  # of a PNG, from 1 to 9: files are 4 % larger than with 6, with which a picture takes a sixth longer
 # Dots per inch of a PNG. The maps of a run take 379 kB and 0.21 s; at 100 they take 145 kB, and small type is blurred;
 # at 400 they take 644 kB and 0.33 s, and a report of many pages loads slowly.
@@ -51,7 +51,7 @@ DASHED = (0, (4, 2))
 DOTTED = (0, (1, 2))
 DASHES_SEEN = 2.4  # length of a line in a legend, in heights of its letters, at which its dashes can be recognised
 
-# Of pass bands, from the lowest one; the seventh has the look of the first. The dashes are for greyscale print.
+# Looks of pass bands, from the lowest one; the seventh has that of the first. The dashes are for greyscale print.
 BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 BAND_DASHES = ("-", (0, (6, 1)), (0, (4, 1, 1, 1)), (0, (1.5, 0.8)), (0, (6, 1, 1, 1, 1, 1)), (0, (3, 2)))
 

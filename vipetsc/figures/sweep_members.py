@@ -26,7 +26,7 @@ from vipetsc.wording import counted
 
 AMPLITUDE = "amplitude"
 SITES = "contacts.sites"
-# Keys that the names of a case have anyway (`Labels`).
+# Keys whose values are in the names of every case (`Labels`).
 NAMED = {"contacts.law", "lattice.reading", SITES, "drive.cycles", "drive.amplitude"}
 LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
@@ -60,8 +60,7 @@ class Sweeps(list[xr.Dataset]):
 class MemberRun(NamedTuple):
     """A member of a sweep with its fields: its ``case``, resolved to a ``model`` (which counts from 0), and its files.
 
-    ``varied`` is a text with the keys that the sweep varies and their values, without those that names of cases have
-    anyway.
+    ``varied`` is a text with the keys that the sweep varies and their values, without the keys ``NAMED``.
     """
 
     folder: Path

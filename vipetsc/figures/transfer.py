@@ -30,8 +30,8 @@ from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, taper
 
 FIELD = "bands/kinetic_energy"  # (band, t, cell) in J
-# Cell whose spectrum before the sites the paper shows. The other one, behind them, is its cell 150, the middle of the
-# lattice.
+# The paper shows spectra of two cells: this one, before the sites, and cell 150, the middle of its lattice, which the
+# wave reaches after it has met sites.
 INPUT_CELL = 5
 
 
@@ -49,12 +49,12 @@ SEGMENTS = {
 }
 OUTLINE = [withStroke(linewidth=3.4, foreground=style.BLACK)]  # seen on bright and dark places of a map
 TEXT_OUTLINE = [withStroke(linewidth=1.4, foreground=style.BLACK)]
-ROOM = 1e4  # factor from a spectrum's peak to the end of its axis, where the time history is inset
+ROOM = 1e4  # factor from the peak of a spectrum to the end of its axis: room for the inset with the time history
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
 MOST_COLUMNS = 4  # of dispersions on a page
 MOST_PANELS = 12  # on a page of members that have nothing in common
 LETTERS = 14  # of the titles of dispersions on an inch
-DECADES = 6  # below the total energy, over which energies of parts are shown
+DECADES = 6  # decades below the total energy over which energies of parts are shown
 LARGEST_ERROR = 0.01  # of the sum of the parts over the total, the paper's 1 %
 # Total energy over its largest, below which the sum of the parts is not compared with it: there the error of the sum is
 # that of the filters' tails.

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import style
-from vipetsc.figures.panels import band_of, note, recorded_sites, shade_regions
+from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import (
@@ -39,7 +39,7 @@ from vipetsc.io.read import curves, field_interval, field_time
 from vipetsc.spectra import doubt
 
 MARKERS = "os^Dv"  # of configurations
-FEWEST = 6  # amplitudes of a curve: two each below, near and beyond the peak
+FEWEST = 6  # amplitudes of a curve that is drawn: two each below, near and beyond the peak
 PERIODS = 10  # of the drive in a phase portrait: more turns would cover each other
 REACH = 6  # end of the linear panels over the amplitude of the peak; the logarithmic ones show all
 BACKBONE_LABEL = "Inter-band transfer, normalised slope (1)"
@@ -158,7 +158,7 @@ def _draw_curve(axes: Axes, curve: TransferCurve, look: _Look, name_band: bool) 
     amplitudes = np.asarray(curve.data[AMPLITUDE])
     line = {"color": look.colour, "marker": look.marker, "ms": 2.2, "lw": 0.7}
     axes.plot(amplitudes, np.asarray(curve.data["ibtet"]), label=look.label, **line)
-    band = band_of(curve.data, "ibtet")
+    band = quantile_band(curve.data, "ibtet")
     if band:
         label = "5 to 95 % of samples" if name_band else ""
         axes.fill_between(amplitudes, *band, color=look.colour, alpha=0.25, lw=0, label=label)
@@ -234,8 +234,9 @@ def _groups(values: Mapping[Any, Any]) -> list[dict[str, Any]]:
 def _superposition(axes: Axes, aligned: TransferCurve) -> str:
     """Draw a lattice's transfer and its branch's slope over normalised energy, and return the panel's title.
 
-    Points are the lattice's transfer, red where it was fitted in region III, with the fit in green. Dashed is the slope
-    over the divisor with which it fits the transfer; grey is the same with the floor added.
+    Blue points are the lattice's transfer; the power law in green was fitted to the red ones, in region III. The dashed
+    line is the branch's slope over the divisor with which it fits the transfer, the grey line the same with the floor
+    added.
     """
     curve = aligned.data
     energy = curve["energy"]
@@ -260,13 +261,13 @@ def _superposition(axes: Axes, aligned: TransferCurve) -> str:
     axes.plot(energy, transfer, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
     axes.plot(energy[fitted], transfer[fitted], "o", color=style.RED, ms=2.8, label="in region III")
 
-    law = curve["factor"] * energy[fitted] ** curve["exponent"]
+    power_law = curve["factor"] * energy[fitted] ** curve["exponent"]
     label = f"$E^{{{curve['exponent']:.2f}}}$, adj. $R^2$ {curve['r2_adjusted']:.3f}"
     doubts = doubt(fitted.sum(), curve["r2_adjusted"])
     if doubts:
-        law = np.full_like(law, np.nan)
+        power_law = np.full_like(power_law, np.nan)
         label = f"no power law: {doubts}"
-    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=label)
+    axes.plot(energy[fitted], power_law, color=style.GREEN, lw=1.4, zorder=4, label=label)
 
     # Region I is shaded up to grazing, not only to the last point of the branch before it.
     shaded = np.minimum(np.where(region == 1, grazing, branch), right)

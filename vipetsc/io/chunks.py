@@ -5,7 +5,8 @@ A chunk holds the samples between two checkpoints. Each rank stores a part of it
 - fields (sample, dof, cell) such as ``displacement``, whose cells are the half-open ranges ``columns`` (range, 2) of
   the recorded cells, numbered from 0;
 - losses and forces (sample, site), whose sites are the half-open ranges ``sites`` (range, 2), from 0;
-- ``impacts`` (episode,), a record of each contact episode that ended in the chunk, in the last one of open ones too;
+- ``impacts`` (episode,), a record of each contact episode that ended in the chunk; in the last chunk also of those that
+  are still open;
 - in the part of rank 0 what belongs to a sample as a whole (``SAMPLED``, ``DAMPING`` and ``MOTION``).
 """
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 # Variables of the file by name: dimensions, units, text.
 # ``SAMPLED``, ``DAMPING`` and ``MOTION`` are known on rank 0 for every sample; ``GIVEN`` is known before the first one.
-# ``LARGE`` are the fields, losses and forces and the log of contacts: where ranks write together, each has a part.
+# ``LARGE`` are fields, losses, forces and the log of contacts, of which each rank has a part.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -88,10 +89,20 @@ GIVEN = {
 class Recording:
     """Description of the contents of the chunks of a run.
 
-    ``given``: the arrays of ``GIVEN``; ``fields``: names of the recorded ones; ``together``: whether all ranks write
-    into one common file, instead of rank 0 alone; ``rows``: samples in a field of the whole run. ``sampled``: names of
-    the variables that rank 0 has of every sample, from ``SAMPLED``, ``DAMPING`` and ``MOTION``; ``of_sites``: names of
-    those over (time, site).
+    Attributes
+    ----------
+    given
+        The arrays of ``GIVEN`` by name.
+    fields
+        Names of the fields that are recorded.
+    together
+        Whether all ranks write into one common file; otherwise rank 0 writes it alone.
+    rows
+        Number of samples in a field of the whole run.
+    sampled
+        Names of the variables that rank 0 has of every sample, from ``SAMPLED``, ``DAMPING`` and ``MOTION``.
+    of_sites
+        Names of the variables over (time, site), from ``LOSSES`` and ``FORCES``.
     """
 
     given: Arrays

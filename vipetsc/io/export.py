@@ -16,14 +16,14 @@ from vipetsc.wording import with_unit
 
 # Samples that run.xdmf lists; of a run with more, every n-th. One takes about 1 kB, so that the text has 5 MB at most.
 MOST_FRAMES = 5000
-MOST_ROWS = 1_000_000  # of a table: spreadsheets read no more
-MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site: 400 MB of text
+MOST_ROWS = 1_000_000  # rows of a table: spreadsheets read no more
+MOST_NUMBERS = 20_000_000  # numbers in a table with a column for each point or site: 400 MB of text
 ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
-# Variables of a search over (design, label), and the dimension of the labels, which name the columns of its table.
-OF_DESIGNS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
-# The second dimensions of variables of a frequency response, whose labels name the columns of its table.
-OF_RESPONSES = {"way", "site", "location", "pair", "wall"}
+# Variables of a search over (design, label), each with the dimension of its labels, which name the columns of a table.
+DESIGN_LABELS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
+# Second dimensions that variables of a frequency response may have. Their labels name the columns of its table.
+RESPONSE_LABELS = {"way", "site", "location", "pair", "wall"}
 HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
@@ -151,10 +151,10 @@ def write_curves(path: Path) -> list[Path]:
 def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
     """Columns (design,) for the variables, objectives and constraints of a search, by their labels.
 
-    None where ``data`` are not a search, or a table's ``dims`` are not those of its designs.
+    There are no columns if ``data`` are not a search, or ``dims``, those of a table, are not those of its designs.
     """
     columns = {}
-    for name, label in OF_DESIGNS.items():
+    for name, label in DESIGN_LABELS.items():
         if name not in data or data[name].dims != (*dims, label):
             continue
         units = ["1"] * data.sizes[label]
@@ -168,22 +168,22 @@ def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr
 def _columns_of_responses(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
     """Columns (point,) of a frequency response for each mass, contact or wall, by variable and label.
 
-    None where ``data`` are no response, or a table's ``dims`` are not those of its points.
+    There are no columns if ``data`` are no response, or ``dims``, those of a table, are not those of its points.
     """
     columns: dict[str, xr.DataArray] = {}
     if dims != ("point",) or data.attrs.get("branch_kind") != RESPONSES:
         return columns
     for name, item in data.data_vars.items():
-        if len(item.dims) == 2 and item.dims[1] in OF_RESPONSES:
+        if len(item.dims) == 2 and item.dims[1] in RESPONSE_LABELS:
             for label, values in zip(data[item.dims[1]].values, item.values.T, strict=True):
                 columns[f"{name}/{label}"] = xr.DataArray(values, dims=dims, attrs={"units": item.attrs["units"]})
     return columns
 
 
 def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
-    """Write the motion of points and the forces at sites over time, a column for each point or site.
+    """Write the motion of points and the forces at sites over time, a column for each point or site; return the files.
 
-    None of results that are no ``run`` or recorded neither; the files are named after ``source``.
+    Nothing is written for results that are no ``run``, or that recorded neither. Files are named after ``source``.
     """
     columns: dict[str, dict[str, np.ndarray]] = {"points": {}, "forces": {}}
     for name in MOTION:

@@ -175,6 +175,7 @@ def _claim(
     foreign = _holds_another_kind(path, kind)
     if not foreign:
         _finish_swap(path, kind)
+    # An empty folder is no result.
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
     if foreign or (filled and not (path / kind.marker).exists()):
         raise FolderError(f"{path}: contains files that are not a {kind.noun}'s of this kind; choose another --out")
@@ -199,7 +200,7 @@ def _claim(
             folder = aside
         folder.mkdir(exist_ok=True)
 
-    # Of continued results keys may have changed with which they stay valid: the text is then the present one.
+    # Keys that leave continued results valid may have changed: the text is then replaced by the present one.
     if not going_on or _text_of(folder / kind.marker) != text:
         write_text(folder / kind.marker, text)
     remove_temporary_files(folder)

@@ -21,8 +21,9 @@ logger = logging.getLogger(__name__)
 LOCK = ".lock"
 # The name of this process in a lock: two processes in containers on one host may have the same number.
 TOKEN = secrets.token_hex(8)
-# s. Where a rank is killed, mpirun returns before its other ranks are gone, and the same command may be typed at once:
-# it sends them SIGTERM and, a second later, SIGKILL, and one with much memory takes a moment more.
+# Seconds that a command waits for another one in the folder. If a rank is killed, mpirun returns before its other ranks
+# are gone, and the same command may be typed at once. mpirun sends the others SIGTERM and, a second later, SIGKILL; a
+# rank with much memory takes a moment more.
 PATIENCE = 5.0
 LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
 

@@ -31,9 +31,9 @@ Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
 Node: TypeAlias = "h5py.h5g.GroupID | h5py.h5d.DatasetID"
 
-# Attributes by which HDF5 and netCDF-4 describe dimensions: they are no attributes of a variable.
-OF_DIMENSIONS = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
-OF_DIMENSIONS |= {"_Netcdf4Dimid", "_Netcdf4Coordinates", "_nc3_strict", "_NCProperties"}
+# Attributes by which HDF5 and netCDF-4 describe dimensions. Readers do not see them as attributes of a variable.
+DIMENSION_ATTRIBUTES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
+DIMENSION_ATTRIBUTES |= {"_Netcdf4Dimid", "_Netcdf4Coordinates", "_nc3_strict", "_NCProperties"}
 # The attribute NAME of a dimension without a coordinate begins so.
 NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -59,7 +59,7 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
     Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
-    # HDF5 crashes after a full disk. It makes the file in memory, and Python writes the bytes.
+    # HDF5 only makes the file in memory, and Python writes its bytes: where the disk is full, HDF5 would crash later.
     with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
         put_dataset(file, data)
         file.flush()
@@ -203,12 +203,12 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
     attributes: dict[str, Any] = {}
     with files.acquire_context() as file:
         nodes = dict(_nodes("", h5py.h5g.open(file.id, b"/")))
-        # The address of an object is at hand, while HDF5 searches the whole file for the name of one.
+        # By their addresses: to ask HDF5 for the name of an object takes a search of the whole file.
         paths = {h5py.h5o.get_info(node).addr: path for path, node in nodes.items()}
 
         for path, node in nodes.items():
             stored = _stored_attributes(node)
-            described = {key: _attribute(value) for key, value in stored.items() if key not in OF_DIMENSIONS}
+            described = {key: _attribute(value) for key, value in stored.items() if key not in DIMENSION_ATTRIBUTES}
             if isinstance(node, h5py.h5g.GroupID):
                 attributes |= {_path(path, key): value for key, value in described.items()}
                 continue
