@@ -23,6 +23,8 @@ def measured() -> xr.Dataset:
         "sites/cell": variable("site", np.zeros(0, int), "1", "cell of the site"),
         "bands/part": variable("bands/part", np.array([1, 2, 3]), "1", "part"),
         "bands/energy": variable(("bands/part", "time"), np.eye(3), "J", "energy", parts=["A", "gap", "B"]),
+        # Its link in the group to the coordinate of the root makes room for the next variable.
+        "bands/mass": variable("cell", [4e-3, 2e-3], "kg", "mass"),
         # In xarray's DataTree a group inherits the root's coordinate of that name in its place.
         "bands/cell": variable("bands/part", np.array([7, 7, 3], np.int8), "1", "not the coordinate of the root"),
         "coarse/time": variable("coarse/time", [0.0, 1.0], "s", "a time of the group's own"),
@@ -68,9 +70,24 @@ def test_the_file_is_netcdf_4_for_other_tools(tmp_path):
         assert file["law"].asstr()[...].tolist() == ["hertz", "bilinear"]
         assert file["bands"].attrs["start"] == 0.5
 
+        # Programs that open a group alone find the coordinates of the root in it.
+        assert file["bands"].get("time", getlink=True).path == "/time"
+        # Files of the same contents have the same bytes at any time.
+        assert h5py.h5g.get_objinfo(file.id, b"velocity").mtime == 0
+
     with xr.open_dataset(path, engine="h5netcdf", group="bands") as bands:
         assert bands["energy"].dims == ("part", "time")
         assert bands["energy"].attrs["units"] == "J"
+
+
+def test_an_attribute_replaces_one_of_the_same_name(tmp_path):
+    """An attribute of a variable takes the place of one by which HDF5 describes a dimension."""
+    data = measured()
+    data.variables["time"].attrs["NAME"] = "clock"
+    write_netcdf(tmp_path / "a.h5", data)
+
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["time"].attrs["NAME"] == "clock"
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
