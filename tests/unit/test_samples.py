@@ -44,6 +44,21 @@ def test_what_is_no_table_of_two_columns_is_refused(file):
     assert "holds (4, 3) numbers" in refusal(file=str(file), dataset="three")
 
 
+def test_a_missing_value_in_the_first_row_is_no_line_of_names(tmp_path):
+    """A first row of "nan" is one of numbers, which the case refuses; a line of names may begin with a digit."""
+    path = tmp_path / "samples.csv"
+
+    def times(text: str) -> list[float]:
+        """Return the times that are read from a file with a ``text``."""
+        path.write_text(text, encoding="utf-8")
+        table, problems = with_samples({"drive": {"waveform": "samples", "samples": {"file": str(path)}}})
+        assert not problems
+        return table["drive"]["samples"]["time"]
+
+    assert np.isnan(times("nan,1.0\n0.5,1.0\n1.0,0.0\n")[0])
+    assert times("1st_time,2nd_force\n0.5,1.0\n1.0,0.0\n") == [0.5, 1.0]
+
+
 @pytest.mark.parametrize("header", ["", "time,force\n"])
 def test_a_table_of_text_is_read_up_to_the_line_that_is_too_much(tmp_path, header):
     """A table of text with one sample more than allowed is refused, with a line of names or without."""

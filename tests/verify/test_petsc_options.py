@@ -91,7 +91,9 @@ def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, 
 
 
 def test_what_only_looks_is_no_part_of_a_case():
-    for name in ("log_view", "info", "malloc_debug", "ts_monitor", "ts_adapt_monitor", "options_left", "ts_view"):
+    looks = ("log_view", "info", "malloc_debug", "ts_monitor", "ts_adapt_monitor", "options_left", "ts_view")
+    # Those of PetscAttachDebugger: where the debugger is shown, and on which ranks.
+    for name in (*looks, "start_in_debugger", "debug_terminal", "debugger_ranks", "debugger_pause", "display"):
         assert only_looks(name)
     for name in ("ts_rk_type", "ts_adapt_clip", "log_veiw", "ts_moniter", "ts_max_snes_failures"):
         assert not only_looks(name)

@@ -1,9 +1,9 @@
 """Cases, which define simulations: strict TOML is read into a typed, immutable and fully resolved case.
 
-``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
-``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers; ``case``, ``sweep``,
-``nnm``, ``law`` and ``design`` are the cases of the verbs, with the conditions between their keys. The manual lists
-keys and units.
+``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case).
+``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers. Each verb has a module
+with its case and the conditions between its keys: ``case`` that of ``run``, all others one of the verb's name;
+``verb_cases`` lists them. The manual lists keys and units.
 """
 
 from vipetsc.case.case import Case, Model, case_id

@@ -42,9 +42,9 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
 
 
 def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """The values (cells,) that a profile gives in place of the reference cell's ``values``, and what is wrong with it.
+    """The values (cells,) that a profile gives in place of the reference cell's ``values`` (cells,).
 
-    The text of what is wrong is "" if nothing is.
+    The second result says what is wrong with the profile; it is "" if nothing is.
     """
     if isinstance(given, Profile):
         return np.linspace(given.first, given.last, len(values)), ""
@@ -71,7 +71,10 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """Numbers (cells,) drawn about the ``values`` of the quantity ``key``, and what is wrong with them, as above."""
+    """Numbers (cells,) drawn about the ``values`` (cells,) of the quantity ``key``.
+
+    The second result says what is wrong with the deviation; it is "" if nothing is.
+    """
     drawn = deviation.draw(values, seed, key)
     if deviation.relative and not values.any():
         return drawn, "is 0 in all cells, so that a relative deviation has no effect"

@@ -33,16 +33,16 @@ SLOWEST = 1e-9
 class LawTable(Section):
     """How the scattering law of one site is computed.
 
-    It is the law of the kind of ``site``, a number in the list of the sites (by default the site nearest to the drive).
-    A kind is a contact law with its restitution, the ratio of the clearances on both sides, and the masses that the
-    contact joins. ``clearance`` in m is the lesser one, by default the geometric mean of the sites of that kind.
+    The law is that of the kind of ``site``, a number in the list of the sites (by default the site nearest to the
+    drive). A kind is a contact law with its restitution, the ratio of the clearances on both sides, and the masses that
+    the contact joins. ``clearance`` in m is the lesser one, by default the geometric mean of the sites of that kind.
     ``distance`` is the number of cells from the driven cell to the site, by default that of the nearest site, or
     without sites the length of the burst; it is so large that the burst ends before a wave returns from the site. The
     law is a function of z, the largest relative displacement over the clearance, up to ``largest``. Points are added
-    until between neighbouring ones all fractions are straight lines over log z up to ``tolerance`` or the scatter, or
-    the points are closer than ``finest``. At each point ``samples`` runs with amplitudes that differ from it by up to
-    the fraction ``jitter`` give mean and scatter. A run ends ``settle`` durations of the burst after the slow waves
-    reach the site.
+    until all fractions between neighbouring points are straight lines over log z, within ``tolerance`` or the scatter,
+    or until neighbours are closer than ``finest``. At each point ``samples`` runs with amplitudes that differ from it
+    by up to the fraction ``jitter`` give mean and scatter. A run ends ``settle`` durations of the burst after the slow
+    waves reach the site.
     """
 
     site: int | None = Field(None, ge=1)

@@ -13,6 +13,7 @@ from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
+from vipetsc.case.samples import is_number
 from vipetsc.case.schema import Finite, Positive
 from vipetsc.io.names import path_named
 from vipetsc.wording import counted
@@ -197,13 +198,13 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     if separator in (";", "\t") and not any("." in line for line in lines[1:]):
         # Where commas do not separate, they are those of decimals, except in names.
         decimals = [line.replace(",", ".") for line in lines]
-        if not all(_is_number(field) for field in decimals[0].split(separator)):
+        if not all(is_number(field) for field in decimals[0].split(separator)):
             decimals[0] = lines[0]
         lines = decimals
     rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
     names: list[str] = []
     # Measuring programs write "nan" for a missing value: a first row with it is one of numbers, not of names.
-    if not all(_is_number(field) for field in rows[0]):
+    if not all(is_number(field) for field in rows[0]):
         names = rows.pop(0)
 
     if not rows:
@@ -215,7 +216,7 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     try:
         table = np.array(rows, float)
     except ValueError:
-        number, row = next((n, row) for n, row in enumerate(rows, 1) if not all(_is_number(field) for field in row))
+        number, row = next((n, row) for n, row in enumerate(rows, 1) if not all(is_number(field) for field in row))
         raise MeasuredError("file", record.file, f"row {number} is no row of numbers: {', '.join(row)}") from None
 
     columns = {}
@@ -237,15 +238,6 @@ def _index_of(place: Place, names: list[str], key: str) -> int:
     if not names:
         remedy = "the table has no line of names; give a number from 1"
     raise MeasuredError(key, place, f"no column of that name; {remedy}")
-
-
-def _is_number(field: str) -> bool:
-    """Whether a field of a table is a number."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:

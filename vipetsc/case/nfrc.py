@@ -42,6 +42,17 @@ class ResponseCurve(NamedTuple):
     values: dict[str, Any]
 
 
+class FixedParameters(NamedTuple):
+    """What is fixed along a curve of one case: the ``restitution`` of all sites, and the value ``fixed``.
+
+    ``name`` is that of the curve among those of the case.
+    """
+
+    name: str
+    restitution: float
+    fixed: float
+
+
 class NfrcCase(Case):
     """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``.
 
@@ -263,24 +274,27 @@ class NfrcCase(Case):
         curves = []
         for number, (member, case) in enumerate(self._members):
             # Without a family there is one member, whose name is empty.
-            for name, restitution, fixed in case.curves():
+            for curve in case.curves():
                 curves.append(
                     ResponseCurve(
-                        name="-".join(filter(None, (member.name, name))),
+                        name="-".join(filter(None, (member.name, curve.name))),
                         case=case,
-                        restitution=restitution,
-                        fixed=fixed,
+                        restitution=curve.restitution,
+                        fixed=curve.fixed,
                         member=number,
                         values=member.values,
                     )
                 )
         return curves
 
-    def curves(self) -> list[tuple[str, float, float]]:
-        """Name, restitution and value of the fixed parameter of each curve of the case, or of its first member."""
+    def curves(self) -> list[FixedParameters]:
+        """The curves of the case, or of its first member: one for each restitution and each value that is fixed."""
         restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
-        fixed = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
-        return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]
+        values = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
+        curves = []
+        for (of_restitution, restitution), (of_value, value) in itertools.product(restitutions, values):
+            curves.append(FixedParameters(f"r{of_restitution}-{of_value}", restitution=restitution, fixed=value))
+        return curves
 
 
 def has_waves(chain: Chain) -> bool:

@@ -12,11 +12,12 @@ from vipetsc.plugins import call
 from vipetsc.register import Parameter
 from vipetsc.wording import with_unit
 
-# Indentations in m at which force, slope and energy of a law are compared with each other, and those of its onset.
+# Indentations in m at which force, slope and energy of a law are compared with each other, and those between which the
+# power is measured with which its force begins.
 DEPTHS = np.geomspace(1e-6, 1e-3, 7)
 ONSET = np.array([1e-9, 1e-8])
-# Relative difference of a derivative from a central difference quotient, and the step of that over x. The quotient of a
-# power of x is exact to 1e-10, and a wrong factor or exponent in a formula differs by far more.
+# Relative difference of a derivative from a central difference quotient, and the step of the quotient over x. The
+# quotient of a power of x is exact to 1e-10, and a wrong factor or exponent in a formula differs by far more.
 CLOSE = 1e-5
 STEP = 1e-5
 # Difference of the power with which a force begins from the one that is stated: it distinguishes 1, 1.5 and 2, and

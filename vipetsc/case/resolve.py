@@ -247,7 +247,7 @@ def check_contacts(
 ) -> Iterator[Problem]:
     """Problems with the sites of a run that begins with the motion ``initial``, and with the law."""
     yield from check_sites(lattice, contacts)
-    # Of a count without a preset to place it there are no cells.
+    # A count of sites has no cells where no preset places them.
     sites = site_cells(lattice, contacts)
     is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None
     yield from check_stiffness(contacts, bool(contacts.sites) and not is_unplaced, valid)

@@ -89,14 +89,24 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
             rows = np.asarray(values, float)
     else:
         lines = _table_lines(path)
-        # A table may begin with a line of names.
-        has_header = bool(lines) and not re.match(r"[-+.\d]", lines[0][0])
+        # A table may begin with a line of names. Measuring programs write "nan" for a missing value, which is no name.
+        if lines and not any(is_number(field) for field in lines[0]):
+            del lines[0]
         try:
-            rows = np.array(lines[1:] if has_header else lines, float)
+            rows = np.array(lines, float)
         except ValueError:
             raise ValueError("is not a table of numbers; give time and value in two columns") from None
     _check_shape(rows.shape)
     return rows
+
+
+def is_number(field: str) -> bool:
+    """Whether a ``field`` of a table of text is a number; "nan" is one."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
 def _table_lines(path: Path) -> list[list[str]]:

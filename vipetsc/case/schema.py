@@ -336,9 +336,9 @@ class PetscTable(Section):
 # Options for what PETSc prints, checks and does about an error, none of which changes a result.
 _LOOKS = re.compile(
     r"log(_(view|trace|all|sync|exclude|summary)\w*)?|info(_exclude)?|malloc(_(debug|dump|view|test|hbw)\w*)?"
-    r"|memory_view|options_(left|view|monitor|file)\w*|objects_dump|start_in_debugger|stop_for_debugger|debugg?er?_\w+"
+    r"|memory_view|options_(left|view|monitor|file)\w*|objects_dump|start_in_debugger|stop_for_debugger|debug(ger)?_\w+"
     r"|on_error_\w+|error_output_\w+|fp_trap|check_pointer_intensity|no_signal_handler|skip_petscrc|version|help"
-    r"|history|citations|get_total_flops|\w+_(view|monitor)(_\w+)?"
+    r"|display|history|citations|get_total_flops|\w+_(view|monitor)(_\w+)?"
 )
 
 

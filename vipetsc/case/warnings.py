@@ -194,7 +194,8 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     """Warnings of fields that do not resolve the waves.
 
-    Those of measures that fields do not allow have the words of the analysis: a command that prints both shows one.
+    Sentences on measures that the fields do not allow are word for word those of the analysis, so that a command that
+    prints both shows each of them once.
     """
     chain = model.chain
     top = pass_bands(chain.cell)[-1].high
