@@ -1,4 +1,4 @@
-"""Savings of pictures: formulas parsed once, fonts without typesetting tables, small pictures of a report."""
+"""What makes pictures fast and small: formulas parsed once, fonts without typesetting tables, encodings."""
 
 import io
 

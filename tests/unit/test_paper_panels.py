@@ -1,4 +1,4 @@
-"""Panels of the paper's figures from synthetic data: entropy histories, energies over time, dispersions of cells."""
+"""Panels of the paper's figures from synthetic data: entropy histories, energies, dispersions of cells, wavelets."""
 
 from types import SimpleNamespace
 
@@ -7,10 +7,11 @@ import pytest
 import tomli_w
 import xarray as xr
 
-from vipetsc.figures import cost_maps, transfer
+from vipetsc.figures import cost_maps, scattering, transfer, wavenumber_bins
 from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, Sweeps
+from vipetsc.spectra import entropies, filter_bank
 
 AMPLITUDES = [1.0, 4.0, 16.0, 64.0, 256.0]  # N
 
@@ -133,3 +134,10 @@ def test_each_reading_has_frequencies_up_to_those_of_its_best_cell():
             assert axes.get_ylim() == pytest.approx((0.0, cost_maps.HEADROOM * highest))
         announced = [axes.get_title("right") for axes in row]
         assert announced == ["", "", f"up to {3 * highest:.3g} krad/s ↑"]
+
+
+def test_pictures_of_wavelets_have_the_parameters_of_the_measures():
+    """The wavelets of pictures have the parameter kc of the entropies, and those of bins the one of the filter bank."""
+    assert scattering.KC == entropies.KC
+    bank = filter_bank(60)
+    assert np.array_equal(filter_bank(60, wavenumber_bins.BINS_KC).transfer, bank.transfer)

@@ -17,8 +17,8 @@ def first_few(items: Sequence[object]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in two digits, from two minutes on minutes in three, without powers of ten."""
-    # Rounded first: the format "g" alone writes 110 in two digits as 1.1e+02.
+    """A time as text: seconds in two digits or, from two minutes on, minutes in three, without powers of ten."""
+    # It is rounded first, since the format "g" alone writes 110 in two digits as 1.1e+02.
     if seconds < 120:
         return f"{float(f'{seconds:.2g}'):g} s"
     return f"{float(f'{seconds / 60:.3g}'):g} min"

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from vipetsc import plugins
 from vipetsc.case.parts import module_names
-from vipetsc.figures.sources import FILES
+from vipetsc.figures.sources import FILES, SWEEP
 from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
@@ -26,8 +26,11 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
     ``vipetsc.figures.sources``, functions those of ``vipetsc.figures.registry.FigureSpec``.
     """
     figures: dict[str, Callable[..., Any]] = {}
+    if not folders:
+        return figures, ""
+
     reasons = []
-    for name in _modules(folders[0]) if folders else []:
+    for name in _modules(folders[0]):
         try:
             parts = plugins.load(name).parts
         except plugins.PluginError as error:
@@ -36,7 +39,9 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
         for part in parts:
             if isinstance(part, FigurePart) and part.source == source:
                 draw = partial(_drawn, part)
-                figures[part.name] = partial(_of_sweeps, draw) if source == "sweep" else draw
+                if source == SWEEP:
+                    draw = partial(_each_sweep, draw)
+                figures[part.name] = draw
     return figures, "; ".join(reasons)
 
 
@@ -62,7 +67,7 @@ def _drawn(part: FigurePart, *results: Any) -> Figure:
     return figure
 
 
-def _of_sweeps(draw: Callable[[xr.Dataset], Figure], sweeps: Sequence[xr.Dataset]) -> Iterator[Drawing]:
-    """Yield the drawing of each ensemble; a registered figure of a sweep is drawn of one at a time."""
+def _each_sweep(draw: Callable[[xr.Dataset], Figure], sweeps: Sequence[xr.Dataset]) -> Iterator[Drawing]:
+    """Yield a drawing of each of ``sweeps``: a registered figure shows one sweep, those of the registry all of them."""
     for ensemble in sweeps:
         yield Drawing("", partial(draw, ensemble))

@@ -36,8 +36,9 @@ from vipetsc.lattice import pass_bands
 from vipetsc.spectra import transform
 
 # The Morlet parameter kc, in rad: the phase of a wavelet over one standard deviation of its envelope. A wavelet of the
-# wavenumber kappa is kc/kappa wide in x and kappa/kc wide in wavenumber. This is the paper's for entropies: it resolves
-# wavenumbers better than the smaller one of ``wavenumber_bins``, and positions worse.
+# wavenumber kappa is kc/kappa wide in x and kappa/kc wide in wavenumber. The paper has no number for it. This one, also
+# that of the entropies (``spectra.entropies.KC``), resolves wavenumbers better than the smaller one of
+# ``wavenumber_bins``, and positions worse.
 KC = 12.0
 # Wavenumbers in a map of |X|. The entropy's 60 would be seen as steps.
 WAVENUMBERS = 120

@@ -231,16 +231,17 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
     """
     measured = [(ensemble, _triples(ensemble)) for ensemble in sweeps]
     several_sweeps = sum(bool(triples) for _, triples in measured) > 1
-    for ensemble, triple in ((ensemble, triple) for ensemble, triples in measured for triple in triples):
-        runs = tuple(sweeps.files.get(member.folder, MemberRun.open) for member in triple)
-        if all("velocity" in run.run and all(name in run.analysis for name in needs) for run in runs):
-            wave = DrivenWave.of(runs[0].case)
-            yield AmplitudeSeries(
-                suffix=suffix(triple[0].row, ensemble, named=several_sweeps),
-                title=_series_title(triple[0].row, ensemble, runs[0].case, wave),
-                runs=runs,
-                wave=wave,
-            )
+    for ensemble, triples in measured:
+        for triple in triples:
+            runs = tuple(sweeps.files.get(member.folder, MemberRun.open) for member in triple)
+            if all("velocity" in run.run and all(name in run.analysis for name in needs) for run in runs):
+                wave = DrivenWave.of(runs[0].case)
+                yield AmplitudeSeries(
+                    suffix=suffix(triple[0].row, ensemble, named=several_sweeps),
+                    title=_series_title(triple[0].row, ensemble, runs[0].case, wave),
+                    runs=runs,
+                    wave=wave,
+                )
 
 
 def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: DrivenWave) -> str:

@@ -55,7 +55,9 @@ MOST_COLUMNS = 4  # of dispersions on a page
 MOST_PANELS = 12  # on a page of members that have nothing in common
 LETTERS = 14  # of the titles of dispersions on an inch
 DECADES = 6  # decades below the total energy over which energies of parts are shown
-LARGEST_ERROR = 0.01  # of the sum of the parts over the total, the paper's 1 %
+# Largest error of the sum of the parts over the total. The paper says that they "matched nearly identically"; this is
+# the 1 % that it allows for wavenumber bins.
+LARGEST_ERROR = 0.01
 # Total energy over its largest, below which the sum of the parts is not compared with it: there the error of the sum is
 # that of the filters' tails.
 LEAST_TOTAL = 1e-3

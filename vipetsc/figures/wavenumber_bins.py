@@ -35,8 +35,8 @@ from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch
 from vipetsc.spectra import Nodes, inverse, transform
 
-# The Morlet parameter kc of the bins, the paper's: half that of the entropies (``scattering.KC``), since maps of bins
-# are to resolve positions.
+# The Morlet parameter kc of the bins, for which the paper has no number: that of ``spectra.filter_bank``, and half of
+# that of the entropies (``scattering.KC``), since maps of bins are to resolve positions.
 BINS_KC = 6.0
 SHOWN = 7  # bins whose maps are drawn
 EXPLAINED = 4  # bins in the picture that explains them
@@ -56,7 +56,7 @@ BLUR = 0.006, 0.01
 DARKENED = 0.85
 # Panels of traces end at this multiple of the largest value that they show.
 MARGIN = 1.1
-# The relative error up to which the paper takes its partition to be complete (its Eq. (A8)).
+# The relative error, Eq. (A8), up to which the paper takes its partition to be complete (its section II.B and Fig. A1).
 COMPLETE = 0.01
 
 
