@@ -131,6 +131,14 @@ def test_exit_codes_say_how_a_study_ended(call, drawn, name):
     assert drawn == []
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_the_help_names_the_folder_that_is_used(name):
+    """The help of --out has the folder of the results, which ends with the suffix of the verb."""
+    verb = VERBS[name]
+    (out,) = (argument for argument in verb.arguments if argument.flag == "--out")
+    assert f"runs/NAME{verb.suffix}," in out.keywords["help"]
+
+
 def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
     """The table has the rows that concern the verb, each once, and no rows of a run if the verb makes none."""
     response = in_process("validate", example_case("nfrc")).stdout

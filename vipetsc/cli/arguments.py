@@ -21,11 +21,16 @@ def case_with(section: str) -> Argument:
     return argument("case", metavar="CASE", help=f"case file (TOML) with a section [{section}]")
 
 
+def output_folder(default: str) -> Argument:
+    """The argument --out of a verb that writes its results to the folder ``default`` if no other is named."""
+    return argument("--out", type=Path, metavar="DIR", help=f"output folder; default: {default}")
+
+
 CASE = argument("case", nargs="?", metavar="CASE", help="case file (TOML); default: the built-in case")
 SET = argument(
     "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
 )
-OUT = argument("--out", type=Path, metavar="DIR", help="output folder; default: runs/NAME")
+OUT = output_folder("runs/NAME, with the name of the case")
 FORCE = argument(
     "--force", action="store_true", help="start again from the beginning and replace the results in the output folder"
 )

@@ -114,7 +114,8 @@ def _check_cells(run: xr.Dataset, shot: Shot) -> slice:
     recorded = run["cell"].values
     first, last = shot.cells or (recorded[0], recorded[-1])
     if shot.cells and not recorded[0] <= first < last <= recorded[-1]:
-        raise ValueError(f"--cells {first}:{last}: the run recorded cells {recorded[0]} to {recorded[-1]}")
+        inside = f"{recorded[0]} to {recorded[-1]}"
+        raise ValueError(f"--cells {first}:{last}: needs two of the recorded cells or more, A < B from {inside}")
 
     # The places of these numbers, since a run may have recorded every n-th cell.
     begin, end = np.searchsorted(recorded, (first, last + 1)).tolist()
@@ -129,7 +130,7 @@ def _check_times(run: xr.Dataset, shot: Shot) -> np.ndarray:
     start = time[0] if shot.start is None else shot.start
     stop = time[-1] if shot.stop is None else shot.stop
     if not time[0] <= start < stop <= time[-1] * (1 + 1e-12):
-        raise ValueError(f"--from {start:g} --to {stop:g}: the run recorded {time[0]:g} to {time[-1]:g} s")
+        raise ValueError(f"--from {start:g} --to {stop:g}: needs an interval within {time[0]:g} to {time[-1]:g} s")
 
     # With a frame at the end as well, which rounding may put a little beyond it.
     step = (shot.speed or (stop - start) / LENGTH) / shot.rate

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, CaseError, Problem
-from vipetsc.cli.arguments import CASE, OUT, SET, argument
+from vipetsc.cli.arguments import CASE, SET, argument, output_folder
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import write_text
@@ -25,9 +25,9 @@ MODES = argument(
     "--modes",
     type=int,
     metavar="N",
-    help="also compute the N linear modes of the finite lattice nearest to a frequency, and their shapes",
+    help="also compute N linear modes of the finite lattice, those nearest to a frequency, and their shapes",
 )
-NEAR = argument("--near", type=float, metavar="OMEGA", help="this frequency in rad/s; default: 0")
+NEAR = argument("--near", type=float, metavar="OMEGA", help="frequency in rad/s for --modes; default: 0")
 JSON = argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -195,7 +195,7 @@ VERB = PlainVerb(
     name="bands",
     text="pass bands, gaps and group velocities of a cell",
     example="bands runs/examples/three-mass.toml --json",
-    arguments=(CASE, MODES, NEAR, SET, OUT, JSON),
+    arguments=(CASE, MODES, NEAR, SET, output_folder("runs/NAME-bands, with the name of the case"), JSON),
     function=bands,
     is_answer=True,
 )

@@ -1,7 +1,7 @@
 """The verb ``law``: the scattering law of one site."""
 
 from vipetsc.case import LawCase
-from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
+from vipetsc.cli.arguments import CASE, FORCE, RESUME, SET, output_folder
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -28,7 +28,7 @@ VERB = StudyVerb(
     name="law",
     text="compute the scattering law of one site with adaptive refinement",
     example="law runs/examples/law.toml --set law.tolerance=0.02",
-    arguments=(CASE, *STUDY_ARGUMENTS),
+    arguments=(CASE, SET, output_folder("runs/NAME-law, with the name of the case"), FORCE, RESUME),
     case=LawCase,
     study=compute_law,
     table=law_rows,

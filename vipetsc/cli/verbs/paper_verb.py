@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from vipetsc.cli.arguments import OUT, argument
+from vipetsc.cli.arguments import argument, output_folder
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, FAILED, PlainVerb
 from vipetsc.io.folder import PAPER
@@ -54,7 +54,7 @@ VERB = PlainVerb(
             "--quick", action="store_true", help="coarse grids, which take minutes and are marked in every picture"
         ),
         argument("--list", action="store_true", help="list completed and remaining steps with their duration"),
-        OUT,
+        output_folder("runs/paper, with --quick runs/paper-quick"),
     ),
     function=paper,
     results=PAPER,

@@ -182,15 +182,15 @@ VERB = PlainVerb(
             type=Path,
             nargs="+",
             metavar="PATH",
-            help="folder of a run, a search or a law, or its run.h5, design.h5, law.h5; or folders of branches, whose"
-            " branches of one name share a page",
+            help="folder of results, or the file in it, such as run.h5 or law.h5; several folders may hold sweeps and"
+            " branches, which then share pages",
         ),
         argument("--fig", action="append", metavar="NAME", help="draw only this figure; may be repeated"),
         argument(
             "--format",
             action="append",
             choices=("png", "pdf", "gif", "mp4"),
-            help="default: png, for movies gif, and mp4 with ffmpeg; may be repeated",
+            help="default: png; for movies gif and, if ffmpeg is installed, mp4; may be repeated",
         ),
         argument(
             "--movie",

@@ -20,10 +20,10 @@ INTERBAND = "interband"
 ONE_SITE = "interband-one-site"
 MAIN = "5-sites-30-cycles"
 IN_PHASE = "branch-in-phase.h5"
-# Numbers of tongues and special points of the in-phase branch at 100 MPa, up to the energy ``HIGHEST`` in J. Steps of a
-# third of the usual ones find no more.
+# Numbers of tongues and special points of the in-phase branch at the printed 100 MPa, up to the energy ``HIGHEST`` (J).
+# Steps of a third of the usual ones find no more.
 HIGHEST = 6e9
-TRUE = {
+EXPECTED_COUNTS = {
     "hertz": {"tongues": 17, "grazing": 316, "symmetry-breaking": 62, "period-doubling": 41, "fold-energy": 90},
     "bilinear": {"tongues": 15, "grazing": 187, "fold-energy": 132},
 }
@@ -95,18 +95,18 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
 def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
     """Add tongues, special points and largest frequency of the in-phase ``branch`` to ``result``.
 
-    A reason is added for each number that differs from ``TRUE``.
+    A reason is added for each number that differs from ``EXPECTED_COUNTS``.
     """
-    # Up to the energy of ``TRUE``: a branch that was followed further has more.
+    # Up to the energy of ``EXPECTED_COUNTS``: a branch that was followed further has more.
     passed = branch["energy"].values <= HIGHEST
     kind, tongue, frequency = (branch[name].values[passed] for name in ("kind", "resonance", "frequency"))
-    counts = {name: int(np.sum(kind == KINDS.index(name))) for name in TRUE[law] if name != "tongues"}
+    counts = {name: int(np.sum(kind == KINDS.index(name))) for name in EXPECTED_COUNTS[law] if name != "tongues"}
     counts["tongues"] = len(set(tongue[tongue > 1].tolist()))
     result.value |= {f"{name} of the in-phase branch, {law}": count for name, count in counts.items()}
     result.value[f"largest frequency (Hz) of the in-phase branch, {law}"] = frequency.max()
     for name, count in counts.items():
-        if count != TRUE[law][name]:
-            result.reasons.append(f"the {law} branch in phase has {count} {name}, not {TRUE[law][name]}")
+        if count != EXPECTED_COUNTS[law][name]:
+            result.reasons.append(f"the {law} branch in phase has {count} {name}, not {EXPECTED_COUNTS[law][name]}")
 
 
 def _largest(values: np.ndarray) -> float | None:
