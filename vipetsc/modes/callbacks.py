@@ -1,9 +1,11 @@
 """Exceptions of Python functions that PETSc calls, as its solvers for equations do.
 
-An exception that crosses PETSc's own frames leaves locked vectors behind, and comes out as itself, as "error code -1"
-or as "error code 101", by PETSc's version. So PETSc is given NaN, on which its solvers give up, where all ranks of the
-solver give it. What may be one rank's own, while others wait in the same callback, has to leave at once; the program
-ends then.
+An exception that passes through PETSc's own functions leaves vectors locked behind. With some versions of PETSc it
+arrives unchanged, with others as "error code -1" or "error code 101". A callback that fails therefore returns NaN, on
+which the solver gives up, and the exception is raised when the solver has returned.
+
+This is safe only if the callback fails on all ranks of the solver. An exception of one rank alone, while the others
+wait in a collective call of the same callback, is raised at once; it ends the program on all ranks.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,10 +29,11 @@ class CallbackErrors:
         return self._first is not None
 
     def keep(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """The ``callback(solver, x, result, ...)`` as PETSc is given it; FlowError is raised by all ranks or none.
+        """The function to give to PETSc in place of ``callback(solver, x, result, ...)``.
 
-        After a failure the result is NaN, that of all later callbacks too: they would be evaluated at what follows from
-        NaN.
+        A FlowError of the callback must be raised by all ranks or by none; any other exception may be one rank's own.
+        After the first failure the callback is not called again, since its arguments would follow from NaN; the results
+        are NaN.
         """
 
         def call(solver: object, x: PETSc.Vec, result: PETSc.Vec | PETSc.Mat, *others: object) -> None:

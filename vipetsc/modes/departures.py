@@ -1,26 +1,28 @@
-"""Departures of contacts from what they are at rest, and which of an orbit's are images of one another.
+"""Departures of contacts from their state at rest, and which departures of an orbit are images of one another.
 
-A *departure* is a time in which a contact that is open at rest is closed, or one that is pressed at rest is open. A
-symmetry of the system (a lattice that is its own mirror image, equal stops on both sides) that takes an orbit to itself
-takes the departures of one contact to those of another, or of its other side: at the same instants, where it keeps the
-phase, or half a period later, where it turns the motion round. Orbits between two instants of rest also run back as
-they came. Such images last equally long; they begin and vanish together along a whole branch, however short its steps.
+A *departure* is an interval of time in which a contact that is open at rest is closed, or one that is pressed at rest
+is open. If the system has a symmetry (a lattice that is its own mirror image, equal stops on both sides) and an orbit
+has it, too, the symmetry maps the departures of one contact to those of another contact, or of the other side: to the
+same instants, or to instants half a period later if it reverses the sign of the motion. An orbit that is at rest twice
+in a period also runs back as it came, so that a departure has an image in reversed time. Images are of equal length,
+and appear and vanish together along a whole branch, however short the steps.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-# The tolerance on phases, in periods, and on squares of lengths. Orbits that are symmetric are so to about 1e-12; a
-# short contact's depth, the square of its length, is that accurate, and the length itself is not.
+# The tolerances on phases, in periods, and on squares of lengths. Symmetric orbits are symmetric to about 1e-12. So is
+# the depth of a short contact, which is proportional to the square of its length; the length itself is less accurate.
 SAME_PHASE = 1e-6
 SAME_SQUARE = 1e-9
 
 
 class Departure(NamedTuple):
-    """The ``middle`` of a departure, counted from an instant of rest or of the centre, and its ``length``, in periods.
+    """The ``middle`` of a departure, counted from the start of the arc, and its ``length``, both in periods.
 
-    A departure that goes on beyond an instant of rest has all of its length, and its middle is that instant.
+    The arc starts at rest or at the centre (u = 0). A departure that lasts over an instant of rest is counted whole:
+    its middle is that instant, and its length includes the part beyond.
     """
 
     middle: float
@@ -54,7 +56,7 @@ def within_arc(spans: Iterable[tuple[float, float]], fraction: float, rest_after
 
 
 def families(departures: Sequence[Departure]) -> Counter[int]:
-    """How many families of so many images each there are among the ``departures`` of an orbit, by their size."""
+    """The number of families of images among the ``departures`` of an orbit, for each size of a family."""
     groups: list[list[Departure]] = []
     for departure in departures:
         for family in groups:
@@ -67,7 +69,7 @@ def families(departures: Sequence[Departure]) -> Counter[int]:
 
 
 def changed_families(before: Sequence[Departure], after: Sequence[Departure]) -> int:
-    """How many families of images one orbit has and the other one has not: those that appear, and those that vanish.
+    """The number of families of images that only one of two orbits has: those that appear, and those that vanish.
 
     A family that gains or loses members counts twice, as one that vanishes and another one that appears.
     """

@@ -1,4 +1,4 @@
-"""The latest values of a function of which neighbouring states of a branch need the same ones."""
+"""A store of the values computed last, for quantities that neighbouring states of a branch ask for again."""
 
 from collections.abc import Callable, Hashable
 from typing import Generic, TypeVar
@@ -8,10 +8,10 @@ Value = TypeVar("Value")
 
 
 class LatestValues(Generic[Argument, Value]):
-    """The ``count`` values that were computed last, by their arguments.
+    """The ``count`` values that were computed last, found by their arguments.
 
-    A cache of ``functools`` on a method would keep its object alive until the collector of cycles comes by, and
-    with it matrices of a whole lattice.
+    ``functools.lru_cache`` on a method would do the same, but would keep its object alive, and with it matrices of a
+    whole lattice, until Python's garbage collector runs.
     """
 
     def __init__(self, count: int) -> None:

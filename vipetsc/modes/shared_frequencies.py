@@ -1,8 +1,9 @@
-"""Linear modes with which no branch can begin alone: others have their frequency, or a multiple of it.
+"""Linear modes at which no branch can begin: another mode has the same frequency, or a multiple of it.
 
-Small motions of such modes together are periodic with the period of the one alone. The orbits of that period then are
-no curve: which of them goes on once a contact acts is not determined by the mode. In a ring of equal cells the waves to
-the left and to the right have one frequency, so that nearly all modes come in pairs.
+Small motions in which both modes take part are then periodic with the period of the first one. The orbits of this
+period form a surface and not a curve, and the mode does not determine which of them continues when a contact begins to
+act. In a ring of equal cells the waves to the left and to the right have one frequency, so that nearly all modes come
+in pairs.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from vipetsc.modes.system import System
 # Squared frequencies are equal within this fraction, or within rounding of the largest one in the eigenvalues.
 SAME = 1e-10
 ROUNDING = 1e-13
-# Masses up to which modes are compared before anything is computed, which then takes a second at most.
+# Largest number of masses for which modes are compared before a command computes anything; it takes a second at most.
 MOST_COMPARED = 1000
 REMEDY = (
     "choose modes with a frequency of their own (nnm.modes), or make the system less symmetric: cells that differ "
@@ -30,10 +31,10 @@ class Companion(NamedTuple):
 
 
 def companions(system: System, mode: int) -> list[Companion]:
-    """The other modes of ``system`` that come to rest with ``mode`` (from 0) after its period.
+    """The other modes of ``system`` whose motion is periodic with the period of ``mode`` (from 0).
 
-    Motions of an odd system are sought among those that repeat themselves with the other sign after half of it, in
-    which modes of even multiples have no part.
+    Branches of an odd system are sought among motions with u(t + T/2) = -u(t), in which modes of even multiples take no
+    part.
     """
     omega, _ = system.linear_modes()
     rounding = ROUNDING * omega[-1] ** 2
@@ -54,7 +55,8 @@ def companions(system: System, mode: int) -> list[Companion]:
 def why_not_alone(system: System, mode: int) -> str:
     """Why no branch begins with ``mode`` (from 0) alone, and the remedy; empty where one does.
 
-    Where springs or pressed contacts are nonlinear about rest small motions are not linear, and their equations decide.
+    It is empty, too, for systems that are not linear about rest (smooth springs, pressed contacts of Hertz's law):
+    their small motions depend on the nonlinearity, and Newton's method finds a branch or fails.
     """
     if not system.is_linear_at_rest:
         return ""
@@ -74,7 +76,10 @@ def why_not_alone(system: System, mode: int) -> str:
 
 
 def check_start(system: System, mode: int, energy: float) -> None:
-    """Raise StartError if no branch begins with ``mode`` (from 0) alone at an ``energy`` in J, where it is linear."""
+    """Raise StartError if no branch begins with ``mode`` (from 0) alone at a start ``energy`` in J.
+
+    Beyond the energy at which the mode touches a contact its motion is not linear, and nothing is checked.
+    """
     if energy < system.grazing_energy(mode):
         reason = why_not_alone(system, mode)
         if reason:
@@ -82,7 +87,10 @@ def check_start(system: System, mode: int, energy: float) -> None:
 
 
 def check_modes_alone(case: NnmCase) -> None:
-    """Raise CaseError if a mode of the ``case`` shares its frequency; of a large lattice its branch would say so."""
+    """Raise CaseError if a mode of the ``case`` shares its frequency with another one.
+
+    Lattices with more than ``MOST_COMPARED`` masses are left to ``check_start``, by which the branch fails instead.
+    """
     if case.nnm.start_frequency or case.nnm.system == "condensed":
         return
     system = System.from_case(case)

@@ -16,11 +16,11 @@ from vipetsc.modes.balance.stops import Stops
 
 @dataclass(frozen=True)
 class ContactPair:
-    """Contact between two masses (0-based), with stops on both sides of a ``clearance`` in m.
+    """Contact between two masses (0-based), with a stop on either side of w = u_resonator - u_host.
 
-    ``host`` may be None for a contact with the ground; w = u_resonator - u_host. The stop on the side of negative w is
-    at ``clearance_minus`` if that is not None. A clearance of inf is that of a side without a stop, a negative one that
-    of a contact that is pressed at rest, where a static load balances its force.
+    ``host`` is None for a contact with the ground, where w = u_resonator. The stops are at w = ``clearance`` and at
+    w = -``clearance_minus`` in m, which is the same distance if it is None. On a side without a stop the clearance is
+    inf. A contact that is pressed at rest has a negative clearance on its only side; a static load balances its force.
     """
 
     host: int | None
@@ -129,9 +129,9 @@ class System:
 
     @classmethod
     def from_chain(cls, chain: Chain, stops: Sequence[Stops], dense: bool = True) -> Self:
-        """The finite lattice ``chain`` with the ``stops`` of its sites, as one system; else with a sparse stiffness.
+        """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots.
 
-        Dashpots of the lattice are left out.
+        The stiffness is a ``dense`` matrix or a sparse one.
         """
         dofs = chain.cell.dofs
         pairs = []
@@ -153,8 +153,9 @@ class System:
     def reduced(cls, cell: UnitCell, stops: Stops) -> Self:
         """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
 
-        Each of the host's springs to other masses is divided between its two masses: held at its middle it has twice
-        its stiffness, and the paper takes half of the total. The same holds for the resonator's springs.
+        A spring from the host to another mass of the lattice is divided between the two: fixed at its middle, the
+        host's half has twice the stiffness. The paper takes half of the total of these, so that the host is tied to the
+        ground by the sum of the springs' own stiffnesses. The same holds for the resonator.
         """
         ground = {cell.host: 0.0, cell.resonator: 0.0}
         between = 0.0
@@ -294,11 +295,11 @@ class System:
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def closed_frequencies(self) -> np.ndarray:
-        """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit.
+        """Frequencies (n,) in rad/s to which those of large motions tend if all contacts have the bilinear law.
 
-        It is that of contacts with stops on both sides.
+        Each contact must have stops on both sides.
         """
-        # With w >> D only the linear part of a bilinear contact counts: a spring of its stiffness.
+        # Where |w| is much larger than the clearance, it does not count: the contact is a spring of its stiffness.
         stiffness = self.stiffness.copy()
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             stiffness += pair.law.stiffness * np.outer(row, row)

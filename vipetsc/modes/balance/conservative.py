@@ -129,7 +129,9 @@ class ConservativeMotions:
     def balance(self, order: int) -> HarmonicBalance:
         """The equations of motions with harmonics up to ``order``."""
         if order not in self._balances:
-            self._balances[order] = HarmonicBalance(self.compliance, self.forces, order, self.forces.odd, cosines=True)
+            self._balances[order] = HarmonicBalance(
+                self.compliance, self.forces, order=order, odd=self.forces.odd, cosines=True
+            )
         return self._balances[order]
 
     def newton(self, balance: HarmonicBalance) -> DenseNewton:
@@ -165,8 +167,9 @@ class ConservativeMotions:
             # What would be left out from each harmonic on, that harmonic included.
             left_out = sizes[:, ::-1].cumsum(axis=1)[:, ::-1]
             count = int((left_out > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0).sum())
-            # The last of ``count`` harmonics has the order count - 1, of odd ones 2 count - 1. One more harmonic at
-            # least is kept, since the sizes are those of this motion and not of the next one.
+            # The last of ``count`` harmonics has the order count - 1, or 2 count - 1 if only odd ones are kept. The
+            # odd order above is taken, which keeps one harmonic more, since the next motion may need more than this
+            # one.
             order_beyond = count
             if self.forces.odd:
                 order_beyond = 2 * count
@@ -197,11 +200,10 @@ class ConservativeMotions:
         _, _, right_vectors = np.linalg.svd(frame.jacobian(frame.xi))
         null_vector = right_vectors[-1]
         point = frame.measures(_solution(frame.xi), null_vector)
-        # Where the energy does not change along the tangent, neither sign is towards growing energy: ``direction`` then
-        # multiplies the null vector as it is.
-        sign = np.sign(point.energy_tangent) * direction or direction
+        # Where the energy is stationary neither sign is towards growing energy: the null vector is taken as it is.
+        sign = np.sign(point.energy_tangent) or 1.0
         harmonics = self.balance(start.order).resized(point.tangent[:-1])
-        return np.append(harmonics, point.tangent[-1]) * sign
+        return np.append(harmonics, point.tangent[-1]) * (sign * direction)
 
     def turn(self, before: Point, after: Point) -> float:
         """0: no angle is guarded beyond that between the tangents in the unknowns of a step's frame.

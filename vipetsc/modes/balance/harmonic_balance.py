@@ -43,10 +43,11 @@ KEPT_MOTIONS = 3
 
 
 class _Columns(NamedTuple):
-    """How harmonics follow from the unknowns of one pair, in the order of its unknowns.
+    """How the harmonics of one pair follow from its unknowns.
 
-    ``orders`` (2 orders,) are those of the harmonics and of their conjugates. ``halves`` (orders, 1) is 1/2 for the
-    mean, which one-sided series have once, and 1 for the others. ``same`` (orders, unknowns) is dZ/dx of the pair.
+    ``orders`` (2 orders,) are the orders k of the harmonics, and then -k of their conjugates. ``halves`` (orders, 1)
+    is 1/2 for the mean, which would otherwise be counted for k and for -k, and 1 for the others. ``same`` (orders,
+    unknowns) is dZ/dx of the pair.
     """
 
     orders: np.ndarray
@@ -55,16 +56,17 @@ class _Columns(NamedTuple):
 
 
 class HarmonicBalance:
-    """The equations of motions with the harmonics ``orders``, in real unknowns x: cosines, then sines if not left out.
+    """The equations of motions with harmonics up to the ``order`` K, in real unknowns x (size,) in m.
 
-    ``order`` is K, the highest. Odd orders alone are enough for symmetric motions of ``forces.odd``; ``cosines`` alone
-    for conservative motions that are at rest at phase 0. x holds, pair by pair, Re Z_k and then Im Z_k for the orders
-    k, in m. ``weight`` multiplies the compliances of orders above the first: at 0 a motion has a mean and one harmonic.
+    With ``odd`` only odd orders k are unknowns, which is enough for motions z(theta + pi) = -z(theta) if ``forces`` are
+    odd, too. With ``cosines`` only the real parts of the harmonics are, which is enough for conservative motions at
+    rest at phase 0: ``forces`` that depend on no velocity, and no load. x holds, pair by pair, Re Z_k for all orders k
+    and then Im Z_k. ``weight`` multiplies the compliances of orders above the first: with 0 a motion has a mean and one
+    harmonic.
 
-    Residual, derivative and energy are those of the compliance shifted by stiffnesses that ``shift`` chooses at a
-    frequency: all of them are asked with one choice along a step. ``forces`` without a dependence on velocities, and no
-    load, make a motion conservative. ``shifted`` is that of other equations with the same compliance, orders and
-    weight, whose values need not be computed again.
+    Residual, derivative and energy are those of the compliance shifted by stiffnesses, which ``shift`` chooses at a
+    frequency; one choice must be kept along a step. ``shifted`` may be that of other equations with the same
+    compliance, orders and weight, whose values are then not computed again.
     """
 
     def __init__(
@@ -101,7 +103,9 @@ class HarmonicBalance:
 
     def weighted(self, weight: float) -> "HarmonicBalance":
         """The equations with another ``weight``."""
-        return HarmonicBalance(self.compliance, self.forces, self.order, self.odd, self.cosines, weight)
+        return HarmonicBalance(
+            self.compliance, self.forces, order=self.order, odd=self.odd, cosines=self.cosines, weight=weight
+        )
 
     def pack(self, z: np.ndarray) -> np.ndarray:
         """Unknowns (size,) of harmonics (pairs, K + 1) complex."""
@@ -192,8 +196,8 @@ class HarmonicBalance:
     def rate(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """dR/domega (size,) in m s/rad of the ``residual`` with no linear motion given: dG_s/domega (F - s Z).
 
-        G_s of the order k is taken at k omega, which gives its derivative the factor k. F does not depend on omega, but
-        through a floor of the approach velocity, which is left out.
+        G_s of the order k is taken at k omega, which gives its derivative the factor k. F depends on omega only through
+        the floor of the approach velocity and through ``Stops.drag``; both are left out.
         """
         out = np.zeros((self.forces.pairs, self.order + 1), complex)
         by_omega = self.shifted.rate(omega, shift) @ self.shifted_force(x, omega, shift)
@@ -211,11 +215,11 @@ class HarmonicBalance:
         )
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
-        """Estimated size of the harmonics left out of ``x`` (n,), over the largest sum of those kept.
+        """Estimated size of the harmonics left out of the motion ``x`` (n,), over the largest sum of those kept.
 
-        Those from K + 1 to 2K are -G F_k, with G continued from its last value as k^-2, as of inertia. For each pair
-        the sum of |G| over its row stands for G. The others are estimated from them: if all fall as k^-3, those beyond
-        2K are 1/3 of those from K to 2K.
+        The harmonics from K + 1 to 2K are -G F_k, where G falls as k^-2 from its value at K omega, as inertia does. For
+        each pair the sum of |G| over its row stands for G. Those beyond 2K are taken to be 1/3 of those from K to 2K,
+        as if all fell as k^-3.
         """
         highest = self.orders[-1]
         forces = np.abs(self.series(x, omega).forces)

@@ -15,11 +15,12 @@ from vipetsc.lattice import Contact
 class Stops(NamedTuple):
     """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
 
-    A clearance of inf says that there is no stop. A negative one says that the contact is pressed at rest by so much,
-    where a static load balances its force. In the homotopy to a state with stops that touch at rest the force has a
-    factor ``weight``, and a dashpot of ``drag`` in N s/m parallel to it. A linear system may have a ``spring`` in N/m
-    in the place of a pressed contact: harmonics are then those of the force less the spring's. ``force`` and ``energy``
-    are those of the contact itself, of the weight 1.
+    A clearance of inf means that there is no stop on that side. A negative one is the depth by which the contact is
+    pressed at rest, where a static load balances its force. The other fields serve harmonic balance. ``weight`` is a
+    factor of the force, and ``drag`` in N s/m a dashpot parallel to it, by which a steady state in contact is reached
+    step by step (``response.steps``). ``spring`` in N/m is the stiffness by which the linear system represents a
+    pressed contact, and which is therefore taken off its force. The methods ``force`` and ``energy`` are those of the
+    contact alone, with the weight 1.
     """
 
     law: Contact

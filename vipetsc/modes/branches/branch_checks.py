@@ -17,45 +17,55 @@ from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.shooting import Shooting
 
-# Points between two checks whether a branch has passed on to another one.
+# Points between two checks whether a branch has passed on to another one; each check integrates fifteen arcs.
 REPETITIONS_EVERY = 50
-# How far a guarded branch may pass a point, over the step to it, and still have met it.
+# A step is followed again if a half-trace or the direction changes by more than this many default bounds. Where the
+# paper's out-of-phase branches are followed without these guards (100 steps), 3 and 4 steps exceed the bounds and one
+# each exceeds twice the bounds; none of them has jumped.
+SUSPICIOUS = 2
+# A step is followed again in this many steps at least, and MOST_POINTS at most. The guarded branch has met the right
+# point if it passes it at a distance of MET times the step.
 MET = 0.02
-# Points at most from the left point to it, and steps into which the step to it is cut at least.
 MOST_POINTS = 400
 FINER = 4
 # A branch without contact whose frequency is within this of a linear mode's has returned to it.
 LINEAR = 1e-9
-# A point within this fraction of its step of an earlier one, in the same direction to this cosine, retraces it.
+# A branch retraces itself at a point whose distance from an earlier step is below this fraction of its own step, with
+# the same direction to this cosine.
 SAME_PLACE = 1e-4
 SAME_DIRECTION = 0.999
-# The latest steps, which lie near anyway, are left out of that.
+# The latest steps, which lie near the point anyway, are left out of that, and branches with few points are not checked.
 LATEST = 6
 FEWEST = 10
-# Every so many points are compared with another flow, which begins so far from the orbit.
+# One of so many points is compared with another flow. The unknowns with which its Newton's method begins are off the
+# orbit by this: from the orbit itself it would not move if the residual of the flow were below the tolerance there.
 COMPARED_EVERY = 4
 OFF = 1e-6
 
 
 def suspects(problem: Shooting, points: list[Point]) -> Iterator[tuple[int, str]]:
-    """Steps of a branch that violate a default guard: (place of the left point, which guard and by how much)."""
+    """Steps of a branch that may have jumped: (place of the left point, which change is large, and how large).
+
+    More contacts change than the default guard allows, or a half-trace or the direction changes by more than
+    ``SUSPICIOUS`` times its default bound.
+    """
     guards = Guards()
     for i, (a, b) in enumerate(itertools.pairwise(points)):
         change = half_trace_change(a, b)
         turn = problem.turn(a, b)
         if contact_changes(problem, a, b, guards.contacts) > guards.contacts:
             yield i, f"contacts {a.episodes} -> {b.episodes}"
-        elif change > 2 * guards.half_trace:
+        elif change > SUSPICIOUS * guards.half_trace:
             yield i, f"asinh of a half-trace changes by {change:.2g}"
-        elif turn > 2 * guards.turn_relative:
+        elif turn > SUSPICIOUS * guards.turn_relative:
             yield i, f"the branch turns by {turn:.2g} rad"
 
 
 def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> bool:
-    """Whether the guarded branch from ``left`` misses ``right``.
+    """Whether the branch from ``left`` misses the point ``right`` when it is followed with guards.
 
-    Follows the branch from the left point with the guards on, until it passes the right one, is further from the left
-    point than three times the step, or cannot go on.
+    It is followed from the left point until it passes the right one, is farther from the left point than three times
+    the step, or cannot go on.
     """
     chart = Relative(problem.system, left.x, left.period)
     origin = chart.encode(left.x, left.period)
@@ -80,7 +90,8 @@ def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> 
         for point in Continuation(problem, left, guarded):
             here = chart.encode(point.x, point.period)
             position, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
-            # a smooth arc leaves its chord by its length times the turn allowed
+            # The branch passes the right point on this step. A smooth arc that turns by no more than the guard allows
+            # deviates from its chord by less than its length times that angle.
             if 0 < position < 1 and missed <= guarded.guards.turn * length:
                 return missed > MET * reach
             if np.linalg.norm(here - origin) > 3 * reach:
@@ -221,11 +232,11 @@ def sampled(problem: Shooting, points: list[Point]) -> Variables:
 
 
 def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
-    """Energy and frequency by ``flow`` at every fourth of ``points``, as variables of the branch's file; else NaN.
+    """Energy and frequency by ``flow`` at one of ``COMPARED_EVERY`` points, as variables of the branch's file.
 
-    The points are corrected keeping the first contact's w (or the largest displacement): at the same energy or
-    frequency the comparison would be ill-posed where the branch is vertical or flat. The differences are the flow's
-    values over the branch's, less 1.
+    The orbits are corrected by the other flow while the first contact's w (or the largest displacement) is kept: with
+    the energy or the frequency kept the comparison would be ill-posed where the branch is vertical or flat. The
+    differences are the flow's values over those of the branch, less 1; NaN where Newton's method fails.
     """
     problem = Shooting(flow, reference.map, max(reference.tolerance, 1e-12))
     contacts = problem.system.contacts
@@ -239,7 +250,6 @@ def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
             held = contacts[0].resonator
         row = np.zeros(len(frame.xi))
         row[held] = 1.0
-        # begin off the orbit, or a flow whose residual passes there would not move at all
         attempt = frame.solve(frame.xi + OFF * (1 - row), row, row @ frame.xi)
         if attempt.converged:
             x, period = frame.chart.decode(attempt.xi)

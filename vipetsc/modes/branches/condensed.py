@@ -37,9 +37,11 @@ from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import System, elastic_stops
 from vipetsc.parallel import StopRequest
 
-# A field is left out below this fraction of its largest value.
+# Displacements below this fraction of the largest one are rounding, and left out.
 NEGLIGIBLE = 1e-16
-# A harmonic is followed so many cells from a site, at first and at last.
+# Displacements are computed up to this distance from a site, in cells, which is doubled until they are negligible
+# there, up to the last value: close to a band edge a breather decays slowly, and one of 2048 cells falls by 1e-16 if
+# its motion decays by 2 % from cell to cell.
 FIRST_REACH = 8
 LAST_REACH = 2048
 # Places up to which Hill's determinant gives the largest multiplier. Its matrix has the harmonics of all of them, and
@@ -64,8 +66,10 @@ class Condensed(NamedTuple):
         options = case.nnm
         if options.system != "condensed":
             system = System.from_case(case)
-            dofs = case.lattice.unit_cell().dofs if options.system == "chain" else system.dofs
-            return cls(condensed_system(system, options), None, system, dofs)
+            dofs = system.dofs
+            if options.system == "chain":
+                dofs = case.lattice.unit_cell().dofs
+            return cls(condensed_system(system, options), chain=None, system=system, dofs=dofs)
 
         chain = case.chain()
         stops = elastic_stops(case)
@@ -74,7 +78,7 @@ class Condensed(NamedTuple):
             motions = condensed_system(System.from_chain(chain, stops), options)
         else:
             motions = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), options)
-        return cls(motions, chain, None, chain.cell.dofs)
+        return cls(motions, chain=chain, system=None, dofs=chain.cell.dofs)
 
 
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
@@ -170,13 +174,19 @@ class CondensedMethod(NnmMethod):
             _, largest = self._orbits.stability(self._orbits.arc(u, point.period))
         except FlowError:
             return np.nan
-        return largest if np.log(largest) > 2 * np.pi * least_growth(finite=True) else 1.0
+        # Slower growth counts as none, as in Hill's method.
+        if np.log(largest) > 2 * np.pi * least_growth(finite=True):
+            return largest
+        return 1.0
 
     @cached_property
     def _orbits(self) -> Shooting:
         """Orbits of all masses, with their sensitivities."""
         system = self.system or System.from_chain(self.case.chain(), elastic_stops(self.case))
-        return Shooting(Dop853Flow(system), MAPS["quarter" if self.motions.forces.odd else "half"])
+        shooting_map = MAPS["half"]
+        if self.motions.forces.odd:
+            shooting_map = MAPS["quarter"]
+        return Shooting(Dop853Flow(system), shooting_map)
 
     def _with_multipliers(self, point: Point, chain: Chain) -> Point:
         """The point with its largest Floquet multipliers, from the lattice's state at phase 0."""
@@ -195,10 +205,17 @@ class CondensedMethod(NnmMethod):
 
 
 def states(motions: ConservativeMotions, points: list[Point], dofs: int) -> Variables:
-    """Displacements at phase 0, where all is at rest, of the cells in which they are not negligible."""
+    """Displacements at phase 0, where all is at rest, as variables of the branch's file.
+
+    They are those of the cells in which one of the ``points`` has displacements that are not negligible.
+    """
     fields = [state_of(motions, point, dofs) for point in points]
     cells = sorted(set().union(*fields))
-    u = np.array([[field.get(cell, 0 * next(iter(field.values()))) for cell in cells] for field in fields])
+    u = np.zeros((len(points), len(cells), dofs))
+    for of_point, field in zip(u, fields, strict=True):
+        for place, cell in enumerate(cells):
+            if cell in field:
+                of_point[place] = field[cell]
     return stored_states(points, cells, u)
 
 
@@ -243,7 +260,10 @@ def with_condensed_loss(motions: ConservativeMotions, dissipation: Dissipation, 
             loss += np.pi * k**2 * omega * float(u @ (dissipation.damping @ u))
         if k == 1 and dissipation.forced is not None:
             first = float(u[dissipation.forced])
-    return replace(point, loss=loss, force=np.nan if dissipation.forced is None else force_for(loss, first))
+    force = np.nan
+    if dissipation.forced is not None:
+        force = force_for(loss, first)
+    return replace(point, loss=loss, force=force)
 
 
 def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: int) -> Iterator[np.ndarray]:
@@ -278,7 +298,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
         near = _cells_near(chain, reach)
         u = compliance.field(omega, forces, near).real
         size = np.abs(u).max(axis=1)
-        # The cells at the full reach: while one of them moves, cells beyond may, too.
+        # The cells at the full distance: while one of them moves, cells beyond may move, too.
         rim = np.min(np.abs(np.subtract.outer(near, chain.sites)), axis=1) == reach
         if reach >= LAST_REACH or not rim.any() or size[rim].max() <= NEGLIGIBLE * size.max():
             return dict(zip(near.tolist(), u, strict=True))

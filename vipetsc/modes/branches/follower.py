@@ -31,12 +31,13 @@ and where it ends, a growing branch is written whole. What is in the folder, and
     failed at the start                     none              no points                   tried again
     complete                                none              both parts, complete        read
 
-Of a branch with one part all is as above its start. A kill at any time leaves one of these states. ``Branch`` explains
-``ending``, ``complete`` and ``findings``.
+A branch with one part has the states of the part above. A kill at any time leaves one of these states. ``Branch``
+explains ``ending``, ``complete`` and ``findings``.
 
-**Failures.** What has failed goes on from its last point when the branch is resumed: the case may have got other steps,
-bounds or numbers of points or of Newton steps, but no other physics. That holds for both parts. A part below that fails
-does not stop the part above, whose points do not depend on it. The same holds for a part that has used up its points.
+**Failures.** A part that has failed goes on from its last point when the branch is resumed. In between the steps, the
+bounds, and the numbers of points and of Newton steps in the case may have been changed, but not the physics. If the
+part below fails, the part above is followed all the same, since its points do not depend on it. A part that has used up
+its points goes on in the same way.
 
 **Branches that cross** a branch at its special points, or are isolated near it, are followed after it, each with files
 of its own. They have one part, and the variables of their points alone (``Method.finish`` is not called for them).

@@ -50,8 +50,8 @@ class Growth:
         rule_of: RuleOf,
         direction: int = 1,
         points_elsewhere: int = 0,
-    ) -> bool:
-        """Continue ``branch`` from the motion ``start`` until it ends; returns whether it is complete then.
+    ) -> None:
+        """Continue ``branch`` from the motion ``start`` until it ends, and set its ``ending`` and ``complete``.
 
         Special points are located between the regular ones.
 
@@ -70,8 +70,8 @@ class Growth:
         # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
         continuation = Continuation(problem, start, rule, direction, step=branch.next_step or None, points_before=done)
         monitor = self.method.monitor(problem)
-        # The monitor compares a point with all earlier ones, and says so where the branch retraces itself or returns to
-        # the linear mode. A resumed branch has to be judged as one that never stopped.
+        # The monitor compares each point with all earlier ones, to see whether the branch retraces itself or returns to
+        # the linear mode. A resumed branch must be judged as one that was not interrupted.
         for point in regular:
             monitor(point)
         if not branch.points:
@@ -79,14 +79,13 @@ class Growth:
 
         try:
             why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
-        # Jumps are pairs of neighbouring points so unlike that the continuation may have changed to another branch.
-        # They are recorded of a branch that fails or is stopped, too. One that is resumed finds the same jumps again.
         finally:
+            # Jumps are pairs of neighbouring points so different that the continuation may have changed to another
+            # branch. They are recorded also if the branch fails or is stopped. When it is resumed they are found again.
             jumps = self.method.jumps(problem, branch.regular())
             branch.findings += [jump for jump in jumps if jump not in branch.findings]
         branch.ending = why_ended or continuation.ending
         branch.complete = why_ended is not None or continuation.finished
-        return branch.complete
 
     def _steps(
         self,

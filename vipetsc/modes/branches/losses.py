@@ -10,11 +10,11 @@ mode. A force F cos(Om t) on one mass, a quarter of a period ahead of its displa
 period, with the first harmonic U_1 of that mass: F = Delta E/(pi |U_1|) keeps the motion going (resonance by quadrature
 of phase; M. Peeters, G. Kerschen, J. C. Golinval, J. Sound Vib. 330 (2011) 486).
 
-An orbit that was shot with matrices is integrated by Gauss's rule between its changes of contact. Its other parts are
-images of the arc, some of them backwards in time: there a contact begins with the velocity with which it ends in the
-arc. Of a whole lattice, without matrices, the state is seen at uniform times of the arc: the mean of v^T C v over them
-converges as that of any periodic function, and errs by 1e-9 to 1e-7 in contact (``FEWEST``). Contacts are integrated by
-the nodes of the substeps in which the orbit itself was.
+Along an orbit that was shot with matrices the arc is integrated by Gauss's rule between its changes of contact. The
+rest of the period consists of images of the arc, some of them backwards in time, in which a contact begins with the
+velocity with which it ends in the arc. Of a whole lattice, shot without matrices, v^T C v is averaged over the state at
+uniform times of the arc. The mean of a smooth periodic function converges fast; with contacts it errs by 1e-9 to 1e-7
+(``FEWEST``). The integrals over contacts use the nodes of the substeps by which the orbit itself was integrated.
 """
 
 import itertools
@@ -37,15 +37,15 @@ from vipetsc.modes.shooting.orbit import whole_period
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import elongation_rows
 
-# Nodes of Gauss's rule in a piece of an arc, which is at most this part of a radian of the fastest linear mode. A stiff
-# contact may be one piece: 12 nodes err by 1e-4 of its loss, 24 by 1e-12.
+# Nodes of Gauss's rule in a piece of an arc, and the longest piece in radians of the fastest motion. A contact that is
+# stiffer than all springs may be one piece: 12 nodes err by 1e-4 of its loss, 24 by 1e-12.
 NODES = 24
 LONGEST = 2.0
-# Of a whole lattice: the fewest times in a period at which its state is seen, and the radians of its fastest motion
-# between two of them.
+# Times of a period at which the state of a whole lattice is looked at: this many at least, and no more than so many
+# radians of the fastest motion apart.
 FEWEST = 512
 BETWEEN = 0.5
-# A substep that ends within this part of an arc from its end is the last one.
+# A substep that ends within this fraction of the arc's duration from its end is the last one.
 AT_END = 1e-9
 
 
@@ -72,7 +72,8 @@ def dissipation_of(case: NnmCase) -> Dissipation:
     elif case.nnm.custom is not None:
         # The table counts masses from 1, and 0 is the ground.
         dashpots = case.nnm.custom.dashpots
-        ends = [(dashpot.start - 1 if dashpot.start else None, dashpot.end - 1) for dashpot in dashpots]
+        mass: list[int | None] = [None, *range(len(case.nnm.custom.masses))]
+        ends = [(mass[dashpot.start], dashpot.end - 1) for dashpot in dashpots]
         rows = elongation_rows(ends, len(case.nnm.custom.masses))
         rates = np.array([dashpot.damping for dashpot in dashpots])
         damping = csr_matrix(rows.T @ (rates[:, None] * rows))
@@ -89,10 +90,10 @@ class _Moment(NamedTuple):
 
 
 class _Contact(NamedTuple):
-    """A contact in an arc: its ``action``, the integral of f w'^2 dt in N m^2/s.
+    """One contact episode in an arc: its ``action``, the integral of f w'^2 dt in N m^2/s.
 
-    ``onset`` and ``separation`` are |w'| in m/s where it begins and ends; None of one that is closed at the start of
-    the arc, or at its end.
+    ``onset`` and ``separation`` are |w'| in m/s where it begins and ends. ``onset`` is None if the contact is closed at
+    the start of the arc, ``separation`` if it is closed at the end.
     """
 
     action: float
@@ -177,7 +178,7 @@ def _contacts_on_tape(substeps: ClosedSubsteps, stops: Stops, number: int, durat
         side = substeps.side[part[0]]
         depths = side * substeps.w[part] - stops.clearance_on(int(side))
         densities = substeps.weights[part] * stops.law.elastic_force(depths) * substeps.rate[part] ** 2
-        # Without a speed: closed at the arc's start, or at its end.
+        # There is no speed where the contact is closed at the arc's start, or at its end.
         onset = None
         if substeps.onset[part[0]]:
             onset = abs(float(substeps.first_rate[part[0]]))
@@ -188,10 +189,14 @@ def _contacts_on_tape(substeps: ClosedSubsteps, stops: Stops, number: int, durat
 
 
 def _taken(law: Contact, contacts: Iterable[_Contact]) -> float:
-    """Energy in J that a contact takes in the arc and in its image backwards in time; NaN if it never separates."""
+    """Energy in J that a contact takes in the arc and in its image backwards in time; NaN if it never separates.
+
+    ``law`` is the contact's law, and ``contacts`` are its episodes in the arc.
+    """
     total = 0.0
     for contact in contacts:
-        # A contact that is closed at rest, at the arc's start or end, is its own image backwards in time.
+        # An episode that lasts over the rest at the arc's start or end is its own image backwards in time: it begins
+        # with the speed with which it ends.
         onset = contact.onset
         if onset is None:
             onset = contact.separation

@@ -62,7 +62,7 @@ class Geometry(NamedTuple):
 class Verdict(NamedTuple):
     """Whether a step is accepted, and the arclength of the next ``step``, or of the next attempt if it is not.
 
-    Of a step that is not accepted, ``why`` says the reason, and ``remedy`` names keys of the case file that may help.
+    For a step that is not accepted, ``why`` gives the reason, and ``remedy`` names keys of the case file that may help.
     """
 
     accepted: bool
@@ -104,16 +104,17 @@ class StepRule(Protocol[S]):
 class GuardedSteps:
     """Steps of a branch of normal modes by [nnm], of such length that the most strained guard comes to ``AIM``.
 
-    Most guarded changes are proportional to the step where it is short: angles and half-traces change at a rate along
-    the branch, and a correction, of second order in the step, is taken over the step. (Of the changes that are not,
-    only being out of bounds counts.) The next step is therefore the last one times ``AIM`` over its strain. It at most
-    doubles, and is shorter than the last one where Newton's method needed more than ``EASY`` steps.
+    Most guarded changes are proportional to a short step: angles and half-traces change at a rate along the branch, and
+    a correction, which is of second order in the step, is divided by the step. The next step is therefore the last one
+    times ``AIM`` over its strain. It at most doubles, and is shorter than the last one where Newton's method needed
+    more than ``EASY`` steps. Changes that are not proportional to the step (``guards.ALL_OR_NOTHING``) have no strain
+    as long as they are within their bounds.
 
     ``problem`` has the orbits, ``control`` the numbers of [nnm].
     """
 
     points_key = "nnm.points"
-    no_step = Verdict(False, 0.0, "no step tried", "nnm.max_newton or nnm.tolerance")
+    no_step = Verdict(accepted=False, step=0.0, why="no step tried", remedy="nnm.max_newton or nnm.tolerance")
 
     def __init__(self, problem: OrbitProblem, control: NnmTable) -> None:
         self.problem = problem
@@ -126,7 +127,10 @@ class GuardedSteps:
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
         """A shorter step."""
         return Verdict(
-            False, step * FAILED_FACTOR, f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance"
+            accepted=False,
+            step=step * FAILED_FACTOR,
+            why=f"no convergence ({attempt.reason})",
+            remedy="nnm.max_newton or nnm.tolerance",
         )
 
     def judge(self, before: Point, after: Point, geometry: Geometry) -> Verdict:
@@ -135,12 +139,13 @@ class GuardedSteps:
         if size <= 1.0:
             # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
             effort = max(size / AIM, after.newton / EASY, 1 / MOST_GROWTH)
-            return Verdict(True, min(after.step / effort, self.control.largest_step))
+            return Verdict(accepted=True, step=min(after.step / effort, self.control.largest_step))
 
         # The strain may not be proportional to the step: the least factor keeps one large strain from ending the
         # branch, and the largest one lets every refusal shorten the step, so that the attempts end.
         factor = min(max(AIM_AGAIN / size, LEAST_FACTOR), MOST_FACTOR)
-        return Verdict(False, after.step * factor, *GUARDED[guard])
+        why, remedy = GUARDED[guard]
+        return Verdict(accepted=False, step=after.step * factor, why=why, remedy=remedy)
 
     def end(self, point: Point) -> tuple[Point, str] | None:
         """The point itself, where it has left the range of energies or of frequencies."""
@@ -161,12 +166,12 @@ class GuardedSteps:
             residuals = attempt.residuals
         return (
             f"step below {self.smallest_step:g} after point {last.index} "
-            f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; {self._touch(last)}"
+            f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; {self._grazing_advice(last)}"
             f"residuals of the last attempt: {residuals}; change nnm.smallest_step or {verdict.remedy}"
         )
 
-    def _touch(self, point: Point) -> str:
-        """A sentence about contacts that graze in the orbit of a ``point``; empty for none."""
+    def _grazing_advice(self, point: Point) -> str:
+        """A sentence on contacts that graze in the orbit of a ``point``, and on keys that help; empty without any."""
         try:
             numbers = self.problem.grazing(point)
         except FlowError:
@@ -240,7 +245,7 @@ class Continuation(Generic[S]):
         last = self.point
         frame = self.problem.frame(last, self.rule.chart)
         attempt = None
-        verdict = Verdict(False, self.step)
+        verdict = Verdict(accepted=False, step=self.step)
 
         while self.step >= self.rule.smallest_step:
             attempt, tangent = _corrected(frame, self.step)

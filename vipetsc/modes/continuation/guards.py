@@ -1,8 +1,9 @@
-"""Guards: bounds on changes from point to point, without which a branch jumps to another arc unseen.
+"""Guards: bounds on what may change from one point of a branch to the next, by which jumps to another arc are noticed.
 
-Both arcs satisfy the equations to rounding, so that no residual distinguishes them. Neighbouring tongues of internal
-resonances differ in their half-traces c = (mu + 1/mu)/2, mu the Floquet multipliers, in their contacts and in their
-direction. A jump between arcs that differ in none of these beyond the bounds is not seen.
+The points of both arcs satisfy the equations to rounding, so that residuals do not distinguish them. Arcs that lie
+close together, as in neighbouring tongues of internal resonances, differ in their half-traces c = (mu + 1/mu)/2 of the
+Floquet multipliers mu, in their contacts, or in their direction. A jump between arcs that differ in none of these by
+more than the bounds is not noticed.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from vipetsc.modes.problem import PeriodicProblem
 # The change that a guard limits, for messages, and the key with its bound.
 GUARDED = {
     "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
-    "contacts": ("more than one contact appears or disappears", "nnm.guards.contacts"),
+    "contacts": ("too many contacts appear or disappear", "nnm.guards.contacts"),
     "corrector": ("the corrector moves too far", "nnm.guards.corrector"),
     "turn": ("the branch turns too sharply", "nnm.guards.turn"),
     "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
@@ -67,7 +68,8 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
 
     worst = Strain(-np.inf, "")
     for guard, change in changes.items():
-        # The truncation, which is no key of the guards, is over its bound already. 0 switches a guard off.
+        # The truncation has been divided by its bound above, which is no key of [nnm.guards]. A bound of 0 switches a
+        # guard off.
         bound = getattr(control.guards, guard, 1.0) or np.inf
         size = change / bound
         # A change that cannot be computed counts as beyond any bound.
@@ -81,12 +83,12 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
 
 
 def contact_changes(problem: OrbitProblem, before: Point, after: Point, allowed: int) -> int:
-    """How many contacts appear or disappear between two points.
+    """The number of contact episodes that appear or disappear between two points.
 
-    If they are more than ``allowed``, images of one another count once. In a lattice that is its own mirror image, or
-    with equal stops on both sides, contacts begin in pairs along the whole branch (``modes.departures``): no shorter
-    step separates them, and to appear together is no jump. To look for images takes the arcs of both orbits again, so
-    it is left out where there is nothing to excuse.
+    If there are more than ``allowed``, those that are images of one another by a symmetry count once. In a lattice that
+    is its own mirror image, or with equal stops on both sides, contacts begin in pairs along the whole branch
+    (``modes.departures``): a shorter step does not separate them, and they are no sign of a jump. Images are looked for
+    in that case alone, since this needs the arcs of both orbits again.
     """
     change = abs(after.episodes - before.episodes)
     if change <= allowed or not allowed:

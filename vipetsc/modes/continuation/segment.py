@@ -17,16 +17,17 @@ import numpy as np
 from vipetsc.modes.continuation.bracketed_root import bracketed_root
 from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 
-# A point of a segment is nearer to where it was sought than this fraction of its length. The cubic between two knots
-# misses an arc that turns by 0.2 rad, the default guard, by 2.5e-4 of its length, and one that turns by 0.8 rad by
-# 0.02: a solution at half the length lies on another arc.
+# A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc. The
+# guess is a cubic between two knots, which misses an arc that turns by 0.2 rad, the default guard, by 2.5e-4 of its
+# length, and one that turns by 0.8 rad by 0.02.
 FURTHEST = 0.5
-# Rounding keeps Newton's method from the tolerance near the tips of narrow tongues; so many times of it is enough here.
+# Near the tips of narrow tongues rounding keeps Newton's method from reaching the tolerance. A residual of this many
+# times the tolerance is accepted for a special point.
 ROUNDING = 10
-# Attempts at a point that Newton's method does not reach, each in a half of the segment before. On the paper's three
-# branches, the in-phase one with 250 special points among them, neither this nor ROUNDING acts: both are a margin.
+# How often a segment is halved to find a special point that Newton's method does not reach. On the paper's three
+# branches, of which the in-phase one has 250 special points, neither this nor ROUNDING acts: both are a margin.
 HALVINGS = 5
-# Fractions of its length at which a segment may be cut in two; the first is taken at which Newton's method converges.
+# Fractions of its length at which a segment may be cut in two; the first one at which Newton's method converges counts.
 MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
 # Where a test turns back between two points, its extreme value is estimated by a parabola. Two zeros are looked for if
 # the estimate is beyond zero or below this fraction of the smaller value at the ends: the parabola may be wrong by as
@@ -62,11 +63,11 @@ class Segment(Generic[S]):
         end = self.frame.encode(right)
         self.length = float(self.frame.tangent @ (end - self.frame.xi))
         self.knots: dict[float, Knot] = {}
-        self._tie(0.0, self.frame.xi, self.frame.tangent)
-        self._tie(self.length, end, self.frame.direction(right))
+        self._add_knot(0.0, self.frame.xi, self.frame.tangent)
+        self._add_knot(self.length, end, self.frame.direction(right))
 
-    def _tie(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
-        """Keep unknowns and the branch's ``direction``, of any length, at an arclength."""
+    def _add_knot(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
+        """Keep the unknowns ``xi`` (n + 1,) and the branch's ``direction`` (n + 1,), of any length, at an arclength."""
         # s is measured along t, so that t . dxi/ds = 1.
         self.knots[arclength] = Knot(xi, direction / (self.frame.tangent @ direction))
 
@@ -98,7 +99,7 @@ class Segment(Generic[S]):
         except np.linalg.LinAlgError as error:
             raise ArithmeticError(f"no unique tangent: {error}") from None
         point = self.frame.measures(attempt, direction)
-        self._tie(arclength, attempt.xi, direction)
+        self._add_knot(arclength, attempt.xi, direction)
         return replace(point, index=self.right.index, step=arclength)
 
     def roots(self, kind: SpecialKind[S], before: S | None) -> list[S]:
@@ -122,6 +123,7 @@ class Segment(Generic[S]):
             return []
         if a * b < 0:
             return [self.root(kind, before)]
+        # The first point of a branch has no step, and a special point none from the point before.
         if before is None or not self.left.step:
             return []
 

@@ -27,28 +27,28 @@ from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import repetitions
 from vipetsc.modes.shooting.shooting import DenseFrame, Shooting
 
-# What is said of the numbers below was measured at eleven special points, seven of them with a crossing branch, of the
-# benchmark of Kerschen and Peeters and of the paper's model with either law.
+# The numbers below were measured at eleven special points of the benchmark of Kerschen and Peeters and of the paper's
+# model with either law. At seven of these points another branch crosses.
 
 # Fractions of ``amplitude`` that are tried, one after the other, as the first step s along a crossing branch. The first
-# leads to it at six of seven crossings, the second at that next to grazing.
+# leads to it at six of the seven crossings, the second at the one next to grazing.
 FRACTIONS = np.array([1.0, 0.1, 0.01, 0.001])
-# Newton's method may move xi by so many s, since the branch leaves at an angle to r: up to 5 on the paper's branches,
-# beyond 100 where it ends on others.
+# Largest correction by Newton's method, over s. The crossing branch may leave at an angle to r: there the correction is
+# up to 5 s on the paper's branches, and beyond 100 s where the method ends on another branch.
 ASTRAY = 20.0
-# The tolerance of a crossing branch is this many residuals of the special point in the map that sees it, where that is
-# more than the tolerance asked for, and LOOSEST at most. The residuals are 5e-15 without contact, and 2e-11 to 3e-9
-# with contacts.
+# The tolerance for a crossing branch is the one asked for, or this many times the residual of the special point in the
+# map that sees the crossing if that is larger, but ``LOOSEST`` at most. These residuals are 5e-15 without contact, and
+# 2e-11 to 3e-9 with contacts.
 ROUNDINGS = 10
 LOOSEST = 1e-9
-# A residual of the special point above this: it is no orbit of the map, as the doubled period's is none of a quarter.
-# Residuals of orbits are up to 3e-9, that of an orbit of another map is 1.
+# A special point with a larger residual is no orbit of the map: an orbit that closes after two periods, for instance,
+# has no quarter from rest to the centre. Residuals of orbits are up to 3e-9, those of other orbits about 1.
 NO_ORBIT = 1e-6
-# The smallest singular value over the largest, up to which a map has a second null direction. It is 1e-9 or less at a
-# crossing, and 3e-3 or more in maps that do not see one.
+# A map has a second null direction if the ratio of the smallest singular value to the largest is below this. The ratio
+# is 1e-9 or less at a crossing, and 3e-3 or more in maps that do not see it.
 SINGULAR = 1e-5
-# Step along the old branch's tangent, over that of a unit step in the unknowns, that gives its direction in another
-# map's unknowns by a difference. With ten times as much or a tenth r turns by 1e-6 rad at most, in the maps taken.
+# Step of the difference, as a fraction of the tangent, by which the old branch's direction is found in the unknowns of
+# another map. With ten times this step or a tenth of it r turns by 1e-6 rad at most, in the maps taken.
 ALONG = 1e-6
 
 
@@ -91,7 +91,8 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
 
     A text with the smallest singular value is appended to ``singular``.
     """
-    problem = Shooting(old.flow, MAPS[name], old.tolerance, old.newton.max_newton)
+    max_newton = old.newton.max_newton
+    problem = Shooting(old.flow, MAPS[name], tolerance=old.tolerance, max_newton=max_newton)
     x, period = _re_expressed(old, point, problem)
     frame = problem.relative_frame(x, period)
     # The special point solves the equations of the old map; here they show whether it is an orbit of this map, too.
@@ -114,15 +115,15 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
     first, second = plane @ (plane.T @ plane @ along)
     row = unit(plane.T @ np.array([-second, first]))
     tolerance = max(old.tolerance, min(ROUNDINGS * rounding, LOOSEST))
-    problem = Shooting(old.flow, MAPS[name], tolerance, old.newton.max_newton)
-    return Crossing(problem, problem.relative_frame(x, period), row)
+    problem = Shooting(old.flow, MAPS[name], tolerance=tolerance, max_newton=max_newton)
+    return Crossing(problem=problem, frame=problem.relative_frame(x, period), row=row)
 
 
 def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
     """The first orbit off the old branch, which crosses at ``point``; raises ContinuationError if none is found."""
     problem, frame, row = crossing
     step = np.nan
-    attempt = Attempt(False, "not tried", [], frame.xi)
+    attempt = Attempt(converged=False, reason="not tried", history=[], xi=frame.xi)
     for step in amplitude * FRACTIONS:
         attempt = frame.solve(frame.xi + step * row, row, row @ frame.xi + step)
         astray = float(np.linalg.norm(attempt.xi - frame.xi - step * row)) > ASTRAY * step

@@ -1,16 +1,18 @@
 """Floquet multipliers of a lattice's periodic motion from the action of its monodromy matrix, without that matrix.
 
-The multipliers mu of a conservative motion come in pairs mu, 1/mu. Nearly all of them, the waves of the lattice far
-from the sites, lie on the unit circle; an instability is a few outside, where Arnoldi's method is slow to tell them
-from the circle. SLEPc's Krylov-Schur method (Stewart 2001) is therefore given the power ``POWER`` of the map, which
-brings |mu| to |mu|^POWER at no cost in orthogonalisation; it is odd, so that mu and -mu stay apart. An odd orbit,
-u(t + T/2) = -u(t), needs half a period: with the sign reversed that map has the multipliers nu, and mu = nu^2. The
-direction of the motion itself, whose multiplier is a defective 1, is deflated: the map acts orthogonally to it.
+The multipliers mu of a conservative motion come in pairs mu, 1/mu. Nearly all of them belong to waves of the lattice
+far from the sites and lie on the unit circle. An unstable motion has a few outside, often so near to the circle that
+Arnoldi's method converges slowly. SLEPc's Krylov-Schur method (Stewart 2001) is therefore given the power ``POWER`` of
+the map, which turns |mu| into |mu|^POWER at no cost in orthogonalisation; the power is odd, so that mu and -mu stay
+apart. An odd orbit, u(t + T/2) = -u(t), needs half a period: with the sign reversed that map has the multipliers nu,
+and mu = nu^2. The direction of the motion itself, which belongs to a defective multiplier 1, is deflated: the map acts
+orthogonally to it.
 
 The space of the vectors that converge is then projected on the map itself (Rayleigh and Ritz), so that each multiplier
-has a residual of its own, |M x - nu x| / |x|. What lies so near to the circle that it does not converge is left out: an
-instability that a run of a hundred periods would not show. Displacements count times the frequency, both times the
-square root of the mass: without contact, kinetic and potential energy of a motion of that frequency.
+has a residual of its own, |M x - nu x| / |x|. Multipliers so near to the circle that they do not converge are left out:
+such an instability would not show in a run of a hundred periods. In the norm |x| displacements are multiplied by the
+frequency, and displacements and velocities by the root of the mass: its square is twice the energy of a motion of that
+frequency without contact.
 
 References
 ----------
@@ -33,31 +35,37 @@ from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.system import System
 
-# These numbers decide what converges and at what cost; each of them was changed for two multipliers of three breathers
-# of 14 cells, whose largest have the sizes 1.046, 1.45 and 10.4. A move is one map of one vector.
+# These numbers decide what converges and at what cost. Each was varied while two multipliers of each of three breathers
+# of 14 cells were computed, whose largest multipliers have the sizes 1.046, 1.45 and 10.4. The cost is counted in
+# products: maps of one vector.
 #
 # Power of the map that SLEPc is given; odd, so that mu and -mu stay apart. With 5 the multiplier 1.046 does not
-# converge, with 13 it takes a tenth fewer moves at a residual of 7e-11 instead of 1e-11, with 51 a quarter more.
+# converge, with 13 it takes a tenth fewer products at a residual of 7e-11 instead of 1e-11, with 51 a quarter more.
 POWER = 25
-# Tolerance of the Krylov-Schur method: the residual is 3e-9 with 1e-8, and 1e-12 takes a fifth more moves.
+# Tolerance of the Krylov-Schur method: the residual is 3e-9 with 1e-8, and 1e-12 takes a fifth more products.
 TOLERANCE = 1e-10
-# Restarts bound the cost where fewer multipliers converge than are wanted: moves grow in proportion to them, and 8 to
-# 32 find the same multipliers.
+# Restarts bound the cost where fewer multipliers converge than are wanted: products grow in proportion to them. 8 to 32
+# restarts find the same multipliers.
 RESTARTS = 16
-# Vectors beyond three times those wanted. From 8 to 32 the multipliers are the same; 8 take up to a third fewer moves,
-# 32 up to three quarters more.
+# Vectors of the Krylov space beyond three times the multipliers wanted. From 8 to 32 the multipliers are the same; 8
+# take up to a third fewer products, 32 up to three quarters more.
 VECTORS = 16
-MULTIPLIERS = 8  # multipliers where a case asks for them without a number
-# Of the first vector, whose other part is the motion of the contacts alone, so that no direction is missing in it. From
-# 1e-4 to 1e-2 it costs the same.
+# Number of multipliers where a case asks for them without one (``nnm.multipliers = true``).
+MULTIPLIERS = 8
+# Size of the random part of the first vector, beside a motion of the contacts of size 1: with it the vector has a part
+# in every direction. Values from 1e-4 to 1e-2 cost the same.
 NOISE = 1e-3
-ONE_RANKS_OWN = 55  # PETSc's number of an error, lack of memory, that need not be met by all ranks
+# PETSc's number of the error "out of memory", which one rank may meet alone.
+ONE_RANKS_OWN = 55
 
 logger = logging.getLogger(__name__)
 
 
 class Monodromy:
-    """The map of variations over an ``arc``, times ``sign``, in scaled blocks, and its ``POWER``, a PETSc matrix."""
+    """The linear map of variations over an ``arc``, times ``sign``, for blocks that are scaled by ``scale``.
+
+    ``multiply`` is its power ``POWER``, for a matrix of PETSc.
+    """
 
     def __init__(self, arc: LatticeArc, scale: np.ndarray, sign: int) -> None:
         self.arc = arc
@@ -90,7 +98,7 @@ def with_multipliers(
     try:
         largest = largest_multipliers(flow, system, odd, u, point.period, count)
     except (PETSc.Error, np.linalg.LinAlgError) as error:
-        # What may be one rank's own ends the program: the other ranks would wait for it.
+        # An error that one rank may have alone ends the program: the other ranks would wait for that rank.
         if getattr(error, "ierr", 0) == ONE_RANKS_OWN:
             raise
         if flow.comm.rank == 0:

@@ -44,7 +44,7 @@ REMEDY = "choose another nnm.start_frequency, between the pass bands"
 
 
 class Diagonal(Chart):
-    """The chart of lattices: initial values over the largest one, period over its value, without dense matrices."""
+    """The chart of lattices, without dense matrices: all initial values over the largest one, and T/T_0."""
 
     def __init__(self, x: np.ndarray, period: float) -> None:
         self.size = float(np.abs(x).max())
@@ -173,7 +173,8 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
 
     def _integrate(self, start: np.ndarray, period: float) -> LatticeArc:
         if self._latest is not None:
-            # Its engine holds windows of the whole orbit; the arc before can no longer move variations.
+            # The engine of an arc holds the whole orbit in memory: that of the arc before is freed first. Variations
+            # can no longer be mapped along that arc.
             self._latest[2].engine.destroy()
             self._latest = None
         return self.flow.arc(self.flow.scatter(start), self.map.fraction * period)
@@ -189,7 +190,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> LatticeFrame:
         """The frame at any initial values ``x`` (n,) and period in s, in the chart of lattices whatever the ``chart``.
 
-        ``tangent`` (n + 1,) is the branch's unit tangent there.
+        ``tangent`` (n + 1,) is d(x, period) along the branch, of any length, or empty.
         """
         return LatticeFrame(self, Diagonal(x, period), x, period, tangent)
 
@@ -207,12 +208,13 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
     def breather(self, omega: float, sites: Sequence[int] = (1,)) -> Point:
         """The orbit of a frequency ``omega`` in rad/s, between the bands, in which ``sites`` touch.
 
-        These are numbers from 1, negative of sites that move the other way. The guess are describing functions, as for
-        condensed motions. Raises ContinuationError if there is none, StartError if Newton's method does not converge
-        from there.
+        ``sites`` are numbers from 1; a negative number is that of a site which moves half a period later. The first
+        guess is the motion by describing functions, as for condensed motions (``balance.conservative``). Raises
+        ContinuationError if there is none, StartError if Newton's method does not converge from it.
         """
         system = self.system
-        # Displacements by a force of 1 N, in m. Of a lattice that nothing holds a little inertia replaces the walls.
+        # Their solutions are displacements by a force of 1 N, in m. In a lattice that nothing holds a static force
+        # would have none: a little inertia takes the place of walls.
         dynamic = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc())
         static = splu((system.stiffness + STATIC * omega**2 * diags(system.masses)).tocsc())
         x = np.zeros(system.dofs)

@@ -23,14 +23,15 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.tangent import MOST_TAPE_ROWS, TangentPropagator
-from vipetsc.lattice import Chain, Drive, ToneBurst
+from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed: below the 1e-12 to which orbits of lattices are
 # corrected.
 RTOL = 1e-13
-# Errors are relative to a speed: of an orbit that starts at rest, at least this fraction of its fastest mode's.
+# Errors are relative to the largest speed at the start of the orbit. The scale is at least this fraction of the speed
+# that the largest displacement would have in the fastest linear mode, since an orbit may start at rest.
 SLOWEST = 0.1
 
 
@@ -79,12 +80,15 @@ class LatticeFlow:
         self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
 
     def _model(self, duration: float, samples: int) -> Model:
-        """The lattice at rest, undriven, for so many samples."""
-        still = ToneBurst(0.0, 1e-3 / duration, 1)
+        """The lattice at rest and without a drive, over ``duration`` seconds with so many ``samples``."""
+        still = ToneBurst(amplitude=0.0, frequency=1e-3 / duration, cycles=1)
+        laws: tuple[Contact, ...] = ()
+        if len(set(self._laws)) > 1:
+            laws = self._laws
         return Model(
             chain=self.chain,
             contact=self._laws[0],
-            drives=(Drive(still, 0, 0),),
+            drives=(Drive(still, cell=0, mass=0),),
             end=duration,
             sample_interval=duration / samples,
             method="8vr",
@@ -92,7 +96,7 @@ class LatticeFlow:
             atol=(0.0, 0.0),
             scale=1.0,
             packet=np.inf,
-            laws=self._laws if len(set(self._laws)) > 1 else (),
+            laws=laws,
             gaps=self._gaps,
         )
 
@@ -142,7 +146,8 @@ class LatticeFlow:
         try:
             engine.place(start, max(float(v.max()), SLOWEST * self._omega * float(u.max())))
             end = engine.run(steps, look)
-        except StalledError as error:  # of all ranks; anything else may be of one alone
+        # Raised on all ranks; any other error may be one rank's own, and is not caught.
+        except StalledError as error:
             engine.destroy()
             raise FlowError(f"the orbit of {duration:.6g} s stops: {error}") from error
         return engine, end

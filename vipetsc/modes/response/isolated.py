@@ -108,7 +108,8 @@ def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: 
         with suppress(*FAILURES):
             start = Response(xi=line.at(begin, float(begin[-1])), next_step=line.options.first_step)
             last = start
-            for point in Continuation(line, start, TurningSteps(line, MOST_STATES), direction):
+            rule = TurningSteps(line, points=MOST_STATES)
+            for point in Continuation(line, start, control=rule, direction=direction):
                 # A line that begins at the amplitude itself does not pass it with its first step.
                 is_left = last is start and start.xi[-1] == crossed
                 if not is_left and (last.xi[-1] - crossed) * (point.xi[-1] - crossed) <= 0:
@@ -124,6 +125,7 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
     Amplitudes range from 1/reach to reach times the curve's own, with reach = ``nfrc.isola_reach``.
     """
     omega, amplitude = states.drive(p)
+    # Along a curve over a key each value has a lattice of its own.
     if isinstance(states, SteadyStates):
         lattice = states
     else:
@@ -135,11 +137,11 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
 
 
 class ClosingSteps(TurningSteps):
-    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or on the range.
+    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or at an end of the range.
 
     It has come back where t . (xi - xi_first), with the tangent t at the first state, turns positive from one state to
-    the next, at a distance from the first state of one step at most. ``begin`` is the state from which the steps go on:
-    the first one, or a later one of a curve that is resumed.
+    the next, and the state is not farther from the first one than a step. ``begin`` is the state from which the steps
+    go on: the first one, or a later one of a curve that is resumed.
     """
 
     def __init__(self, states: Equations, points: int, first: Response, begin: Response) -> None:

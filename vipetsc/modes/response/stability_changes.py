@@ -21,7 +21,6 @@ from vipetsc.modes.balance.hill import AT_ZERO, Perturbations, Stability
 from vipetsc.modes.problem import SpecialKind
 from vipetsc.modes.response.state import Measures, Response
 
-FOLD = "fold"
 BRANCH_POINT = "branch-point"
 PERIOD_DOUBLING = "period-doubling"
 NEIMARK_SACKER = "neimark-sacker"

@@ -32,12 +32,13 @@ from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, larg
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Measures, Response
 
-# A force whose power is below this fraction of amplitude times frequency times displacement, as in a finite lattice
-# without loss, has none but rounding: there are no fractions of it.
+# The power of a force counts as rounding below this fraction of amplitude times frequency times displacement, as in a
+# finite lattice without loss: nothing comes in, of which there could be fractions.
 LEAST_WORK = 1e-12
 # States whose stability is kept: the ends of a step, and one between them. Without special points one is enough.
 KEPT_STATES = 3
-# Frequencies of a range among which the largest linear motion is looked for, as a unit: its size alone matters.
+# Frequencies of a range among which the largest linear motion is looked for. It is a unit, of which the order of
+# magnitude matters alone.
 TRIED = 33
 # Frequencies whose linear motions are kept: those of a step and of its differences. With 2 in place of 9 a curve over
 # the frequency (``nlvib``) computes 7 % more of them; 4 and 18 serve as well.
@@ -95,7 +96,7 @@ class SteadyStates(SteadyEquations):
             balance=HarmonicBalance(
                 self.compliance,
                 self.forces,
-                options.harmonics,
+                order=options.harmonics,
                 odd=bool(options.symmetric),
                 cosines=False,
                 shifted=shifted,
@@ -285,10 +286,10 @@ class SteadyStates(SteadyEquations):
         return self._hill
 
     def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
-        """T, R, U and L (4,) of the module over what comes in.
+        """T, R, U and L (4,) of the module's docstring: powers over the power that comes in.
 
-        ``forces`` (pairs, K + 1) are the contacts' in N, ``loss`` is theirs in J a period. T, R and U are NaN
-        unless the lattice is infinite; all are where nothing comes in.
+        ``forces`` (pairs, K + 1) in N are those of the pairs, ``loss`` in J is what contacts lose in a period. T, R and
+        U are NaN unless the lattice is infinite; all four are NaN where nothing comes in.
         """
         wave = self.linear_motion(omega).wave
         first = forces[:, 1]
@@ -306,10 +307,15 @@ class SteadyStates(SteadyEquations):
             if not given > LEAST_WORK * amplitude * omega * abs(moved):
                 given = 0.0
 
-        powers = np.full(4, 0.0 if self.options.infinite else np.nan)
+        # T, R and U need waves that leave, which only an infinite lattice has.
+        powers = np.full(4, np.nan)
         if isinstance(self.compliance, WaveCompliance) and self.options.infinite:
+            # The powers that leave to higher cells and to lower ones; the wave's side comes first.
             outgoing = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
-            powers[:2] = outgoing if self.options.towards > 0 else outgoing[::-1]
+            if self.options.towards < 0:
+                outgoing = outgoing[::-1]
+            powers[:2] = outgoing
+            powers[2] = 0.0
             for k in range(2, forces.shape[1]):
                 # Even orders of a symmetric motion have no force, and need no solution for their waves.
                 if np.any(forces[:, k]):

@@ -7,7 +7,8 @@ v(T/2; u0, 0) = 0. If f is odd the orbit u(t + T/2) = -u(t) passes the centre u 
 
     H(x, T) = u(T/4; x, 0) = 0,    dH/dx = A,    dH/dT = v(T/4)/4,    S = [[A, B], [C, D]].
 
-The whole period is there for comparison: its condition is 1e6 times worse. n equations for n + 1 unknowns: a branch.
+The n equations for n + 1 unknowns leave a curve of solutions, the branch. The whole period may be shot as well, for
+comparison, but its equations are worse conditioned (``maps``).
 
 **Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated together with the orbit (``flow``;
 ``dop853``: Dormand and Prince's pair, Hairer et al. 1993; ``reference``: PETSc's methods, Newmark's rule). At a

@@ -10,9 +10,9 @@ T/T_0 (``logarithmic``: ln(T/T_0)), the others are
     logarithmic    x_i/x_lead; in the place of the largest one ln(x_lead/x_0,lead)
 
 w is the elongation of a contact, c its row with 1 at the resonator and -1 at the other mass, if there is one, and D its
-clearance in m on the side sigma. D is not 0: contacts that touch at rest have no linear motions, with which branches
-begin, and are refused before. ``logarithmic`` is not needed by any other module: the case key ``nnm.chart`` offers it
-to users, to compare charts with.
+clearance in m on the side sigma. D is not 0: ``System`` refuses contacts that touch at rest, about which no motion is
+linear. ``logarithmic`` is there for users who want to compare charts, by the case key ``nnm.chart``; no other module
+needs it.
 
 **Why grazing needs a chart.** An orbit that starts at rest on its largest sigma w, beyond D, is in contact for the time
 2 [2 (sigma w - D)/|w''|]^1/2. The impulse of a force that grows as (sigma w - D)^n then changes the orbit by the order
@@ -27,9 +27,11 @@ import numpy as np
 
 from vipetsc.modes.system import ContactPair, System
 
-# A largest |w| at the start within this fraction of the clearance is near grazing.
+# The chart ``grazing`` is chosen if |w| at the start is within this fraction of the clearance of it. The paper's
+# out-of-phase branches up to 100 J (116 points with Hertz's law, 141 with the bilinear one) take up to 12 % more Newton
+# steps with values from 0.01 to 0.2.
 NEAR_GRAZING = 0.05
-# The smallest root of the gap in a derivative: at the touch itself the derivative would be singular.
+# Lower bound of |y| in the derivative of w by y, 2 D |y|, which vanishes at the touch itself.
 SMALLEST_ROOT = 1e-9
 
 
@@ -79,8 +81,8 @@ class Relative(DenseChart):
     itself a large common motion would hide the changes of w that make and break contacts. Without ``rest``, where an
     arc starts at the centre, all initial values are over ``size``: they are velocities, and all w are 0.
 
-    A contact that closes a ring of contacts has no unknown of its own: its w is the sum of the others', by which the
-    chart could not be inverted.
+    Of contacts that form a closed ring one has no unknown of its own: its w is the sum of the others, so that with it
+    the chart could not be inverted.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
@@ -115,7 +117,7 @@ class Relative(DenseChart):
 class Logarithmic(DenseChart):
     """Logarithms of the largest initial value and of the period; the other values over the largest one.
 
-    It ends where the value that was the largest has another sign: its logarithm is then NaN.
+    The chart cannot pass a zero of the value that was the largest at its point: the logarithm is NaN beyond.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
@@ -148,8 +150,9 @@ class Logarithmic(DenseChart):
 class Grazing(DenseChart):
     """Initial values over the largest one, with y for the contact that is nearest to its clearance.
 
-    Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. Where it has no stop on that
-    side, the gap is that to the other stop. ``contact`` is its number, ``sign`` the side, ``index`` the place of y.
+    Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. If it has no stop on that side,
+    y is the root of the gap to the stop on the other side. ``contact`` is the number of the contact, ``sign`` is sigma,
+    and ``index`` the place of y among the unknowns.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:

@@ -25,16 +25,19 @@ RTOL = 1e-13
 RTOL_SENSITIVITY = 1e-11
 # Contact changes of one arc beyond which a flow gives up.
 MOST_CHANGES = 2000
-# Fraction of an arc's time in which a contact at rest at its clearance moves by rounding alone.
+# A step shorter than this fraction of the arc's time is taken as it was tried if its search for a contact change finds
+# one at the step's very beginning: a contact at rest at its clearance hardly moves in it, and rounding decides.
 SHORT = 1e-6
 STAGES = 12
 _TABLEAU = np.loadtxt(Path(__file__).with_suffix(".csv"), delimiter=",")
 A = _TABLEAU[:STAGES]
 B, E3, E5 = _TABLEAU[STAGES:]
-# The new step is this fraction of the one that would have the error allowed, and within these factors of the last.
+# The new step is this fraction of the one that would have the error allowed, and within these factors of the last. The
+# fraction and the largest factor are those of the authors' code, whose smallest factor is 1/3.
 SAFETY = 0.9
 LEAST_FACTOR = 0.2
 MOST_FACTOR = 6.0
+# Lower bound of the error in the formula of the new step, which divides by it; the largest factor is met long before.
 SMALLEST_ERROR = 1e-12
 
 
@@ -58,7 +61,11 @@ class Stepper(NamedTuple):
 
 @kernel
 def _combine(stepper: Stepper, weights: np.ndarray, h: float) -> None:
-    """The end from the start and weighted rates. All stages, a number that the compiler knows: unused ones weigh 0."""
+    """Put the start plus ``h`` times the weighted sum of the rates of all stages into the end.
+
+    ``weights`` (STAGES,) are 0 for stages that are not known yet: a loop over all of them has a length that the
+    compiler knows.
+    """
     k, _, y, end = stepper.flat
     for e in range(end.size):
         total = 0.0
@@ -74,7 +81,8 @@ def _scaled_error(stepper: Stepper, h: float) -> float:
     end = stepper.end
     errors = stepper.errors
 
-    # A number that is not finite makes this sum one that is not zero; a test of each number would cost a branch.
+    # 0 times a number that is not finite is NaN, which makes the sum differ from zero. A test of each number would cost
+    # a branch in the loop.
     zero = 0.0
     for value in stepper.flat[3]:
         zero += 0.0 * value
@@ -133,7 +141,7 @@ def _tried(stepper: Stepper, h: float) -> float:
 @kernel
 def _take_orbit(orbit: Stepper, stepper: Stepper) -> None:
     """Let the ``orbit`` begin where the ``stepper`` begins, without the variations."""
-    # Of an attempt that overflowed: a weight of 0 would not remove it from sums.
+    # Rates that an earlier attempt has left infinite or NaN would stay in the sums, even with the weight 0.
     orbit.stages[1:] = 0.0
     for i in range(2 * stepper.step.system.inverse_mass.size):
         orbit.start[i, 0] = stepper.start[i, 0]
@@ -142,9 +150,10 @@ def _take_orbit(orbit: Stepper, stepper: Stepper) -> None:
 
 @kernel
 def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
-    """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one.
+    """Repeat the step of length ``h`` at time ``t`` so that it ends on a ``change``.
 
-    The attempts are made by the ``orbit`` alone, a stepper without variations, which do not act on it.
+    Returns the new length, and whether there is a change at its end; otherwise the gap has a largest value there, not
+    above zero. The ``orbit``, a stepper without variations, makes the attempts; the variations are taken along at last.
     """
     step = orbit.step
     _take_orbit(orbit, stepper)
@@ -166,7 +175,7 @@ def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) 
 
 @kernel
 def _begin_at_end(stepper: Stepper, smooth: bool) -> None:
-    """Begin the next step at the end of the last one, which was observed if the step was ``smooth``."""
+    """Begin the next step at the end of the last one; after a ``smooth`` one, without a change, its rates are known."""
     _, _, start, end = stepper.flat
     for e in range(end.size):
         start[e] = end[e]
@@ -194,7 +203,7 @@ def _shortened(h: float, error: float) -> float:
 
 
 @kernel
-def _list(event: np.ndarray, t: float, change: Change, kind: int) -> None:
+def _fill_event(event: np.ndarray, t: float, change: Change, kind: int) -> None:
     """Fill a row of the events: time, contact, side and kind (1 onset, -1 separation)."""
     event[0] = t
     event[1] = change.contact
@@ -228,7 +237,7 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray)
 
         error = _tried(stepper, h)
         if not error < 1.0:
-            # A stage that overflowed is infinite or NaN, which a weight of 0 in the next sums would not remove.
+            # After an overflow: see ``_take_orbit``.
             if not error < 1e300:
                 stepper.stages[1:] = 0.0
             h = _shortened(h, error)
@@ -242,7 +251,7 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray)
         whole = h
         if not smooth:
             h, changed = _land(stepper, orbit, t, h, change)
-        # What rounding took for an extremum lies before the step, which is then taken as it was tried.
+        # The landing has shortened the step to nothing: rounding took the step's beginning for an extremum.
         if not smooth and not changed and t + h == t:
             if whole > SHORT * duration:
                 return STUCK, count, closed
@@ -262,7 +271,7 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray)
         if changed:
             if count >= events.shape[0]:
                 return FULL, count, closed
-            _list(events[count], t, change, flow.switch(step, change))
+            _fill_event(events[count], t, change, flow.switch(step, change))
             count += 1
         if not smooth:
             flow.observe(step, stepper.start, stepper.stages[0], step.start)
@@ -305,15 +314,15 @@ class Dop853Flow(Flow):
     def __init__(self, system: System) -> None:
         super().__init__(system)
         self._columns = 1 + 2 * system.dofs
-        self._stepper = self._room(self._columns)
-        self._orbit = self._room(1)
+        self._stepper = self._allocate(self._columns)
+        self._orbit = self._allocate(1)
         # The orbit where no variations are asked for, and its end.
-        self._alone = self._room(1)
+        self._alone = self._allocate(1)
         self._end = np.empty((1, 2 * system.dofs))
         self._events = np.empty((MOST_CHANGES, 4))
 
-    def _room(self, columns: int) -> Stepper:
-        """The arrays of a step of the orbit and its variations in so many ``columns``."""
+    def _allocate(self, columns: int) -> Stepper:
+        """The arrays for steps of the orbit and its variations, in ``columns`` columns together."""
         shape = _padded(2 * self.system.dofs, columns)
         block = np.zeros((STAGES + 5, *shape))
         flat = block.reshape(len(block), -1)

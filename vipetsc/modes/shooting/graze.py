@@ -1,11 +1,12 @@
-"""Grazing: the orbit of a branch whose contact just touches, by Newton's method with the touch as two of its equations.
+"""Grazing: the orbit of a branch in which a contact just touches, by Newton's method with the touch as two equations.
 
-A pair of changes of a contact, an onset and a separation in either order, meets where the contact stands at its
-clearance on side s with w' = 0. With the time t of that as an unknown beyond those of the chart,
+Along the branch two changes of a contact, an onset and a separation in either order, come together and vanish. Where
+they meet, at the time t, w is the clearance D on the side s, and w' = 0. With t as one more unknown the orbit solves
 
     H(xi) = 0,    s w(t; xi) = D,    w'(t; xi) = 0,
 
-and the flow's sensitivities give all derivatives. At rest w' = 0 already, and t stays 0.
+and the flow's sensitivities give all derivatives. If the touch is at the start of an arc at rest, w' = 0 holds there
+for every orbit, and t stays 0.
 """
 
 from collections.abc import Iterator
@@ -19,12 +20,16 @@ from vipetsc.modes.shooting.flow import Arc
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.orbit import ShotOrbits
 
+# Newton steps at most. Where they are not enough, the caller brackets the touch instead.
 MOST_STEPS = 10
-# Newton steps are no longer than this, in unknowns of order one ...
+# A longer Newton step, in unknowns of order one, counts as divergence.
 FURTHEST = 0.5
-# ... and after one below this only rounding is left, as the next would be its square.
+# Newton's method ends after a step below this: the next one would be its square, which is rounding.
 CLOSE = 1e-9
-# The flow must not end on an extremum; a parabola over this fraction of the time goes on to it, to rounding.
+# On the way the time may pass the end of the arc, in whose last instant a contact may touch, by this factor.
+LATEST = 1.1
+# The flow would look for the touch as a change of contact. It is therefore followed to this fraction of the time before
+# the touch, and a parabola, whose error is rounding, leads on to it.
 SHORT = 1e-6
 
 
@@ -38,13 +43,19 @@ class Touch(NamedTuple):
 
     @classmethod
     def nearest(cls, arc: Arc, shooting_map: ShootingMap) -> Self:
-        """The two neighbouring changes of an arc that are nearest to each other; one at time 0 if there are none."""
+        """The two neighbouring changes of an arc that are nearest to each other.
+
+        Without any, the time is NaN, with which ``graze`` raises ArithmeticError.
+        """
         pairs = cls.neighbours(arc, shooting_map.starts_at_rest, shooting_map.ends_at_rest)
-        return min(pairs, default=cls(0.0, np.nan, 0, 0))
+        return min(pairs, default=cls(apart=0.0, time=np.nan, contact=0, side=0))
 
     @classmethod
     def neighbours(cls, arc: Arc, rest_before: bool, rest_after: bool) -> Iterator[Self]:
-        """Neighbouring changes of a contact on one side; at rest before and after the arc its mirror image adds one."""
+        """Neighbouring changes of a contact on one side.
+
+        An arc that starts or ends at rest goes on there as its mirror image, with one more change.
+        """
         for contact in np.unique(arc.events[:, 1]).astype(int):
             times, _, sides, _ = arc.events[arc.events[:, 1] == contact].T
             if rest_before:
@@ -54,18 +65,22 @@ class Touch(NamedTuple):
                 times = np.append(times, 2 * arc.duration - times[-1])
                 sides = np.append(sides, sides[-1])
             for i in np.flatnonzero(sides[1:] == sides[:-1]):
-                yield cls(times[i + 1] - times[i], (times[i] + times[i + 1]) / 2, contact, int(sides[i]))
+                yield cls(
+                    apart=times[i + 1] - times[i],
+                    time=(times[i] + times[i + 1]) / 2,
+                    contact=contact,
+                    side=int(sides[i]),
+                )
 
 
 def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touch) -> np.ndarray:
     """Unknowns (n + 1,) of the orbit near ``guess`` where the two changes of a ``touch`` meet.
 
-    Raises ArithmeticError if Newton's method fails, as from a touch that is none.
+    Raises ArithmeticError if Newton's method fails, as it does if the time of the ``touch`` is NaN.
     """
     xi = guess
     time = touch.time
     try:
-        # Plain Newton's method: the bracketing of the caller takes over where it does not converge.
         for _ in range(MOST_STEPS):
             matrix, values, duration = _equations(problem, chart, xi, touch._replace(time=time))
             *step, later = np.linalg.solve(matrix, -values)
@@ -73,7 +88,7 @@ def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touc
             xi = xi + step
             time = time + later
 
-            if not (size <= FURTHEST and 0 <= time <= 1.1 * duration):
+            if not (size <= FURTHEST and 0 <= time <= LATEST * duration):
                 raise ArithmeticError("Newton's method diverges")
             if size <= CLOSE:
                 return xi

@@ -30,7 +30,7 @@ class ShootingMap:
 
     @property
     def quarter(self) -> bool:
-        """Whether it goes from one section to the other; the orbit is then odd about its end."""
+        """Whether an arc goes from one section to the other; the orbit is then odd about the arc's end."""
         return self.start != self.end
 
     def end_unit(self, period: float) -> float:
@@ -47,7 +47,8 @@ class ShootingMap:
         return frequency
 
 
-# The whole period is here to be compared with, by the case key ``nnm.map``: its condition is 1e6 times worse.
+# The whole period is for comparison, by the case key ``nnm.map``. The derivative of its equations has a condition
+# number 4 to 55 times that of the quarter (median), 4e5 times at most, on the paper's branches up to 100 J.
 MAPS = {
     "quarter": ShootingMap("quarter", "rest", "centre", 0.25),
     "half": ShootingMap("half", "rest", "rest", 0.5),

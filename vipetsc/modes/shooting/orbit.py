@@ -11,6 +11,8 @@ from vipetsc.modes.system import System
 
 # An orbit that comes back after a part of its period to within this fraction of its size repeats itself.
 SAME = 1e-6
+# Numbers of repetitions that are looked for. A motion passed n times repeats itself for each prime factor of n, and one
+# that is passed more often without any of these factors is not found.
 PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
 
 
@@ -60,16 +62,17 @@ def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, pari
 
 
 def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
-    """Number of zeros in half a period of the contacts' relative motion (without contacts, of all displacements).
+    """The number k of the k:1 internal resonance to whose tongue an orbit belongs; 1 without a resonance.
 
-    On a tongue of a k:1 internal resonance, mode two moves k times while mode one moves once.
+    It is the number of zeros in half a period of the contacts' relative motion, or, without contacts, of displacements:
+    the largest over all of them. On the tongue the higher mode oscillates k times in a period of the lower one.
     """
     u, _ = sample_orbit(problem, point, samples)
     rows = problem.system.contact_rows
     w = u
     if len(rows):
         w = u @ rows.T
-    # What moves by rounding alone, as a contact at a node, passes zero at random.
+    # A contact at a node of the motion moves by rounding alone, and passes zero at random.
     amplitude = np.abs(w).max(axis=0)
     positive = w[:, amplitude > SAME * amplitude.max()] > 0
     passes = np.sum(positive != np.roll(positive, 1, axis=0), axis=0)
@@ -77,12 +80,12 @@ def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
 
 
 def repetitions(problem: ShotOrbits, point: Point) -> int:
-    """The smallest prime number of times that an orbit passes the same motion in its period; 1 for its least period.
+    """How often an orbit passes the same motion in its period: the smallest such number among ``PRIMES``, else 1.
 
-    Along a branch from a linear mode it is 1 but where a tongue of an internal resonance crosses the other mode's
-    branch: there the orbit is the other mode's, passed k times.
+    Along a branch from a linear mode it is 1, except where a tongue of a k:1 internal resonance crosses the branch of
+    another mode: there the orbit is that mode's, passed k times.
     """
-    # Displacements and velocities are compared with the orbit's size; a motion passed n times repeats for a prime of n.
+    # Displacements are compared with the orbit's size, velocities with the size times a frequency.
     start = problem.arc(point.x, point.period).start
     rate = problem.flow.omega_ref(point.period)
     size = np.abs(start).max()

@@ -1,7 +1,6 @@
 """Flows to compare the compiled one with: PETSc's Runge-Kutta methods, Newmark's rule, central differences.
 
-The keys ``nnm.flow``, ``nnm.compare`` and ``nnm.jacobian`` offer them to users, so that they stand here and not with
-the paper, whose comparisons they were written for.
+Users choose them by the keys ``nnm.flow``, ``nnm.compare`` and ``nnm.jacobian``; the paper's comparisons use them, too.
 
 TSRK lands on contact changes as the compiled flow does, with steps taken one by one: TSEvent loses short contacts and
 error control. Newmark's rule is the paper's flow: a fixed number of steps a period, and the exact derivatives of the
@@ -43,7 +42,7 @@ class Tsrk(Flow):
         self._y = PETSc.Vec().createSeq(self._shape[0] * self._shape[1], comm=PETSc.COMM_SELF)
         self._adaptive = self._solver("basic")
         self._fixed = self._solver("none")
-        # The contacts that the rates are asked with, from one arc to the next.
+        # The closed contacts for ``_rates``, which PETSc calls with the state alone; set at the beginning of an arc.
         self._record: flow.FlowStep
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -278,9 +277,10 @@ class Newmark(Flow):
         if not _newmark(self.compiled, y, h, path):
             raise FlowError("Newmark's implicit step does not converge")
 
-        side = self.system.sides_at(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
-        before = side[:-1]
-        after = side[1:]
+        # The side (steps + 1, contacts) on which each contact is closed at the ends of steps, 0 for an open one.
+        sides = self.system.sides_at(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
+        before = sides[:-1]
+        after = sides[1:]
         events = []
         for i, c in zip(*np.nonzero(before != after), strict=True):
             side = after[i, c]
@@ -311,7 +311,8 @@ class FiniteDifferences(Flow):
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
         columns = []
         for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):
-            later, earlier = (self.flow.arc(start + s * move, duration, period).end for s in (1, -1))
-            columns.append((later - earlier) / (2 * move.max()))
+            beyond = self.flow.arc(start + move, duration, period).end
+            before = self.flow.arc(start - move, duration, period).end
+            columns.append((beyond - before) / (2 * move.max()))
         arc = self.flow.arc(start, duration, period)
         return np.column_stack([arc.end, *columns]), arc.events, arc.closed

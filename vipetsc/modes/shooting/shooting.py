@@ -18,12 +18,13 @@ from vipetsc.modes.shooting.orbit import resonance
 from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
 from vipetsc.modes.shooting.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
 
-# A half-trace is (lambda + 1/lambda)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: a change of
-# sign smaller than this is rounding, and no special point.
+# A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
+# this of the level, on either side, a change of sign is rounding and no special point.
 LEAST_CROSSING = 1e-6
-# Singular values of the Jacobian below this fraction of the largest leave the tangent open.
+# If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
+# and the tangent is not unique.
 DEGENERATE = 1e-12
-# Samples of an arc in which contacts that graze are looked for.
+# Samples of an arc in which contacts that graze are looked for (``grazing.TOUCH``).
 SAMPLES = 2000
 
 
@@ -72,8 +73,9 @@ class Shooting(ShootingEquations[Arc]):
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
         super().__init__(flow.system, shooting_map, tolerance)
         self.flow = flow
-        # From rest to rest the momentum of a system that nothing holds is 0 whatever the start: its centre of mass is
-        # kept where it is at rest instead. From the centre on the arc itself does so.
+        # If nothing holds the system, its momentum stays 0 in an arc from rest to rest, whatever the start: one
+        # equation is lost. The centre of mass is kept in its place instead. An arc that starts at the centre (u = 0)
+        # has it there.
         self._kept = None
         if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
             self._kept = flow.system.mean_motion
@@ -163,25 +165,26 @@ class Shooting(ShootingEquations[Arc]):
         levels = {1.0: "branch-point", -1.0: "period-doubling"}
         if self.map.quarter:
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
-        # Pairs that stay complex are not even looked for, each search being a dozen integrations; where two half-traces
-        # meet within the step, what is found has to be real.
+        # Each search takes a dozen integrations: half-traces that are complex at both points are left out. Two real
+        # ones may meet within the step and be complex in between, so that a point that is found must have a real one.
         for level, name in levels.items():
             for i in real_half_traces(left, right):
                 test = HalfTraceAbove(i, level)
-                yield SpecialKind(name, test, LEAST_CROSSING, accept=test.is_real)
+                yield SpecialKind(name, test, floor=LEAST_CROSSING, accept=test.is_real)
 
-        def sides_with_right(point: Point) -> float:
+        def is_like_right(point: Point) -> float:
+            """1 if a point has as many contact episodes as the right one, else -1: a step at the touch."""
             if point.episodes == right.episodes:
                 return 1.0
             return -1.0
 
         if left.episodes != right.episodes:
-            yield SpecialKind("grazing", sides_with_right, seek=self.seek_touch, finish=without_touch)
+            yield SpecialKind("grazing", is_like_right, seek=self.seek_touch, finish=without_touch)
 
     def seek_touch(self, frame: Frame[Point], guess: np.ndarray, left: Point, right: Point) -> np.ndarray:
         """Unknowns (n + 1,) of the orbit near ``guess`` (n + 1,) in which one contact grazes.
 
-        It is the contact that only one of the orbits ``left`` and ``right`` has.
+        The contact is closed (or open, if it is pressed at rest) in only one of the orbits ``left`` and ``right``.
         """
         assert isinstance(frame, DenseFrame)
         touching = max(left, right, key=lambda p: p.episodes)
@@ -194,5 +197,5 @@ class Shooting(ShootingEquations[Arc]):
 
 
 def without_touch(grazing: Point, left: Point, right: Point) -> Point:
-    """A grazing orbit with the episodes of the neighbour that has fewer: what just touches is not counted."""
+    """A grazing orbit with the number of episodes of the neighbour that has fewer: a mere touch is no episode."""
     return replace(grazing, episodes=min(left.episodes, right.episodes))

@@ -44,9 +44,10 @@ A = TypeVar("A", bound=AnyArc)
 class ShootingFrame(Generic[A]):
     """The shooting equations in the unknowns of a ``chart`` at one orbit.
 
-    The argument ``tangent`` (n + 1,) is d(x, period) along the branch, or empty where there is none yet. The attribute
-    is its unit image in the chart's unknowns, and is there only with a tangent. ``unit`` is that of the residual: the
-    chart's, times the frequency where velocities should vanish at the end of an arc that starts with displacements.
+    The argument ``tangent`` (n + 1,) is d(x, period) along the branch, of any length, or empty where there is none yet.
+    The attribute ``tangent`` is the same direction in the chart's unknowns, of unit length; without the argument there
+    is none. ``unit`` is that of the residual: the chart's, times ``ShootingMap.end_unit``, since velocities may have to
+    vanish at the end of an arc that starts with displacements.
     """
 
     tangent: np.ndarray
@@ -169,7 +170,7 @@ class ShootingEquations(ABC, Generic[A]):
 
     def arc(self, x: np.ndarray, period: float) -> A:
         """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
-        # As bytes: to compare arrays of few numbers takes longer.
+        # Bytes are compared faster than arrays of a few numbers.
         values = x.tobytes()
         if self._latest is None or self._latest[:2] != (values, period):
             self._latest = values, period, self._integrate(self.start(x), period)
@@ -248,9 +249,10 @@ class ShootingEquations(ABC, Generic[A]):
         Raises ContinuationError at a branch point, where the tangent is not unique.
         """
         tangent = self.null_vector(start)
-        # The null vector has either sign; where the energy is stationary, the sign is arbitrary.
         energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
-        return tangent * (np.sign(energy_tangent) * direction or direction)
+        # Where the energy is stationary neither sign is towards growing energy: the null vector is taken as it is.
+        sign = np.sign(energy_tangent) or 1.0
+        return tangent * (sign * direction)
 
     def turn(self, before: Point, after: Point) -> float:
         """Angle in rad between the tangents of two orbits in relative units at the first; 0 without a tangent."""
