@@ -8,7 +8,7 @@ from tests.models import CLEARANCE
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Chain, four_band
 
-# The breather of SPEC section 15 has 1600 rad/s, in the gap between bands 2 and 3, and decays within few cells.
+# A breather of 1600 rad/s, in the gap between bands 2 and 3, decays within few cells.
 BREATHER_CELLS = 14
 BREATHER_SITE = 5
 BREATHER_FREQUENCY = 1600.0

@@ -6,7 +6,7 @@ from vipetsc.lattice import Contact, contact_stiffness, four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.system import SmoothSpring, System
 
-# SPEC section 9: the clearance, the radius and Poisson's ratio of the four-band lattice's contacts.
+# The clearance of the paper's reduced model (Sec. IV), and the radius and Poisson's ratio of the contacts (Sec. III).
 CLEARANCE = 10**-2.75
 RADIUS = 0.005
 POISSON = 0.3
@@ -14,7 +14,8 @@ POISSON = 0.3
 IN_PHASE = 0
 OUT_OF_PHASE = 1
 
-# Energies in J at which the linear modes of the reduced model touch the stops (SPEC section 9).
+# Energies in J at which the linear modes of the reduced model touch the stops: omega^2 (D/w)^2/2, with the clearance D
+# and the relative displacement w in the mode of unit modal mass.
 GRAZING_ENERGY = {OUT_OF_PHASE: 0.0293434562302, IN_PHASE: 0.0035442314356}
 
 
@@ -24,7 +25,7 @@ def four_band_contact(law: str = "hertz", modulus: float = 1e8, exponent: float 
 
 
 def reduced_model(law: str = "bilinear", modulus: float = 1e8, exponent: float | None = None) -> System:
-    """The paper's two masses with one contact between them (SPEC section 9)."""
+    """The paper's two masses with one contact between them (Sec. IV)."""
     return System.reduced(four_band(), Stops.both(four_band_contact(law, modulus, exponent), CLEARANCE))
 
 

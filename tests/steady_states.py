@@ -16,7 +16,7 @@ from vipetsc.modes.response.steady import SteadyStates
 
 LATTICE = {"preset": "four-band", "cells": 30}
 CONTACTS = {"sites": [10], "clearance": CLEARANCE, "restitution": 1.0}
-# The range holds the jump up at amplitude/clearance = 1.0014 (SPEC section 15).
+# The range holds the fold at which a sweep to larger amplitudes jumps: at amplitude/clearance = 1.0014.
 NFRC = {"harmonics": 11, "range": [0.98, 1.01]}
 
 

@@ -256,6 +256,31 @@ def test_the_names_that_extend_gives_are_where_it_says():
             assert re.search(rf"\b{name}\b", sources), (files, name)
 
 
+def test_a_name_with_a_file_behind_it_is_in_that_file():
+    """Where the manual gives a name of the code and, in brackets, its module or file, the name occurs in there."""
+    found = 0
+    for page in [ROOT / "README.md", *MANUAL.rglob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        for name, place in re.findall(r"`([A-Z_a-z]\w+)`\s*\(`(vipetsc[./][\w./]*\w)`", text):
+            path = ROOT / place
+            if not place.endswith(".py"):
+                path = (ROOT / place.replace(".", "/")).with_suffix(".py")
+            if not path.exists():
+                path = path.with_suffix("") / "__init__.py"
+            assert re.search(rf"\b{name}\b", path.read_text(encoding="utf-8")), (page.name, name, place)
+            found += 1
+    assert found > 5
+
+
+def test_the_index_counts_the_studies_of_the_gallery():
+    """The index and the gallery say how many studies there are: as many as the gallery has rows, each with its page."""
+    rows = re.findall(r"^\| \[\S+\]\(gallery/(\S+)\.md\)", (MANUAL / "gallery.md").read_text(), flags=re.M)
+    assert sorted(rows) == sorted(path.stem for path in (MANUAL / "gallery").glob("*.md"))
+    number = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen"}[len(rows)]
+    assert f"| {number} studies" in (MANUAL / "index.md").read_text()
+    assert f"has {number} studies" in (MANUAL / "gallery.md").read_text()
+
+
 def sections() -> dict[str, str]:
     """Return every excerpt of a case file in the manual that the session does not write, by page and number.
 

@@ -17,12 +17,12 @@ def point(*half_traces: complex) -> SimpleNamespace:
 
 
 def test_all_real_half_traces_may_cross_a_level():
-    """Real half-traces may cross a level, hence are followed."""
+    """Half-traces that are real at both points may cross a level: all of them are looked at."""
     assert real_half_traces(point(-0.2, 0.9), point(-0.1, 1.1)) == [0, 1]
 
 
 def test_a_pair_that_stays_complex_crosses_none():
-    """A complex pair whose real part passes 1 is no crossing: its four multipliers are off the real axis, not at 1."""
+    """Two conjugate half-traces whose real part passes 1 cross no level: none of their four multipliers is real."""
     before = point(-0.5, 0.9 - 0.2j, 0.9 + 0.2j)
     after = point(-0.5, 1.1 - 0.2j, 1.1 + 0.2j)
     assert real_half_traces(before, after) == [0]

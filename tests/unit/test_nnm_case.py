@@ -36,7 +36,7 @@ def test_a_case_is_written_out_and_read_back():
 
     assert NnmCase.from_table(table) == case
     contacts = table["contacts"]
-    # These numbers stand in section 9 of SPEC.md.
+    # The paper's values (Sec. III and IV).
     assert contacts["modulus"] == 1e8
     assert contacts["radius"] == 0.005
     assert contacts["poisson"] == 0.3

@@ -168,5 +168,5 @@ def test_a_branch_that_stands_still_says_so():
     finding = next(text for text in map(monitor.check, continuation) if text)
 
     assert finding.startswith("does not advance: 20 points up to ")
-    # The grazing energy, SPEC section 9.
+    # The energy at which the mode touches its stop.
     assert "E = 0.0293434562 J" in finding

@@ -274,7 +274,8 @@ def test_a_breather_comes_back_after_its_period(engine, breather):
 
     u = data["displacement"].values
     w = np.diff(u[:, 5, 1:3])
-    assert np.abs(w).max() == pytest.approx(1.286 * CLEARANCE, rel=1e-3)  # SPEC section 15
+    # The amplitude of the breather by an earlier computation with few harmonics.
+    assert np.abs(w).max() == pytest.approx(1.286 * CLEARANCE, rel=1e-3)
     # The contact is closed at the start, closes on the other side, and closes again at the end.
     assert len(data["impacts/onset"]) == 3
 

@@ -154,7 +154,8 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
 
         parameter = measure(curve, "amplitude")
         (fold,) = (number for number, point in enumerate(curve.points) if point.kind == "fold")
-        assert parameter[fold] == pytest.approx(1.0014, abs=2e-4)  # SPEC section 15
+        # The amplitude at which the motion jumps into contact, by an earlier computation.
+        assert parameter[fold] == pytest.approx(1.0014, abs=2e-4)
 
         # The shares are those transmitted, reflected, sent to other bands, and lost.
         share = measure(curve, "share")

@@ -21,7 +21,10 @@ from vipetsc.modes.system import System
 
 
 def test_linear_modes_and_limits():
-    """The linear modes and those with closed contacts have the frequencies of SPEC section 9."""
+    """The linear modes have the frequencies of the paper's two masses, and large motions those with closed contacts.
+
+    The numbers are the roots of the characteristic polynomials of the two stiffness matrices, in Hz.
+    """
     system = reduced_model()
 
     assert system.linear_modes()[0] / (2 * np.pi) == pytest.approx([135.1209897, 474.2501016], rel=1e-9)
