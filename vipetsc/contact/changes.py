@@ -254,10 +254,18 @@ def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, 
 @allocating
 def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
-    b = np.empty(6)
-    room = np.empty(6)
+    return _extremes(contacts, i, start, end, h, np.empty((4, 6)))
+
+
+# Apart from ``extremes``, since a function that allocates counts references to every row that it looks at.
+@kernel
+def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float, rows: np.ndarray) -> Extremes:
+    """The ``extremes``; ``rows`` (4, 6) are overwritten."""
+    b = rows[0]
+    d = rows[1, :5]
+    recoil = rows[2, :5]
+    room = rows[3]
     bernstein(start[i], end[i], h, b)
-    d = np.empty(5)
     for k in range(5):
         d[k] = 5.0 * (b[k + 1] - b[k]) / h
     side = side_of(contacts[i].mode)
@@ -265,7 +273,6 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
     # The site is deepest at an end, or where side w' falls through zero inside. The first such place is enough: steps
     # in contact are a fraction of an impact, too short for a contact to turn twice.
     deepest = max(side * b[0], side * b[5])
-    recoil = np.empty(5)
     for k in range(5):
         recoil[k] = side * (b[k] - b[k + 1])
     if recoil[0] < 0.0:

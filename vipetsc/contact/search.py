@@ -114,23 +114,28 @@ def first_upcrossing(b: np.ndarray) -> float:
         return 0.0
     if not _may_turn_positive(b):
         return 2.0
+    return _search(b, np.empty((_DEPTH + 2, 8)), np.empty((3, 6)))
 
-    # Intervals that wait to be searched, the leftmost on top: the coefficients on each, its beginning and its width.
+
+# Apart from ``first_upcrossing``, since a function that allocates counts references to every row that it looks at.
+@kernel
+def _search(b: np.ndarray, stack: np.ndarray, room: np.ndarray) -> float:
+    """The root of ``first_upcrossing`` where the coefficients ``b`` (n,) do not tell it at once.
+
+    ``stack`` (interval, 8) takes the intervals that wait to be searched, the leftmost on top: the n coefficients on
+    each, and in the last two columns its beginning and its width. ``room`` (3, 6) is overwritten, too.
+    """
     n = b.size
-    stack = np.empty((_DEPTH + 2, n))
-    low = np.empty(_DEPTH + 2)
-    width = np.empty(_DEPTH + 2)
-    c = np.empty(n)
-    left = np.empty(n)
-    room = np.empty(6)
+    c = room[0, :n]
+    left = room[1, :n]
     _copy(b, stack[0])
-    low[0] = 0.0
-    width[0] = 1.0
+    stack[0, 6] = 0.0
+    stack[0, 7] = 1.0
     top = 0
     while top >= 0:
-        _copy(stack[top], c)
-        begin = low[top]
-        size = width[top]
+        _copy(stack[top, :n], c)
+        begin = stack[top, 6]
+        size = stack[top, 7]
         top -= 1
 
         # No interval begins above zero: in the one before it, which ends there, a crossing would have been found.
@@ -138,7 +143,7 @@ def first_upcrossing(b: np.ndarray) -> float:
             continue
         # One change of sign and opposite signs at the ends: one root.
         if c[n - 1] > 0.0 and _count_changes(c) == 1:
-            return begin + size * _bisect(c, room)
+            return begin + size * _bisect(c, room[2])
         if size < _NARROWEST:
             return begin
 
@@ -146,12 +151,12 @@ def first_upcrossing(b: np.ndarray) -> float:
         _halve(c, left)
         top += 1
         _copy(c, stack[top])
-        low[top] = begin + 0.5 * size
-        width[top] = 0.5 * size
+        stack[top, 6] = begin + 0.5 * size
+        stack[top, 7] = 0.5 * size
         top += 1
         _copy(left, stack[top])
-        low[top] = begin
-        width[top] = 0.5 * size
+        stack[top, 6] = begin
+        stack[top, 7] = 0.5 * size
     return 2.0
 
 

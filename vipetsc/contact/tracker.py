@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.changes import (
     LANDED_G,
     LANDED_W,
@@ -78,7 +78,7 @@ def in_episode(mode: int) -> bool:
     return mode != FREE and abs(mode) != RESTING
 
 
-@njit(error_model="numpy")
+@allocating
 def with_room(tracks: Tracks) -> Tracks:
     """``tracks`` with room in the log for an episode of every site."""
     used = tracks.closed[0]
@@ -92,7 +92,7 @@ def with_room(tracks: Tracks) -> Tracks:
     return Tracks(tracks.sites, log, tracks.closed)
 
 
-@njit(error_model="numpy")
+@kernel
 def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extremes) -> None:
     """Update the open episode of site ``i`` of ``contacts`` (site,) with the extremes ``reached`` in an interval."""
     track = tracks.sites[i]
@@ -112,7 +112,7 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
         track.counts.pulled += 1
 
 
-@njit(error_model="numpy")
+@kernel
 def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> bool:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3).
 
@@ -134,7 +134,7 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
     return any_open
 
 
-@njit(error_model="numpy")
+@kernel
 def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
@@ -164,7 +164,7 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
     return switched
 
 
-@njit(error_model="numpy")
+@kernel
 def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
     """Let site ``i`` rest in contact if it touches a stop without clearance; returns whether it does.
 
@@ -221,7 +221,7 @@ def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float)
     tracks.closed[0] += 1
 
 
-@njit(error_model="numpy")
+@kernel
 def _set_mode(
     contacts: np.ndarray, tracks: Tracks, i: int, mode: int, motion: np.ndarray, energies: np.ndarray, t: float
 ) -> None:

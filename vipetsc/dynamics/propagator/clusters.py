@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import allocating, disjoint, kernel
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -244,8 +244,7 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
     return response
 
 
-# Not a ``kernel`` of ``vipetsc.compiled``, since it makes arrays.
-@njit(error_model="numpy")
+@kernel
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
@@ -258,36 +257,38 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     if dofs.rows.shape[1] == columns.shape[0]:
         return _expand_damped_motion(dofs, c, columns, taylor)
 
-    _, masses, width, terms = dofs.rows.shape
-    even = np.empty(terms)
-    odd = np.empty(terms)
+    masses = dofs.rows.shape[1]
     may_touch = False
     for i in range(dofs.first[c], dofs.first[c + 1]):
         rows = dofs.rows[dofs.table[i]]
         leftmost = dofs.column[i]
-        even[:] = 0.0
-        odd[:] = 0.0
+        taylor[i] = 0.0
         for j in range(masses):
-            for k in range(width):
+            for k in range(rows.shape[1]):
                 u = columns[j, leftmost + k]
                 v = columns[masses + j, leftmost + k]
-                row = rows[j, k]
-                for m in range(terms):
-                    even[m] += u * row[m]
-                    odd[m] += v * row[m]
+                _add_powers(rows[j, k], u, v, taylor[i])
 
         # The sum of all |a_k| bounds |x| in the whole step, 0 <= s <= 1.
         bound = 0.0
-        for m in range(terms):
-            taylor[i, 2 * m] = even[m] * dofs.factors[2 * m]
-            taylor[i, 2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
+        for m in range(rows.shape[2]):
+            taylor[i, 2 * m] *= dofs.factors[2 * m]
+            taylor[i, 2 * m + 1] *= dofs.factors[2 * m + 1]
             bound += abs(taylor[i, 2 * m]) + abs(taylor[i, 2 * m + 1])
         # Not ``bound >= clearance``: a state that is not finite must be looked at, too.
         may_touch |= not bound < dofs.clearance[i]
     return may_touch
 
 
-@njit(error_model="numpy")
+@disjoint
+def _add_powers(row: np.ndarray, u: float, v: float, series: np.ndarray) -> None:
+    """Add ``row`` (term,) times ``u`` to the even coefficients of a ``series``, and times ``v`` to the odd ones."""
+    for m in range(row.size):
+        series[2 * m] += u * row[m]
+        series[2 * m + 1] += v * row[m]
+
+
+@allocating
 def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion as ``expand_free_motion`` does, in a lattice with dashpots."""
     _, rows, width, terms = dofs.rows.shape
@@ -322,7 +323,7 @@ def is_zero(row: np.ndarray) -> bool:
     return zero
 
 
-@njit(error_model="numpy")
+@kernel
 def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) the motion that forces within the step have caused at its end.
 
@@ -355,7 +356,7 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
                 out[masses + j, cell] += v * inverse_mass
 
 
-@njit(error_model="numpy")
+@kernel
 def _apply_damped_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add the motion that forces have caused as ``apply_impulses`` does, in a lattice with dashpots.
 

@@ -16,7 +16,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import clipped_energy, impact_time
 from vipetsc.contact.tracker import (
@@ -36,7 +36,7 @@ from vipetsc.dynamics.propagator.clusters import DofTables, create_dof_tables, c
 from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.loss_tables import create_losses, no_losses
-from vipetsc.dynamics.propagator.losses import PairLosses, begin_losses
+from vipetsc.dynamics.propagator.losses import PairLosses, select_losses
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
@@ -67,7 +67,7 @@ FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY),
 """A DoF of ``contact_dofs`` in a checkpoint: its number, below 0 of a drive, and what its cluster's record has."""
 
 
-@njit(error_model="numpy")
+@kernel
 def _update_open_episodes(contacts: np.ndarray, histories: np.ndarray, tracks: Tracks) -> None:
     """Bring the open episodes of ``contacts`` (site,) up to date with their ``histories`` of dtype ``HISTORY``."""
     for i in range(contacts.size):
@@ -77,14 +77,15 @@ def _update_open_episodes(contacts: np.ndarray, histories: np.ndarray, tracks: T
             update_episode(contacts, tracks, i, reached)
 
 
-@njit(error_model="numpy")
+@kernel
 def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     """Switch the sites of a cluster that have landed, ``now`` in s; sets the length of the next substep."""
     contacts = cluster.contacts
     state = cluster.state[0]
     # Before the switch: an episode that ends takes its extremes along.
     _update_open_episodes(contacts, cluster.history, tracks)
-    had_contact = np.empty(contacts.size, np.bool_)
+    # Workspace that every substep fills anew.
+    had_contact = cluster.trial.sums.reaches[0]
     for i in range(contacts.size):
         had_contact[i] = in_episode(contacts[i].mode)
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
@@ -113,7 +114,49 @@ def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
     state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
 
 
-@njit(error_model="numpy")
+@kernel
+def _begin_step(clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, begin: float) -> None:
+    """Set cluster ``c`` to the beginning of a step, ``begin`` in s: nothing has acted in it yet."""
+    cluster = select_cluster(clusters, dofs, c)
+    state = cluster.state[0]
+    state.begin = begin
+    state.position = 0.0
+    cluster.moments[:] = 0.0
+    losses = select_losses(all_losses, dofs, c)
+    losses.moments[:] = 0.0
+    losses.loss[:] = 0.0
+
+
+@kernel
+def _advance_and_switch(
+    clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, tracks: Tracks, may_rest: bool
+) -> tuple[int, int]:
+    """Advance cluster ``c`` to its next change and switch its sites there; returns what ``advance_cluster`` does.
+
+    The log of ``tracks`` must have room.
+    """
+    cluster = select_cluster(clusters, dofs, c)
+    losses = select_losses(all_losses, dofs, c)
+    outcome, site = advance_cluster(cluster, losses, may_rest)
+    if outcome not in (CHANGED, RESTS):
+        return outcome, site
+
+    first = dofs.first[c]
+    sites = tracks.sites[first : first + cluster.contacts.size]
+    own_tracks = Tracks(sites, tracks.log, tracks.closed)
+    state = cluster.state[0]
+    now = state.begin + state.position * cluster.interval
+    if outcome == CHANGED:
+        _switch(cluster, own_tracks, now)
+    else:
+        _update_open_episodes(cluster.contacts, cluster.history, own_tracks)
+        rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)
+    return outcome, site
+
+
+# It may allocate, and such a function counts references to each array that it looks at: those of a cluster are left to
+# kernels.
+@allocating
 def follow_contacts(
     clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, tracks: Tracks, begin: float
 ) -> tuple[bool, Tracks]:
@@ -121,30 +164,16 @@ def follow_contacts(
 
     Returns whether that was possible, and ``tracks`` with as much room as was needed.
     """
-    cluster = select_cluster(clusters, dofs, c)
-    state = cluster.state[0]
-    first = dofs.first[c]
-    state.begin = begin
-    state.position = 0.0
-    cluster.moments[:] = 0.0
-    losses = begin_losses(all_losses, dofs, c)
+    _begin_step(clusters, all_losses, dofs, c, begin)
     # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests. Numba would
     # compile the call twice for a variable that begins as False, once for the constant.
     landings_nowhere = 0
     for _ in range(MOST_CHANGES):
-        outcome, site = advance_cluster(cluster, losses, landings_nowhere > 0)
+        tracks = with_room(tracks)
+        outcome, site = _advance_and_switch(clusters, all_losses, dofs, c, tracks, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
-        tracks = with_room(tracks)
-        sites = tracks.sites[first : first + cluster.contacts.size]
-        own_tracks = Tracks(sites, tracks.log, tracks.closed)
-        now = begin + state.position * cluster.interval
-        if outcome == CHANGED:
-            _switch(cluster, own_tracks, now)
-            landings_nowhere += site >= 0
-        else:
-            _update_open_episodes(cluster.contacts, cluster.history, own_tracks)
-            rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)
+        landings_nowhere += outcome == CHANGED and site >= 0
     return False, tracks
 
 

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.dashpots import NO_DASHPOTS, DashpotRows
 from vipetsc.dynamics.propagator.loss_modes import gauss, mode_count
-from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, ranges_of, sparse_rows
+from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, in_fours, ranges_of, sparse_rows
 from vipetsc.dynamics.vectors import LANES
 
 # Entries below this fraction of a table's largest one are left out.
@@ -105,20 +105,21 @@ def create_loss_stencil(dashpots: DashpotRows, layout: Layout, halo: HaloRegions
     columns = [np.zeros(0, np.int64)]
     for start, stop in ranges_of(is_dense, layout.start).tolist():
         columns.append(int(halo.add(start, stop - start + read - 1)) + np.arange(stop - start))
-    sparse = sparse_rows(interior, layout.dofs, 0)
+    sparse = sparse_rows(interior, layout, 0)
     if layout.dofs % 2:
         # The last mass is there twice, and counts once.
         sparse.values[sparse.starts[-2] :, 2:] = 0.0
+    # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
+    borders = in_fours(np.ascontiguousarray(tables[..., :read].transpose(0, 2, 3, 1)))
     return Stencil(
         interior=ranges - layout.start,
         blocks=sparse.blocks,
         starts=sparse.starts,
-        rows=sparse.rows,
-        offsets=sparse.offsets,
+        places=sparse.places,
         values=sparse.values,
-        # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
-        borders=np.ascontiguousarray(tables[..., :read].transpose(0, 2, 3, 1)),
+        borders=borders,
         border_cells=np.column_stack([np.concatenate(columns), cells[is_dense] - layout.start, table.ravel()]),
+        total=np.zeros(borders.shape[3]),
     )
 
 

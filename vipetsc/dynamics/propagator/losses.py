@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import allocating, inlined, kernel
 from vipetsc.dynamics.propagator.clusters import DofTables, is_zero
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Stencil, multiply_dense
@@ -69,12 +69,12 @@ class PairLosses(NamedTuple):
     before: np.ndarray
 
 
-@njit(error_model="numpy")
-def begin_losses(losses: PairLosses, dofs: DofTables, c: int) -> PairLosses:
-    """The part of ``losses`` that belongs to cluster ``c``, with moments and loss set to zero for a new step."""
+@inlined
+def select_losses(losses: PairLosses, dofs: DofTables, c: int) -> PairLosses:
+    """The part of ``losses`` that belongs to cluster ``c``."""
     first = dofs.first[c]
     stop = dofs.first[c + 1]
-    selected = PairLosses(
+    return PairLosses(
         kinds=losses.kinds[first:stop],
         kernels=losses.kernels,
         degrees=losses.degrees,
@@ -83,12 +83,9 @@ def begin_losses(losses: PairLosses, dofs: DofTables, c: int) -> PairLosses:
         legendre=losses.legendre,
         before=losses.before,
     )
-    selected.moments[:] = 0.0
-    selected.loss[:] = 0.0
-    return selected
 
 
-@njit(error_model="numpy")
+@kernel
 def add_free_losses(
     stencil: Stencil, state: np.ndarray, columns: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> None:
@@ -99,11 +96,10 @@ def add_free_losses(
     blocks of the cell and with cells on the right. A last mass that is alone leaves rows of zeros. Each product of S y
     is multiplied by its y at once, and S y is not stored. ``before`` and ``after`` are different arrays.
     """
-    cells = state.shape[1]
     x = state.reshape(-1)
+    to = stencil.blocks
+    places = stencil.places
     values = stencil.values
-    to = stencil.blocks * cells
-    places = stencil.rows * cells + stencil.offsets
     for cell in range(after.size):
         after[cell] = before[cell]
     for first, stop in stencil.interior:
@@ -128,7 +124,7 @@ def add_free_losses(
             store(add_product(loss, 1.0, before, i), after, i)
 
     masses = state.shape[0] // 2
-    total = np.empty(2 * masses)
+    total = stencil.total
     for column, at, table in stencil.border_cells:
         multiply_dense(stencil.borders[table], columns, column, total)
         # Displacement and velocity mass by mass, as in the stencil's blocks: sums are rounded alike.
@@ -139,7 +135,7 @@ def add_free_losses(
         after[at] = dense + before[at]
 
 
-@njit(error_model="numpy")
+@allocating
 def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int, columns: np.ndarray) -> float:
     """Loss in J that the step's forces on the DoFs of cluster ``c`` have added, by pairs and with free motion.
 

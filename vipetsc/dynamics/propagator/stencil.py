@@ -17,7 +17,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.compiled import inlined, njit
+from vipetsc.compiled import kernel
 from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -88,7 +88,7 @@ class Halo(NamedTuple):
     states: np.ndarray
 
 
-@njit(error_model="numpy")
+@kernel
 def exchange(halo: Halo, which: int, state: np.ndarray) -> int:
     """Bring the columns up to date with the owned cells ``state`` (2 dof, cell) of the state ``which``; collective.
 
@@ -109,20 +109,23 @@ class Stencil(NamedTuple):
     """P(H) on the cells of one rank, as ``apply_propagator`` reads it.
 
     Owned cells in the ranges ``interior`` (range, 2), half open, read only owned ones, far from the ends and from cells
-    that differ: output rows are summed four at a time, ``blocks`` (block, 4), of which one may be there twice. The
-    terms of block b are ``starts[b]`` to ``starts[b + 1]``: ``values`` (term, 4) times the row ``rows`` at the cell
-    ``offsets`` away. ``borders`` (table, 2 dof, 2 reach + 1, 2 dof) are dense rows of the other cells; ``border_cells``
-    (cell, 3) has the halo's first column for each, the owned cell that it is and its table.
+    that differ: output rows are summed four at a time, of which one may be there twice. For cell 0, and with the state
+    as one row of numbers, the outputs of block b go to the places ``blocks`` (block, 4); its terms, ``starts[b]`` to
+    ``starts[b + 1]``, are ``values`` (term, 4) times the numbers at the ``places`` (term,). Cell i is i places further.
+
+    ``borders`` (table, 2 dof, 2 reach + 1, output) are dense rows of the other cells, with zeros for more outputs than
+    2 dof up to a multiple of four; ``border_cells`` (cell, 3) has the halo's first column for each, the owned cell that
+    it is and its table. ``total`` (output,) is workspace for one of them.
     """
 
     interior: np.ndarray
     blocks: np.ndarray
     starts: np.ndarray
-    rows: np.ndarray
-    offsets: np.ndarray
+    places: np.ndarray
     values: np.ndarray
     borders: np.ndarray
     border_cells: np.ndarray
+    total: np.ndarray
 
 
 def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Stencil:
@@ -160,16 +163,16 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
 
     borders, table = _dense_rows(series, inner[is_dense], tuple(ends))
     cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
-    sparse = sparse_rows(series.interior(), layout.dofs, reach)
+    sparse = sparse_rows(series.interior(), layout, reach)
     return Stencil(
         interior=interior - layout.start,
         blocks=sparse.blocks,
         starts=sparse.starts,
-        rows=sparse.rows,
-        offsets=sparse.offsets,
+        places=sparse.places,
         values=sparse.values,
         borders=borders,
         border_cells=np.column_stack([np.concatenate(columns), cells - layout.start, table]),
+        total=np.zeros(borders.shape[3]),
     )
 
 
@@ -178,33 +181,30 @@ class SparseRows(NamedTuple):
 
     blocks: np.ndarray
     starts: np.ndarray
-    rows: np.ndarray
-    offsets: np.ndarray
+    places: np.ndarray
     values: np.ndarray
 
 
-def sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> SparseRows:
+def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
     """Rows in blocks of four, from ``entries`` (2 dof, 2 dof, cell) of an interior cell, counted from ``-reach`` on."""
     # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Of an odd
     # number of masses the last one is there twice.
+    dofs = layout.dofs
     masses = np.minimum(np.arange(dofs + dofs % 2), dofs - 1)
     blocks = np.column_stack([masses, masses + dofs]).reshape(-1, 4)
 
     starts = [0]
-    rows = []
-    offsets = []
+    places = []
     values = []
     for block in blocks:
         row, column = np.nonzero(entries[block].any(axis=0))
         starts.append(starts[-1] + len(row))
-        rows.append(row)
-        offsets.append(column - reach)
+        places.append(row * layout.owned + column - reach)
         values.append(entries[block][:, row, column].T.copy())
     return SparseRows(
-        blocks=blocks,
+        blocks=blocks * layout.owned,
         starts=np.array(starts),
-        rows=np.concatenate(rows),
-        offsets=np.concatenate(offsets),
+        places=np.concatenate(places),
         values=np.concatenate(values),
     )
 
@@ -233,7 +233,13 @@ def _dense_rows(
     for i, rows in zip(np.flatnonzero(~is_shared), series.rows(examples[~is_shared]), strict=True):
         tables[i] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
     numbers = np.append(table, len(examples) + np.arange(len(ends)))
-    return np.concatenate([tables, _end_rows(series, ends)]), numbers
+    return in_fours(np.concatenate([tables, _end_rows(series, ends)])), numbers
+
+
+def in_fours(tables: np.ndarray) -> np.ndarray:
+    """The ``tables`` (..., output) with outputs of zeros behind the others, up to a multiple of four."""
+    extra = -tables.shape[-1] % 4
+    return np.pad(tables, [(0, 0)] * (tables.ndim - 1) + [(0, extra)])
 
 
 @lru_cache(maxsize=4)  # members of a sweep have the same ends
@@ -249,16 +255,15 @@ def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarr
     return tables
 
 
-@njit(error_model="numpy")
+@kernel
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
     """Put P(H) times the lattice's ``state``, whose halo is ``columns``, into ``out`` (2 dof, owned cell)."""
-    # On flat arrays, in which row r of cell i is at r cells + i: the output rows of each block, the input of each term.
-    cells = state.shape[1]
+    # On flat arrays, in which row r of cell i is at r cells + i.
     x = state.reshape(-1)
     y = out.reshape(-1)
+    to = stencil.blocks
+    places = stencil.places
     values = stencil.values
-    to = stencil.blocks * cells
-    places = stencil.rows * cells + stencil.offsets
 
     # So many neighbouring cells at once: all have the same rows of P.
     for first, stop in stencil.interior:
@@ -284,18 +289,32 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                 store(sum2, y, to[b, 2] + i)
                 store(sum3, y, to[b, 3] + i)
 
-    total = np.empty(out.shape[0])
     for column, cell, table in stencil.border_cells:
-        multiply_dense(stencil.borders[table], columns, column, total)
-        for output in range(total.size):
-            out[output, cell] = total[output]
+        multiply_dense(stencil.borders[table], columns, column, stencil.total)
+        for output in range(out.shape[0]):
+            out[output, cell] = stencil.total[output]
 
 
-@inlined
+@kernel
 def multiply_dense(rows: np.ndarray, columns: np.ndarray, column: int, total: np.ndarray) -> None:
-    """Put the dense ``rows`` (2 dof, cell, output) times the halo's ``columns`` from ``column`` on into ``total``."""
-    total[:] = 0.0
-    for row in range(rows.shape[0]):
-        for k in range(rows.shape[1]):
-            for output in range(total.size):
-                total[output] += columns[row, column + k] * rows[row, k, output]
+    """Put the dense ``rows`` (2 dof, cell, output) times the halo's ``columns`` from ``column`` on into ``total``.
+
+    ``total`` (output,) has a multiple of four numbers.
+    """
+    for output in range(0, total.size, 4):
+        # Names, not an array: the sums stay in registers.
+        sum0 = 0.0
+        sum1 = 0.0
+        sum2 = 0.0
+        sum3 = 0.0
+        for row in range(rows.shape[0]):
+            for k in range(rows.shape[1]):
+                x = columns[row, column + k]
+                sum0 += x * rows[row, k, output]
+                sum1 += x * rows[row, k, output + 1]
+                sum2 += x * rows[row, k, output + 2]
+                sum3 += x * rows[row, k, output + 3]
+        total[output] = sum0
+        total[output + 1] = sum1
+        total[output + 2] = sum2
+        total[output + 3] = sum3

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.clusters import DofTables
@@ -184,7 +184,8 @@ def create_tape(clusters: int, rows: int) -> Tape:
     )
 
 
-@njit(error_model="numpy")
+# Put in place of their calls, these two serve kernels as well as functions that count references to arrays.
+@inlined
 def _select_tape(tape: Tape, c: int) -> Tape:
     """The tape of cluster ``c``."""
     # Nothing is written on a tape without rows, so that no view of it is needed.
@@ -193,7 +194,7 @@ def _select_tape(tape: Tape, c: int) -> Tape:
     return Tape(rows=tape.rows[c : c + 1], motion=tape.motion[c : c + 1], used=tape.used[c : c + 1])
 
 
-@njit(error_model="numpy")
+@inlined
 def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
     """Cluster ``c`` of all: the same constants and workspace, views of its part of the other arrays."""
     first = dofs.first[c]
