@@ -155,6 +155,29 @@ def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
     assert nfrc.parameter_label(branch) == label
 
 
+@pytest.mark.parametrize(
+    ("clearance", "unstable", "axis", "dashes"),
+    [
+        (1e-3, [0, 0, 0], "largest |w| / clearance", None),
+        (1e-3, [0, 2, 0], "largest |w| / clearance", "unstable"),
+        (0.0, [0, 2, -1], "largest |w| (mm)", "unstable or undecided"),
+    ],
+)
+def test_the_panel_of_displacements_is_named_by_them(clearance, unstable, axis, dashes):
+    """The axis is that of the displacement, and the dashed line has a name, whichever states are stable."""
+    branch = branch_of(amplitude=[0.5, 0.9, 1.2], unstable=unstable, kind=[0, 0, 0])
+    branch["largest"] = (("point", "site"), [[5e-4], [9e-4], [1.1e-3]])
+    branch["clearance"] = ("site", [clearance])
+    branch["up_point"] = ("up", [0, 1, 2])
+    branch["down_point"] = ("down", [2, 1, 0])
+    branch.attrs["over"] = "amplitude"
+    axes = Figure().subplots()
+    nfrc._draw_displacement(axes, branch)
+    assert axes.get_ylabel() == axis
+    dashed = [line.get_label() for line in axes.lines if line.get_linestyle() == "--"]
+    assert dashed == [dashes] * (dashes is not None)
+
+
 def test_fractions_that_are_rounding_have_no_panel():
     """Fractions of energy have no panel where all are NaN or rounding.
 

@@ -151,12 +151,12 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     # Springs and contacts that touch at rest have no clearance to compare with, and along a curve over another key the
     # clearances may change.
     if clearance.size and np.all(clearance > 0) and "parameter" not in branch:
-        label = "largest |w| / clearance"
+        motion_label = "largest |w| / clearance"
         relative = largest / clearance
     else:
-        label = "largest elongation (mm)"
+        motion_label = "largest elongation (mm)"
         if branch.sizes["site"]:
-            label = "largest |w| (mm)"
+            motion_label = "largest |w| (mm)"
         relative = 1e3 * largest
     size = relative[:, 0]
 
@@ -184,13 +184,13 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         after = np.insert(~stable[:-1], 0, False)
         before = np.append(~stable[1:], False)
         dashed = np.where(~stable | before | after, size, np.nan)
-        label = "unstable"
+        dashed_label = "unstable"
         if np.any(branch["unstable"].values < 0):
-            label = "unstable or undecided"
-        axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label=label)
+            dashed_label = "unstable or undecided"
+        axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label=dashed_label)
 
     draw_special(axes, branch, size, labelled=True)
-    axes.set_ylabel(label)
+    axes.set_ylabel(motion_label)
     axes.legend(fontsize=6, loc="best")
 
 
