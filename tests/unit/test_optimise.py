@@ -20,6 +20,7 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judgement, ObjectiveRuns
+from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, smooth
@@ -56,6 +57,23 @@ def test_designs_of_other_cells_keep_smooth_parts_and_dashpots():
     assert second.stiffness == 2e3
     assert not second.cubic
     assert not second.damping
+
+
+@pytest.mark.parametrize(("objectives", "sign"), [([{"measure": "transmitted"}], -1), (None, 1)])
+def test_designs_are_compared_at_amplitudes_of_any_sign(objectives, sign):
+    """The case's amplitude may be negative, a phase, next to positive ones of objectives: the curve is log-spaced."""
+    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": -5.0}}
+    one_at_ten = [{"measure": "transmitted", "amplitudes": [10.0]}, {"measure": "transmitted", "goal": "minimise"}]
+    table["optimise"] = BOUNDS | {"objective": objectives or one_at_ten}
+    search_plan = OptimiseCase.from_table(table)
+    design = SimpleNamespace(case=search_plan.base)
+    search = SimpleNamespace(plan=search_plan, compared=lambda: {"case": 0}, designs=[design])
+
+    amplitudes = np.array([run.drive.amplitude for run in curves_of(search)["case"]])
+    curve = amplitudes[(amplitudes != -5.0) & (np.sign(amplitudes) == sign)]
+    assert len(curve) >= 10
+    assert np.abs(amplitudes).min() == pytest.approx(1.25)
+    assert np.abs(amplitudes).max() == pytest.approx(40.0 if sign > 0 else 20.0)
 
 
 def plan(*changes: str) -> OptimiseCase:

@@ -36,8 +36,11 @@ def curves_of(search: OptimumSearch) -> dict[str, list[Case]]:
     case_amplitude = search.plan.amplitude
     amplitudes = options.curve
     if not amplitudes and has_free_amplitude(search.plan.base):
-        asked = [a for table in options.measured for a in table.amplitudes or [case_amplitude]]
-        amplitudes = np.geomspace(min(asked) / CURVE_SPREAD, max(asked) * CURVE_SPREAD, CURVE_POINTS).tolist()
+        asked = [amplitude for table in options.measured for amplitude in table.amplitudes or [case_amplitude]]
+        # By size: the sign of a drive's amplitude is a phase, and only that of the case may be negative.
+        sizes = np.abs(asked)
+        curve = np.geomspace(sizes.min() / CURVE_SPREAD, sizes.max() * CURVE_SPREAD, CURVE_POINTS)
+        amplitudes = np.copysign(curve, max(asked)).tolist()
     # The case's own amplitude is always among them: the bars of energies are drawn there.
     amplitudes = sorted({*amplitudes, case_amplitude})
 
