@@ -10,7 +10,7 @@ from tests.unit.test_trial_cases import QUANTITIES, base_of, sought
 from vipetsc.case import CaseError
 from vipetsc.case.trial import TrialCases
 from vipetsc.identification.coefficient_slopes import CoefficientSlopes
-from vipetsc.identification.least_residuals import least_residuals
+from vipetsc.identification.least_residuals import _Step, least_residuals
 from vipetsc.identification.motion import MotionCoefficients
 from vipetsc.identification.precision import EXACT, FINAL, GROWING, ROUGHEST, TOLERANCE, Precision
 
@@ -50,6 +50,14 @@ def test_a_fit_ends_where_scipys_does_with_one_jacobian_less(precision):
     assert expected.status in (2, 3, 4)
     assert found.tolist() == expected.x.tolist()
     assert counted == [expected.nfev, expected.njev - 1]
+
+
+@pytest.mark.parametrize(("length", "ends"), [(0.9995e-6, True), (1.0005e-6, False)])
+def test_a_small_step_is_judged_by_where_it_begins(length, ends):
+    """A step from 0 ends a fit if it is below the square of the tolerance, as in SciPy, however far it leads."""
+    step = _Step(x=np.zeros(1), residuals=np.ones(1), slopes=np.zeros((1, 1)))
+    # The cost falls by much, so that the length of the step alone decides.
+    assert step.ends_at(np.array([length]), np.full(1, 0.5), Precision(cost=1e-2, step=1e-3)) == ends
 
 
 def test_a_bad_model_of_a_step_does_not_end_a_fit():

@@ -20,7 +20,7 @@ from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import composed, predict
 from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
+from vipetsc.studies.response import BINS, DISSIPATED, SiteResponse, SiteResponses, in_contact
 
 # The two ramps of this chirp meet, so that its spectrum is smooth and lies within the band.
 CHIRP = {"waveform": "chirp", "bandwidth": 300.0, "duration": 0.09, "ramp": 0.045}
@@ -47,11 +47,11 @@ class Prediction(NamedTuple):
 
     def site(self) -> SiteResponse:
         """The response of one site to the waves that meet it, by the records."""
-        _, answers = self.records()
+        _, site_records = self.records()
         frequency = self.case.model().drive.frequency
         [kind] = self.case.kinds.kinds
         cell = self.case.lattice.unit_cell()
-        return SiteResponse.of(answers, cell, frequency, answers[0]["largest"], kind.pair)
+        return SiteResponse.of(site_records, cell, frequency, site_records[0]["largest"], kind.pair)
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +62,9 @@ def prediction(tmp_path_factory) -> Prediction:
     return Prediction(folder, case, predict(case, folder))
 
 
-def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[str, Any]]) -> xr.Dataset:
+def composed_from(case: PredictCase, linear: dict[str, Any], site_records: list[dict[str, Any]]) -> xr.Dataset:
     """The prediction of a case from records of a linear run and of one site, without simulations to compare with."""
-    return composed(case, Records(linear, [answers], [], answers[0]["largest"]))
+    return composed(case, Records(linear, [site_records], [], site_records[0]["largest"]))
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_the_first_contact_is_exact(prediction, factor, touches):
 
 def test_one_site_alone_is_what_its_run_gave(prediction):
     """The energies composed for a single site are those of its run at the same z, if nothing returns from the ends."""
-    _, answers = prediction.records()
+    _, site_records = prediction.records()
     clearance = prediction.case.law.clearance
     site = prediction.site()
     contacts = {"sites": [200], "clearance": [clearance]}
@@ -127,7 +127,7 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
     network = Network(long.model())
 
     # The points lie above the onset and cover the whole range of z.
-    for record in answers[6::4]:
+    for record in site_records[6::4]:
         amplitude = record["z"] * clearance / np.abs(network.linear).max()
         outcome = network.compose(amplitude, SiteResponses((site,), np.zeros(1, int)))
         # Totals are sums of powers over samples: the power lost, then those by band.
@@ -138,13 +138,12 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
 
 def test_without_loss_nothing_is_lost(prediction):
     """A prediction composed of records without loss has no loss."""
-    linear, answers = prediction.records()
-    for record in answers:
-        # Row 6 of the sums has the lost powers.
-        record["sums"][6] = [0.0] * BINS
+    linear, site_records = prediction.records()
+    for record in site_records:
+        record["sums"][DISSIPATED] = [0.0] * BINS
         record["totals"][0] = 0.0
 
-    data = composed_from(prediction.case, linear, answers)
+    data = composed_from(prediction.case, linear, site_records)
 
     assert float(np.abs(data["predicted/dissipated"]).max()) == 0
     assert float(data["predicted/upper"].max()) > 0.05
@@ -152,23 +151,23 @@ def test_without_loss_nothing_is_lost(prediction):
 
 def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
     """The prediction is the same for sites that the case lists in another order."""
-    linear, answers = prediction.records()
+    linear, site_records = prediction.records()
     # This lattice is the same, with its sites in another order.
     swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
 
-    first = composed_from(prediction.case, linear, answers)
-    second = composed_from(swapped, linear | {"reached": linear["reached"][::-1]}, answers)
+    first = composed_from(prediction.case, linear, site_records)
+    second = composed_from(swapped, linear | {"reached": linear["reached"][::-1]}, site_records)
 
     np.testing.assert_allclose(first["predicted/bands"], second["predicted/bands"], atol=2e-4)
 
 
 def test_a_site_that_nothing_reaches_changes_nothing(prediction):
     """A site with a clearance of a metre leaves the prediction as it is."""
-    linear, answers = prediction.records()
+    linear, site_records = prediction.records()
     # A clearance of a metre is never closed.
     more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
 
-    data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
+    data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, site_records)
 
     np.testing.assert_allclose(data["predicted/bands"], prediction.data["predicted/bands"], atol=2e-3)
 
@@ -199,12 +198,12 @@ def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path)
 
 def test_equal_values_in_lists_are_one_kind(prediction):
     """A list of equal values gives the same kind of site, and the same bits, as one value for all sites."""
-    linear, answers = prediction.records()
+    linear, site_records = prediction.records()
     restitution = prediction.case.contacts.restitution
     listed = prediction_case(contacts={"each": {"restitution": [restitution] * 2}})
     assert listed.kinds == prediction.case.kinds
 
-    data = composed_from(listed, linear, answers)
+    data = composed_from(listed, linear, site_records)
 
     # The bits are equal, since a list of equal values describes the same lattice.
     np.testing.assert_array_equal(data["predicted/bands"], prediction.data["predicted/bands"])
@@ -226,12 +225,12 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
 
     Without contacts the release is the onset.
     """
-    _, answers = prediction.records()
-    assert all(0 < record["release"] < 1 for record in answers[4:])
+    _, site_records = prediction.records()
+    assert all(0 < record["release"] < 1 for record in site_records[4:])
 
-    z = np.array([record["z"] for record in answers])
+    z = np.array([record["z"] for record in site_records])
     release = prediction.site().over_bursts(z).release
-    np.testing.assert_allclose(release, [record["release"] for record in answers])
+    np.testing.assert_allclose(release, [record["release"] for record in site_records])
 
 
 def test_finished_runs_are_not_repeated(prediction, tmp_path, monkeypatch):

@@ -89,11 +89,11 @@ class _Step(NamedTuple):
     def ends_at(self, x: np.ndarray, residuals: np.ndarray, precision: Precision) -> bool:
         """Whether a fit ends with the step to ``x`` (active,), where the residuals are ``residuals`` (datum,).
 
-        The conditions are SciPy's for a small step and for a small reduction of the cost, the latter without the terms
-        by which its trust region keeps away from the bounds.
+        The conditions are SciPy's for a small step, relative to where it begins, and for a small reduction of the cost,
+        the latter without the terms by which its trust region keeps away from the bounds.
         """
         moved = x - self.x
-        if np.linalg.norm(moved) < precision.step * (precision.step + np.linalg.norm(x)):
+        if np.linalg.norm(moved) < precision.step * (precision.step + np.linalg.norm(self.x)):
             return True
 
         cost = float(self.residuals @ self.residuals)
