@@ -12,11 +12,12 @@ import xarray as xr
 import vipetsc
 from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
+from vipetsc.io.netcdf import variable
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
-from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
+from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, _fits, fit_curve
 from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, read_linear
 from vipetsc.studies.sweep import conclude, summarise
 
@@ -165,6 +166,20 @@ def test_a_power_law_is_fitted_from_the_largest_value_on():
     # Three points are fitted but are no power law; two are not fitted.
     assert fit_curve(amplitude[:7], curve[:7], normalise=False)["is_power_law"] == 0
     assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])
+
+
+@pytest.mark.parametrize("unit", ["N", "m"])
+def test_a_fit_has_the_unit_of_the_amplitude(unit):
+    """The amplitude of the peak and the factors of a fit are those of a force, or of a wall that moves by metres."""
+    amplitude = np.geomspace(1.0, 100.0, 12)
+    data = {
+        "amplitude": variable("amplitude", amplitude, unit, "drive.amplitude"),
+        "ibtet": variable("amplitude", 1 / amplitude, "1", "transfer"),
+    }
+    fits = _fits(data, "amplitude")
+
+    assert fits["fits/ibtet/peak_amplitude"].attrs["units"] == unit
+    assert fits["fits/ibtet/factor"].attrs == {"units": "1", "long_name": f"factor of the log-log fit at 1 {unit}"}
 
 
 def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:

@@ -13,7 +13,8 @@ from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
 from vipetsc.case import measured as measured_module
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.case.measured import RecordTable, read_measured
+from vipetsc.case.measured import RecordTable, SensorTable, read_measured
+from vipetsc.studies.further_sensor import _further_sensor
 from vipetsc.studies.identified import _start_values, _warnings_of_parameters, parameter_lines
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
@@ -373,6 +374,28 @@ def test_the_size_of_a_data_set_is_checked_before_it_is_read(tmp_path, monkeypat
     assert problems["identify.records[1].sensors[1].column"].endswith(
         "the dataset has 20 numbers; at most 19 are possible"
     )
+
+
+def test_the_amplitude_that_is_sought_has_the_unit_of_its_drive(tmp_path):
+    """The amplitude of a force is in N, that of a moved wall in m, and that of an impulse in N s."""
+    unknowns = [{"quantity": "amplitude", "bounds": [1e-6, 100.0]}]
+    drives = {
+        "N": {"cycles": 4},
+        "m": {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "frequency": 300.0},
+        "N s": {"waveform": "impulse", "amplitude": 1e-3, "duration": 1e-3},
+    }
+    for unit, drive in drives.items():
+        table = lattice_table() | {"drive": drive}
+        plan = IdentifyCase.from_table(identify_table(table, record_in(written(tmp_path)), unknowns=unknowns))
+        assert [parameter.unit for parameter in plan.parameters] == [unit]
+
+
+def test_a_further_sensor_has_the_noise_of_those_that_measure_the_same():
+    """The noise of accelerations in m/s^2 has no part in that of a velocity in m/s."""
+    quantities = ["force", "velocity", "acceleration", "velocity"]
+    sensors = [SensorTable(quantity=quantity, column=1) for quantity in quantities]
+    assert _further_sensor(sensors, np.array([7.0, 0.1, 50.0, 0.3])) == ("velocity", pytest.approx(0.2))
+    assert _further_sensor(sensors[:1], np.array([7.0])) == ("velocity", 1.0)
 
 
 def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):

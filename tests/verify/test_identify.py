@@ -129,6 +129,36 @@ def test_the_motion_is_that_of_the_engine(tmp_path):
     assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
 
 
+def test_a_force_is_that_of_its_drive_behind_a_wall_of_two_springs(tmp_path):
+    """A wall acts through two springs, and a force sensor of the second drive has that drive's force."""
+    springs = [
+        {"start": 2, "end": 1, "stiffness": 2e4, "next_cell": True},
+        {"start": 2, "end": 2, "stiffness": 1e3, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 1e4},
+    ]
+    force = {"waveform": "harmonic", "amplitude": 2.0, "frequency": 700.0, "cell": 3}
+    wall = {"waveform": "harmonic", "end": "left", "amplitude": 1e-5, "frequency": 500.0, "more": [force]}
+    table = {
+        "name": "wall",
+        "lattice": {"cell": {"masses": [0.01, 0.02], "springs": springs}, "cells": 6},
+        "contacts": {"sites": [3], "clearance": 1e-3, "stiffness": 1e6},
+        "drive": wall,
+        "time": {"end": 0.004, "sample_interval": 1e-4},
+    }
+    times = 1e-4 * np.arange(1, 41)
+    path = tmp_path / "wall.csv"
+    np.savetxt(path, np.column_stack([times, np.sin(times), np.cos(times)]), delimiter=",")
+    sensors = [{"quantity": "velocity", "column": 2, "cell": 2}, {"quantity": "force", "column": 3, "drive": 2}]
+    unknowns = [{"quantity": "clearance", "bounds": [1e-4, 1e-2]}]
+    record = {"file": str(path), "time": 1, "sensors": sensors}
+    work = fits_of(identify_table(table, record, unknowns=unknowns))
+
+    values, _ = work.windows().misfit.predicted(work.starts()[0], 0, 1.0)
+    *of_springs, second = work.plan.base.model().drives
+    assert len(of_springs) == 2
+    assert values[:, 1] == pytest.approx(second.waveform.force(times), abs=1e-9)
+
+
 @pytest.mark.slow
 def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     """From starts 30 % off, three sensors determine three clearances, the stiffness and the restitution to 1e-6."""

@@ -12,7 +12,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.uncertainty import marginal_jacobian, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
-from vipetsc.studies import identified as identified_module
+from vipetsc.studies import further_sensor as further_sensor_module
 from vipetsc.studies.identification import Identification, read_measured_records, run_identification
 
 UNKNOWNS = [
@@ -111,8 +111,8 @@ def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
     windows = Identification(plan, read_measured_records(plan), StopRequest()).windows()
     known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(3)))
     samples = len(windows.misfit.records[0].times)
-    monkeypatch.setattr(identified_module, "MOST_NUMBERS", samples * 24 * 3 * 4 // 3 + 1)
-    thinned = identified_module._sensor_values(windows, z, known)
+    monkeypatch.setattr(further_sensor_module, "MOST_NUMBERS", samples * 24 * 4 * 4 // 3 + 1)
+    thinned = further_sensor_module.further_sensor_values(windows, z, known)
     assert thinned["sensor/relative_error"] == pytest.approx(results["sensor/relative_error"].values, rel=0.5)
     assert (thinned["sensor/relative_error"] < known.errors).all()
 

@@ -29,7 +29,10 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
         load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
         # A wall's motion is a force of that motion times the spring's stiffness.
         load[drive.mass] += drive.stiffness or 1.0
-    return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
+    sources = []
+    for (waveform, place), load in loads.items():
+        sources.append(Source(cell, ends, cells=cells, place=place, load=load, waveform=waveform))
+    return sources
 
 
 def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:

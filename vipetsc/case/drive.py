@@ -280,6 +280,17 @@ def build_drives(drives: DriveTable, chain: Chain) -> tuple[Drive, ...]:
     return tuple(built for _, drive in drives.every for built in build_drive(drive, chain))
 
 
+def first_built(drives: DriveTable, chain: Chain) -> list[int]:
+    """The number (from 0) in ``build_drives`` of the first drive that is built of each of the ``drives``."""
+    numbers = []
+    count = 0
+    for _, drive in drives.every:
+        numbers.append(count)
+        # A wall may act through several springs.
+        count += len(build_drive(drive, chain))
+    return numbers
+
+
 def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
     """The drives of a resolved ``drive``: one, or one for each mass that a spring ties to a wall that moves."""
     waveform = waveform_of(drive)

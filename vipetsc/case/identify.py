@@ -29,7 +29,7 @@ from vipetsc.case.sought import (
 from vipetsc.case.study import StudyCase
 from vipetsc.case.trial import TrialCases
 from vipetsc.case.warnings import loss_warnings, unit_warnings
-from vipetsc.lattice import Drive
+from vipetsc.case.waveforms import OneDrive
 from vipetsc.lattice.contact import LAWS
 
 DASHPOTS = ("dashpot", "grounding")
@@ -297,8 +297,8 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 # The case itself is valid, so that the problem is one of the record's keys.
                 yield replace(problem, key=f"{at}.{problem.key}")
         else:
-            yield from _wall_problems(record, case.model().drives, at)
-        yield from sensor_problems(record, at, base.lattice.cells, dofs, len(case.drive.every))
+            yield from _wall_problems(record, [drive for _, drive in case.drive.every], at)
+        yield from sensor_problems(record, at, cells=base.lattice.cells, dofs=dofs, drives=len(case.drive.every))
 
         if record.initial == "estimate" and masses > MOST_MASSES:
             remedy = f"of {masses} masses is too much to estimate; {MOST_MASSES} masses are possible"
@@ -314,11 +314,11 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 yield Problem(f"identify.unknowns[{index}].quantity", unknown.quantity, remedy)
 
 
-def _wall_problems(record: RecordTable, drives: Sequence[Drive], at: str) -> Iterator[Problem]:
+def _wall_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:
     """Problems of sensors for the force of a wall that moves; ``drives`` are those of the ``record``."""
     for number, sensor in enumerate(record.sensors, 1):
         drive = sensor.drive or 1
-        if sensor.quantity == "force" and drive <= len(drives) and drives[drive - 1].stiffness:
+        if sensor.quantity == "force" and drive <= len(drives) and drives[drive - 1].end:
             # What a load cell at the wall measures is the force of the spring, by the motion of wall and mass.
             remedy = f"drive {drive} moves a wall, whose force depends on the lattice's motion; measure that of a mass"
             yield Problem(f"{at}.sensors[{number}].quantity", "force", remedy)

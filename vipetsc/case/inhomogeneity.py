@@ -154,7 +154,7 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
     if absorbing and absorbing.cells and absorbing.strength:
         # Last: absorbing dashpots are added to what profiles, scatter and Rayleigh damping give. A cell outside the
         # absorber, as cell -2, has the reference cell's dashpots: the end adds the difference from these.
-        graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
+        graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, before=0)
         assert graded.variation is not None and graded.variation.grounding is not None
         extra = graded.variation.grounding - graded.coefficients(-2, -1).grounding
         if absorbing.end != "left":

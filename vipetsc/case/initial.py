@@ -162,7 +162,14 @@ class InitialTable(Section):
     def packet(self, cell: UnitCell) -> Packet:
         """The packet, of 1 m; only of that kind."""
         assert self.band and self.wavenumber and self.cell and self.width
-        return gaussian_packet(cell, self.band, self.wavenumber, self.cell - 1, self.width, self.direction or 1)
+        return gaussian_packet(
+            cell,
+            self.band,
+            kappa=self.wavenumber,
+            centre=self.cell - 1,
+            width=self.width,
+            direction=self.direction or 1,
+        )
 
 
 class Beginning(NamedTuple):

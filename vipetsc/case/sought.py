@@ -7,6 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
@@ -33,8 +34,8 @@ UNITS = {
     "cubic": "N/m^3",
     "dashpot": "N s/m",
     "grounding": "N s/m",
-    "amplitude": "N",
 }
+"""The unit of each unknown; that of an amplitude depends on the drive, and an exponent and a restitution have none."""
 
 
 class UnknownTable(Section):
@@ -160,8 +161,8 @@ def groups_of(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
     return [tuple(number - 1 for number in group) for group in unknown.of]
 
 
-def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) -> SoughtParameter:
-    """The parameter of an ``unknown`` that has one value at the ``members``, and begins at ``start``."""
+def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, unit: str) -> SoughtParameter:
+    """The parameter of an ``unknown``, in its ``unit``, with one value at the ``members``; it begins at ``start``."""
     low, high = unknown.bounds
     name: str = unknown.quantity
     if unknown.of != "all":
@@ -177,7 +178,7 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) ->
         high=high,
         # The value of the case may be outside the bounds; the search begins within them.
         start=min(max(start, low), high),
-        unit=UNITS.get(unknown.quantity, "1"),
+        unit=unit,
         is_logarithmic=is_logarithmic,
     )
 
@@ -185,6 +186,9 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) ->
 def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
     """The parameters of an ``unknown`` of the case ``base``, which begin at its values unless a start is given."""
     values = values_of(base, unknown.quantity)
+    unit = UNITS.get(unknown.quantity, "1")
+    if unknown.quantity == "amplitude":
+        unit = drive_unit(base.drive)
     parameters = []
     for number, members in enumerate(groups_of(unknown, len(values))):
         if isinstance(unknown.start, list):
@@ -194,7 +198,7 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
         else:
             # Members that have one value may differ in the case: their mean has the least squares from them.
             start = float(np.mean([values[member] for member in members]))
-        parameters.append(_parameter(unknown, members, start))
+        parameters.append(_parameter(unknown, members, start, unit))
     return parameters
 
 

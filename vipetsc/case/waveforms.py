@@ -56,16 +56,25 @@ class WaveformRecord(NamedTuple):
 
 
 def _build_burst(drive: "OneDrive") -> Waveform:
-    return ToneBurst(drive.amplitude, _given(drive.frequency), drive.cycles, drive.envelope)
+    return ToneBurst(
+        amplitude=drive.amplitude, frequency=_given(drive.frequency), cycles=drive.cycles, envelope=drive.envelope
+    )
 
 
 def _build_harmonic(drive: "OneDrive") -> Waveform:
-    return ramped(drive.amplitude, _given(drive.frequency), _given(drive.ramp), drive.duration or np.inf)
+    return ramped(
+        drive.amplitude, frequency=_given(drive.frequency), ramp=_given(drive.ramp), duration=drive.duration or np.inf
+    )
 
 
 def _build_chirp(drive: "OneDrive") -> Waveform:
-    duration = _given(drive.duration)
-    return ramped(drive.amplitude, _given(drive.frequency), _given(drive.ramp), duration, sweep=drive.bandwidth)
+    return ramped(
+        drive.amplitude,
+        frequency=_given(drive.frequency),
+        ramp=_given(drive.ramp),
+        duration=_given(drive.duration),
+        sweep=drive.bandwidth,
+    )
 
 
 def _build_impulse(drive: "OneDrive") -> Waveform:
@@ -73,15 +82,21 @@ def _build_impulse(drive: "OneDrive") -> Waveform:
 
 
 def _build_step(drive: "OneDrive") -> Waveform:
-    frequency = _given(drive.frequency)
-    return ramped(drive.amplitude, frequency, _given(drive.ramp), drive.duration or np.inf, sweep=None)
+    return ramped(
+        drive.amplitude,
+        frequency=_given(drive.frequency),
+        ramp=_given(drive.ramp),
+        duration=drive.duration or np.inf,
+        sweep=None,
+    )
 
 
 def _build_samples(drive: "OneDrive") -> Waveform:
     assert drive.samples
     # After the last sample a wall stays where it is, and a force is 0.
     hold = drive.end is not None
-    return spline(drive.amplitude, drive.samples.time, drive.samples.value, _given(drive.frequency), hold)
+    samples = drive.samples
+    return spline(drive.amplitude, samples.time, samples.value, frequency=_given(drive.frequency), hold=hold)
 
 
 def _given(value: float | None) -> float:

@@ -65,7 +65,7 @@ class CoefficientSlopes:
 
         below, above = self._neighbours(z, p)
         low, high = (self._trials.case(self._values_with(z, p, x)).model() for x in (below, above))
-        slopes = slopes_between(low, high, above - below, model, middle)
+        slopes = slopes_between(low, high, width=above - below, model=model, middle=middle)
         # Other initial motions are given in numbers: no parameter changes them.
         if model.initial is not None and model.initial.kind in FOLLOWING_CELL:
             return ParameterSlope(slopes, (state_of(high) - state_of(low)) / (above - below))
@@ -106,7 +106,8 @@ class CoefficientSlopes:
         if model.initial is not None and model.initial.kind in FOLLOWING_CELL:
             return None
 
-        slopes = slopes_between(lower, upper, float(high[p] - low[p]), model, MotionCoefficients.of(model))
+        width = float(high[p] - low[p])
+        slopes = slopes_between(lower, upper, width=width, model=model, middle=MotionCoefficients.of(model))
         # The force of a moved wall is proportional to the stiffness k of its spring. Derivatives of drives are relative
         # to their forces: that by k is 1/k, which is not constant.
         if slopes.drives.any():

@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from vipetsc.case import CaseError, Model
+from vipetsc.case.drive import first_built
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
@@ -268,12 +269,15 @@ class Misfit:
         return p < self.count and self.plan.parameters[p].quantity == quantity
 
     def _force(self, z: np.ndarray, number: int, end: float, drive: int) -> tuple[np.ndarray, np.ndarray]:
-        """The force (sample,) in N of the ``drive`` of that number (from 0), and its rate in N/s."""
-        model = self.model(z, number)
+        """The force (sample,) in N of the ``drive`` of that number (from 0) in the case, and its rate in N/s."""
+        case = self._trials[number].case(self.values(z))
+        model = case.model()
+        # The model has a drive for each spring to a moved wall, and so may have more of them than the case.
+        place = first_built(case.drive, model.chain)[drive]
         drives = create_drives(model.drives, range(len(model.drives)))
         times = self.times(z, number, end)
-        short = SHORT / model.drives[drive].waveform.highest
-        before, force, after = (drive_forces(drives, times + shift)[drive] for shift in (-short, 0.0, short))
+        short = SHORT / model.drives[place].waveform.highest
+        before, force, after = (drive_forces(drives, times + shift)[place] for shift in (-short, 0.0, short))
         # Before its beginning there is no drive.
         started = times > 0
         return force * started, (after - before) / (2 * short) * started

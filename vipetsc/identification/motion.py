@@ -230,10 +230,14 @@ def respond(
         slopes=slopes,
     )
 
-    columns = 1 + len(slopes.linear)
-    rows = 2 * len(coefficients.masses)
     tracker = ImpactTracker(sites, range(len(sites)))
-    moving = create_motion(rows, columns, len(sites), model.scale, tolerances)
+    moving = create_motion(
+        rows=2 * len(coefficients.masses),
+        columns=1 + len(slopes.linear),
+        sites=len(sites),
+        scale=model.scale,
+        tolerances=tolerances,
+    )
     instant = 0.0
     if begin is not None:
         instant = begin.time
@@ -243,6 +247,7 @@ def respond(
     # Times of every n-th sample are not contiguous, and for arrays of another layout the kernels would be compiled
     # once more.
     instants = np.ascontiguousarray(times)
+    # The highest frequency, the first instant, then those of the samples.
     outcome, tracks, motion, reached = integrate(
         lattice, moving, tracker.tracks, fastest(coefficients), instant, instants, watched
     )

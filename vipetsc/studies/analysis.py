@@ -339,7 +339,7 @@ def _entropies(
     # The result from every second snapshot and cell estimates the error of the result from all.
     local = entropy.local[start:][::2, ::2]
     weight = entropy.weight[start:]
-    coarse = spectra.averages(local, weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())
+    coarse = spectra.averages(local, weight[::2, ::2], start=0, stride=2 * options.cell_stride, largest=weight.max())
 
     values: dict[str, Any] = {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
     strides = options.model_dump(include={"snapshot_stride", "cell_stride"})

@@ -238,7 +238,9 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     except ValueError as error:
         return str(error)
     floor = float(untouched.mean())
-    aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
+    aligned = align(
+        work=curve["work"].values, ibtet=curve["ibtet"].values, initiation=initiation.energy, floor=floor, branch=slope
+    )
     if "exponent" not in aligned.attrs:
         count = int(aligned["fitted"].sum())
         remedy = "follow the branch to more energy (nnm.energy), or sweep more amplitudes"

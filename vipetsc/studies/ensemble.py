@@ -33,17 +33,18 @@ AMPLITUDE = "drive.amplitude"
 
 # Statistics of a member in the ensemble, in addition to the ``MEASURES`` of its analysis.
 STATISTICS = {name: REGISTRY[name].row for name in ("contact_episodes", "dissipated_fraction", "work", "ledger_error")}
+# Unit and text of what a fit consists of; {unit} stands for the unit of the amplitude.
 FIT = {
-    "peak_amplitude": ("N", "amplitude of the largest value"),
+    "peak_amplitude": ("{unit}", "amplitude of the largest value"),
     "peak": ("1", "largest value, not normalised"),
     "points": ("1", "number of points from the peak on"),
     "exponent": ("1", "exponent of the log-log fit"),
     "exponent_low": ("1", "lower end of its 95 % confidence interval"),
     "exponent_high": ("1", "upper end of its 95 % confidence interval"),
-    "factor": ("1", "factor of the log-log fit at 1 N"),
+    "factor": ("1", "factor of the log-log fit at 1 {unit}"),
     "r2_log_log": ("1", "adjusted R^2 of the log-log fit"),
     "exponent_nonlinear": ("1", "exponent of the nonlinear fit"),
-    "factor_nonlinear": ("1", "factor of the nonlinear fit at 1 N"),
+    "factor_nonlinear": ("1", "factor of the nonlinear fit at 1 {unit}"),
     "r2_nonlinear": ("1", "adjusted R^2 of the nonlinear fit"),
     "is_power_law": ("1", f"1 where the log-log fit is a power law: {FEWEST} points or more, adjusted R^2 not below 0"),
 }
@@ -314,6 +315,7 @@ def _fits(data: Variables, along: str) -> Variables:
     """
     fits: Variables = {}
     amplitude = data[along].values.astype(float)
+    unit = data[along].attrs["units"]
     for name in FITTED:
         if name not in data:
             continue
@@ -321,12 +323,13 @@ def _fits(data: Variables, along: str) -> Variables:
         rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
         for key, about in FIT.items():
             table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
-            fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, *about)
+            units, text = (part.format(unit=unit) for part in about)
+            fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, units, text)
     return fits
 
 
 def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict[str, float]:
-    """The entries of ``FIT`` for one ``curve`` (amplitude,) over amplitudes in N; NaN where there is no fit.
+    """The entries of ``FIT`` for one ``curve`` (amplitude,) over the ``amplitude`` (amplitude,); NaN without a fit.
 
     From the curve's peak on y = factor A^exponent, A the amplitude's size, by a straight line of log y over log A and
     by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first.

@@ -214,7 +214,7 @@ def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.
 def _recorded_runs(work: Identification, folder: Path, comm: MPI.Comm, ranks: int) -> RecordedRuns:
     """The records of fits by teams of so many ``ranks``."""
     failures = (*FAILURES, CaseError, MotionError)
-    return RecordedRuns("identified-runs", folder, comm, work.stop, ranks, failures).read()
+    return RecordedRuns("identified-runs", folder, comm, work.stop, ranks=ranks, failures=failures).read()
 
 
 def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm, progress: bool) -> list[Record]:

@@ -10,18 +10,11 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
 from vipetsc.identification.clearance_search import largest_towards, reached_by
 from vipetsc.identification.growing_windows import GrowingWindows
-from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.misfit_profile import ProfileCosts
-from vipetsc.identification.uncertainty import (
-    DETERMINED,
-    Uncertainty,
-    errors_with_sensor,
-    marginal_jacobian,
-    quantile,
-    uncertainty_of,
-)
+from vipetsc.identification.uncertainty import DETERMINED, Uncertainty, marginal_jacobian, quantile, uncertainty_of
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
+from vipetsc.studies.further_sensor import further_sensor_values
 from vipetsc.studies.identified_layout import LAYOUT
 
 # A misfit more than this many times the noise that is given is reported. Intervals are as wide as the noise makes them:
@@ -35,10 +28,6 @@ IMPROBABLE = 0.01
 EXACT = 1e-6
 # Fits whose coordinates differ by at most this, or by three standard errors if these are more, lie in one valley.
 SAME_VALLEY = 1e-3
-# Sensors are sought on so many masses at most, evenly over the lattice.
-MOST_CANDIDATES = 400
-# Numbers of their motion and its derivatives that are kept in memory, 160 MB.
-MOST_NUMBERS = 20_000_000
 
 
 def identified_values(
@@ -51,7 +40,7 @@ def identified_values(
     jacobian = windows.misfit.whole_jacobian(z, windows.last)
     uncertainty = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
     values = _parameter_values(windows, z, uncertainty)
-    values |= _sensor_values(windows, z, uncertainty_of(jacobian))
+    values |= further_sensor_values(windows, z, uncertainty_of(jacobian))
     values |= _window_values(windows, fits[best])
     values |= _start_values(windows, fits, best, uncertainty.errors)
     values |= _channel_values(windows, z)
@@ -100,43 +89,6 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncer
         "direction": np.arange(1, len(z) + 1),
         "singular": uncertainty.singular,
         "vector": uncertainty.directions,
-    }
-
-
-def _sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
-    """The mass at which one more sensor of the first record with contact would lower each error most.
-
-    The ``uncertainty`` is that of all coordinates: the sensor also measures an initial state that is estimated.
-    """
-    misfit = windows.misfit
-    plan = misfit.plan
-    tables = plan.options.records
-    record = next((number for number, table in enumerate(tables) if table.contact), 0)
-    # The new sensor measures what the first sensor of motion does, with the mean noise of all sensors of motion.
-    sensors = [number for number, sensor in enumerate(tables[record].sensors) if sensor.quantity != "force"]
-    quantity = "velocity"
-    noise = 1.0
-    if sensors:
-        quantity = tables[record].sensors[sensors[0]].quantity
-        noise = float(np.mean([misfit.noise[record][number] for number in sensors]))
-
-    dofs = plan.base.lattice.unit_cell().dofs
-    count = plan.base.lattice.cells * dofs
-    candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
-    inner, estimated = misfit.columns(record, range(misfit.size))
-    # Of long records of large lattices every n-th sample, which stands for n of them, is enough.
-    numbers = len(misfit.records[record].times) * len(candidates) * len(ROWS) * (1 + len(inner + estimated))
-    stride = -(-numbers // MOST_NUMBERS)
-    response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates, stride)
-    slopes = np.zeros((*response.motion.shape[:2], len(z)))
-    # Each sample stands for ``stride`` of them, whose information adds: sensitivities grow with its root.
-    slopes[:, :, inner + estimated] = np.sqrt(stride) * response.motion[:, :, ROWS[quantity], 1:]
-    errors = errors_with_sensor(uncertainty, slopes, noise)[:, : misfit.count]
-    chosen = errors.argmin(axis=0)
-    return {
-        "sensor/cell": candidates[chosen] // dofs + 1,
-        "sensor/mass": candidates[chosen] % dofs + 1,
-        "sensor/relative_error": errors.min(axis=0),
     }
 
 

@@ -59,7 +59,7 @@ class ObjectiveRuns:
 
     def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
         self.plan = plan
-        self.recorded = RecordedRuns("optimum-runs", folder, comm, stop, plan.options.ranks).read()
+        self.recorded = RecordedRuns("optimum-runs", folder, comm, stop, ranks=plan.options.ranks).read()
 
     def runs(self, design: Case) -> dict[Condition, Case]:
         """The runs of a ``design`` by amplitude and number of the disorder's sample, and its frequency responses.

@@ -115,7 +115,8 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     options = plan.options
     point = plan.space.to_unit(start)
     if len(options.objective) == 2:
-        return Nsga2(point, options.step, options.seed, options.population or POPULATION)
+        population = options.population or POPULATION
+        return Nsga2(point, step=options.step, seed=options.seed, population=population)
 
     variables = plan.variables()
     # Variables that are whole numbers have a least deviation, or the search would stay at one of them.
@@ -125,4 +126,4 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     for row in {variable.row for variable in variables if variable.row}:
         members = np.array([variable.row == row for variable in variables])
         directions[np.ix_(members, members)] = smooth(int(members.sum()))
-    return CmaEs(point, steps, directions, options.step, options.seed, options.population)
+    return CmaEs(point, steps, directions, step=options.step, seed=options.seed, population=options.population)

@@ -103,7 +103,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
 
     kinds = case.kinds
     responses = [
-        SiteResponse.of(rows, cell, model.drive.frequency, records.largest, kind.pair)
+        SiteResponse.of(rows, cell, drive=model.drive.frequency, largest=records.largest, pair=kind.pair)
         for rows, kind in zip(records.sites, kinds.kinds, strict=True)
     ]
     every_site = SiteResponses(of_kind=tuple(responses), kind=np.array(kinds.of))

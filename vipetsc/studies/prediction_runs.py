@@ -177,7 +177,9 @@ class PredictionRuns:
             w = motion.displacement[:, 0]
             is_damped = self.model.chain.is_damped
             self.linear_waves[kind] = LinearWave(
-                burst=Burst(self.model.chain.cell, self.model.drive.frequency, motion.time, w, ring.kind.pair),
+                burst=Burst(
+                    self.model.chain.cell, drive=self.model.drive.frequency, time=motion.time, w=w, pair=ring.kind.pair
+                ),
                 displacement=w,
                 peak=ring.peak_of(motion),
                 waves=SiteWaves(self.model, ring.setting, ring.kind.pair) if is_damped else None,

@@ -156,7 +156,7 @@ def measure_run(
             arrival = linear.arrival_at(first_site_cell(case))
         else:
             arrival = find_arrival()
-        analysis = analyse(run, measures, arrival, options, comm)
+        analysis = analyse(run, measures, arrival=arrival, options=options, comm=comm)
 
     def write() -> Path:
         path = folder / "analysis.h5"

@@ -205,7 +205,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     status, warnings = on_root(comm, put_together)
     # MPI has a limited number of communicators, and a process may run many sweeps.
     runs.recorded.team.Free()
-    return SweepResult(status, computed, seconds, busy, folder, warnings)
+    return SweepResult(status=status, computed=computed, seconds=seconds, busy=busy, folder=folder, warnings=warnings)
 
 
 def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
@@ -302,7 +302,7 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
         case = plan.member(number).case
         if case:
             drawn.append(DrawnMember(number, case, linear_name(case)))
-    return _Survey(results, missing, drawn, _needed_runs(plan, results, drawn), lost)
+    return _Survey(results=results, missing=missing, drawn=drawn, needed=_needed_runs(plan, results, drawn), lost=lost)
 
 
 def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:

@@ -48,7 +48,7 @@ class SweepRuns:
         self.ids = plan.ids()
         self.measures = measures_of(plan)
         # Any exception counts as a failure of the member, but for a full disk: a sweep goes on past failures.
-        self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, plan.options.ranks, failures=(Exception,))
+        self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, ranks=plan.options.ranks, failures=(Exception,))
         self.linear: dict[str, LinearRun | str] = {}
         self._histories = LinearHistories()
         # Members use one block of memory for their fields, one after the other: none is needed once it is measured.
@@ -69,7 +69,9 @@ class SweepRuns:
 
             def measure() -> LinearRun:
                 entropies = history.opening_entropies(samples=history.run.sizes["time"], factor=1.0)
-                linear = LinearRun.of(history.run, history.statistics, sites, self.measures, entropies)
+                linear = LinearRun.of(
+                    history.run, history.statistics, sites=sites, names=self.measures, entropies=entropies
+                )
                 self.recorded.file.append(linear.record(name))
                 return linear
 
