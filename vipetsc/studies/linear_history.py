@@ -33,9 +33,11 @@ from vipetsc.studies.linear_run import (
 from vipetsc.studies.opening_entropies import Computed, OpeningEntropies
 from vipetsc.studies.recorded_runs import completed
 
-FEWEST_MEMBERS = 3  # of a linear run whose history is worth its computation: it costs a run, and saves a part of each
-# Samples between those that members may begin after: a member computes half of them twice on average, under 1 % of
-# the built-in run, and a state takes as much memory as one sample.
+# Members, at least, that differ in amplitude and contacts alone, for a history of their linear run: it costs a run, and
+# saves a part of each member's.
+FEWEST_MEMBERS = 3
+# Samples from one state at which members may begin to the next. On average a member computes half as many samples
+# twice, under 1 % of the built-in run; a state takes as much memory as one sample.
 STATES_EVERY = 64
 MOST_BYTES = 2**28  # of the histories that are kept, a quarter of a GB: six of the built-in lattice's, 42 MB each
 # Keys of contacts and of the amplitude, in which members of one linear run differ; those drawn for contacts.

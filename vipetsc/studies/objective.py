@@ -53,8 +53,8 @@ class Judgement(NamedTuple):
 class ObjectiveRuns:
     """Computes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and judges designs by them.
 
-    The record of a run, or of the frequency responses of a design, by the hash of its case: its ``values``, or why it
-    failed (``reason``). All ranks must construct one.
+    A run, or the frequency responses of a design, has a record under the hash of its case: the measured ``values``, or
+    the ``reason`` why it failed. All ranks must construct one.
     """
 
     def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:

@@ -21,7 +21,8 @@ from vipetsc.studies.designs import OptimumSearch
 from vipetsc.studies.optimum_layout import LAYOUT
 from vipetsc.studies.sampler import front
 
-# Designs are compared at so many amplitudes, from the least over this to the largest times this: over 24 dB, by 2.4 dB.
+# Designs are compared at CURVE_POINTS amplitudes, log-spaced from the smallest one at which they are measured over
+# CURVE_SPREAD to the largest times CURVE_SPREAD: for a single amplitude over 24 dB, in steps of 2.4 dB.
 CURVE_POINTS = 11
 CURVE_SPREAD = 4.0
 # Shown for every design with any objective: a large transfer may come with a large loss.

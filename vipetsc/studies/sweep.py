@@ -262,7 +262,7 @@ class _Survey(NamedTuple):
             run = linear.get(member.linear)
             if isinstance(run, LinearRun):
                 # Beyond ten clearances a site costs little more: a member of five sites takes 0.38 s of CPU at one or
-                # two clearances, 0.56 at 6, 0.64 at 19 and 0.97 at 620. The end orders members without contacts.
+                # two clearances, 0.56 at 6, 0.64 at 19 and 0.97 at 620. The end time orders members without contacts.
                 contacts = float(np.minimum(run.reached(member.case), 10.0).sum())
                 numbers.append(member.number)
                 costs.append(contacts + 1e-3 * float(member.case.time.end))

@@ -77,15 +77,15 @@ class WaveLosses:
         self.rays = Rays(model, line.time)
         self.during = line.time <= model.end
 
-        # The masses of absorbing ends, which have dashpots that the reference cell has not, and a column of ones and
-        # zeros for each that takes its displacement out of all.
+        # The masses of absorbing ends, which have dashpots that the reference cell has not, and for each a column that
+        # selects its displacement.
         (masses,) = np.nonzero(self.rays.extra.ravel())
         self.dashpots = self.rays.extra.ravel()[masses]
         rows = np.zeros((self.rays.extra.size, len(masses)))
         rows[masses, np.arange(len(masses))] = 1.0
 
-        # Velocities (offset, mass, force) of these by unit forces at the sites and of the drives, at the frequencies of
-        # ``line``.
+        # Velocities (offset, mass, force) of these masses under unit forces at the sites and of the drives, at the
+        # frequencies of ``line``.
         omega = middle + line.offset - 1j * line.decay
         motions = compliance.motion(omega, rows) if len(masses) else np.zeros((len(omega), 0, 0))
         self.velocities = 1j * omega[:, None, None] * motions
