@@ -19,7 +19,7 @@ from vipetsc.case.named_files import relative_names, with_absolute_names
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.objective import Judgement, ObjectiveRuns
+from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
 from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
@@ -74,6 +74,17 @@ def test_designs_are_compared_at_amplitudes_of_any_sign(objectives, sign):
     assert len(curve) >= 10
     assert np.abs(amplitudes).min() == pytest.approx(1.25)
     assert np.abs(amplitudes).max() == pytest.approx(40.0 if sign > 0 else 20.0)
+
+
+@pytest.mark.parametrize(("ends", "beyond"), [("fixed", 9.0), ("periodic", np.nan)])
+def test_nothing_lies_beyond_the_last_site_of_a_ring(ends, beyond):
+    """The energy of masses that move beyond the last site is that of a lattice with ends; a ring has no such cells."""
+    model = OptimiseCase.from_table(TABLE | {"lattice": TABLE["lattice"] | {"ends": ends}}).base.model()
+    masses = np.asarray(model.chain.cell.masses)
+    velocity = np.zeros((40, 4))
+    # Two masses before the last site, which is in the 30th cell, and one behind it.
+    velocity[[3, 20, 35], 0] = np.sqrt(2 * np.array([1.0, 4.0, 9.0]) / masses[0])
+    assert _energy_beyond(model, np.zeros((40, 4)), velocity) == pytest.approx(beyond, nan_ok=True)
 
 
 def plan(*changes: str) -> OptimiseCase:

@@ -268,10 +268,10 @@ def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray)
     """Energy in J of the cells beyond the site that is farthest from the drive.
 
     Springs between these cells count in full; the spring k at the boundary counts as k u_b (u_b - u_a)/2, u_b beyond
-    it. NaN without a site.
+    it. NaN without a site, and on a ring, where both sides of a site are on the way to it.
     """
     chain = model.chain
-    if not chain.sites:
+    if not chain.sites or chain.ends == "periodic":
         return np.nan
     sites = np.array(chain.sites)
     farthest = sites[np.argmax(np.abs(sites - model.drive_cell))]
