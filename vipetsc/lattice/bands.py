@@ -138,7 +138,7 @@ def _speed(cell: UnitCell, band: int, kappa: float) -> float:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
     squared, vector = _eigenpair(cell, band, kappa)
     slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
-    return abs(slope) / (2 * float(np.sqrt(max(squared, np.finfo(float).tiny))))
+    return abs(slope) / (2 * float(np.sqrt(max(squared, float(np.finfo(float).tiny)))))
 
 
 def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:
