@@ -21,10 +21,11 @@ contact's force.
 given z, the fractions do not depend on the clearance. Hertz's does through its stiffness kc D^(1/2): the law is that of
 one clearance, by default the geometric mean of the sites'.
 
-**Refinement.** The first points are z = 1 and two an octave beyond. Then the point in the middle (in log z) of each two
-neighbours is computed. If T, R, U or the dissipated fraction there differs from the mean of both neighbours by more
-than the tolerance and the scatter, or if T falls from 1 between them, both halves are treated likewise, until they are
-finer than asked for. Mean and deviation at z are those of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
+**Refinement.** The first points are z = 1 and, up to the largest z, two in each octave. Then the point in the middle
+(in log z) of each two neighbours is computed. If T, R, U or the dissipated fraction there differs from the mean of both
+neighbours by more than the tolerance and the scatter, or if T falls from 1 between them, both halves are treated
+likewise, until they are finer than asked for. Mean and deviation at z are those of runs spread evenly over z (1 +-
+min(jitter, (z - 1)/10)).
 """
 
 import itertools
