@@ -3,12 +3,13 @@ r"""Nonlinear normal modes of conservative systems with contacts: their branches
 The system is M u'' + K u + f(u) = 0 with masses in contact pairs and smooth springs (``system``); a nonlinear normal
 mode is a family of periodic orbits that begins at a linear mode (Kerschen et al. 2009; Rosenberg's in the odd case).
 
-**Subpackages.** ``problem`` is the interface between continuation and a method; ``system`` is the system, ``point`` an
-orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns. ``shooting`` finds periodic orbits by
-integrating them, ``lattice`` finds orbits of whole lattices on all ranks, ``balance`` finds them by their harmonics;
-``continuation`` follows branches of any of them, ``branches`` follows and stores the branches of a case. ``response``
-has steady responses to a drive, which are not modes but obey the same equations and use the same continuation. The
-docstring of each subpackage derives its method.
+**Modules.** ``problem`` is the interface between continuation and a method; ``system`` is the system, ``point`` an
+orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns.
+
+**Subpackages**, whose docstrings derive the methods. ``shooting`` finds periodic orbits by integrating them,
+``lattice`` finds orbits of whole lattices on all ranks, ``balance`` finds them by their harmonics; ``continuation``
+follows branches of any of them, ``branches`` follows and stores the branches of a case. ``response`` has steady
+responses to a drive, which are not modes but are found by the same equations and the same continuation.
 
 A user-written loop (importing the package loads PETSc)::
 

@@ -97,6 +97,10 @@ AT_REST = 1e-6
 BALANCED = 1e-6
 # As the harmonics above the first are brought in: first step of their weight; how far the motion may change in one
 # step, over the largest harmonic of the first guess; factors of the step after success and failure; the smallest step.
+# Seven breathers of the built-in lattice, from 1450 to 5000 rad/s, take 275 Newton steps with these values. First steps
+# from 0.05 to 1, and factors from 1.2 to 2.5 and from 0.2 to 0.6, take 269 to 351 and lead to the same motions. So do
+# changes of 0.05 to 0.5, with 475 to 178: small ones are the safer, since a motion that changes much may be another
+# one.
 FIRST_WEIGHT = 0.1
 FURTHEST = 0.1
 LONGER = 1.6

@@ -17,12 +17,13 @@ def locate(
     """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
     Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``. ``chart`` is as
-    for ``Continuation``. With ``grazing`` every change of the number of contacts is located as well, which costs 40
-    corrections or so where it must be bracketed. With the point ``before`` the left one, two special points of a kind
-    are found within a step as well. What cannot be located is appended to ``missed`` in a sentence.
+    for ``Continuation``. With ``grazing`` every change of the number of contacts is located as well, which takes about
+    40 corrections where it must be bracketed. With the point ``before`` the left one, two special points of one kind
+    within the step are found as well. For each special point that cannot be located a sentence is appended to
+    ``missed``.
 
-    An energy fold always has a half-trace of 1, as branch points have, and is not reported as one too; it begins or
-    ends the tongue of a ``resonance``. A branch point in the same step as an energy fold is therefore not reported.
+    An energy fold has a half-trace of 1, as a branch point has. In a step with an energy fold no branch point is
+    therefore looked for: it would be the fold again.
     """
     points: list[S] = []
     segment = Segment(problem, chart, left, right)

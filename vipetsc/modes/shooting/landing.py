@@ -4,8 +4,8 @@ A contact changes when its gap rises through zero: sigma w - D while it is open,
 step's quintic Hermite interpolant of the gap is cut into its monotone pieces by ``contact.search``, so that no pair
 of changes is missed, however short. A largest value within the interpolant's error of zero is left to the flow.
 
-The roots are bisected in monomial form on the quarters of the step. Which of two neighbouring floats is taken for a
-root decides, through the number of Newton steps of a later orbit, on the points of a branch.
+The roots are bisected in monomial form on the quarters of the step. Another method might end on a neighbouring float:
+by the number of Newton steps of a later orbit even this would change the points of a branch.
 """
 
 from typing import NamedTuple
@@ -17,8 +17,9 @@ from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
 NONE, CROSSING, EXTREMUM = range(3)
-EXTREMUM_ATTEMPTS = 40  # attempts at one extremum
-MOST_ATTEMPTS = 120  # attempts of one landing in all
+# Largest number of attempts at one extremum, and of one landing in all. Bisection of a step to rounding takes about 54.
+EXTREMUM_ATTEMPTS = 40
+MOST_ATTEMPTS = 120
 # Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.
 Coefficients = tuple[float, float, float, float, float, float]
 # A slope at the start below this fraction of the curvature is the rounding of an extremum.
