@@ -18,8 +18,8 @@ from vipetsc.modes.continuation.bracketed_root import bracketed_root
 from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 
 # A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc. The
-# guess is a cubic between two knots, which misses an arc that turns by 0.2 rad, the default guard, by 2.5e-4 of its
-# length, and one that turns by 0.8 rad by 0.02.
+# guess is a cubic between two knots, which misses a circular arc that turns by 0.2 rad, the default guard, by 7e-5 of
+# its length, and one that turns by 0.8 rad by 0.01.
 FURTHEST = 0.5
 # Near the tips of narrow tongues rounding keeps Newton's method from reaching the tolerance. A residual of this many
 # times the tolerance is accepted for a special point.
