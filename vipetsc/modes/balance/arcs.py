@@ -103,10 +103,11 @@ def minima(slope: np.ndarray) -> np.ndarray:
     ``slope`` (sample,) is its derivative at equal phases of one period. A minimum is where the straight line between
     two samples passes zero upwards.
     """
-    after = np.roll(slope, -1)
-    before_minimum = np.nonzero((slope < 0) & (after >= 0))[0]
-    change = slope[before_minimum] - after[before_minimum]
-    return (before_minimum + slope[before_minimum] / change) * (2 * np.pi / len(slope))
+    after = np.append(slope[1:], slope[:1])
+    (before_minimum,) = np.nonzero((slope < 0) & (after >= 0))
+    falling = slope[before_minimum]
+    change = falling - after[before_minimum]
+    return (before_minimum + falling / change) * (2 * np.pi / len(slope))
 
 
 def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:

@@ -186,7 +186,7 @@ class HarmonicBalance:
         changes -= shift[:, 0] * columns.same
 
         # Of pair i and order k by the unknown u of pair j: G_s (dF - s dZ), and dZ of the pair itself.
-        matrix = np.moveaxis(shifted.compliance, 0, 1)[:, :, :, None] * np.moveaxis(changes, 0, 1)
+        matrix = shifted.compliance.swapaxes(0, 1)[:, :, :, None] * changes.swapaxes(0, 1)
         for pair in range(pairs):
             matrix[pair, :, pair] += columns.same
         matrix = matrix.reshape(pairs, count, -1)

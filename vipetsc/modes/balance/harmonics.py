@@ -253,13 +253,12 @@ class ForceSeries:
             rows = orders
         lag = rows[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
         slopes = np.hstack([self.slopes[:, :0:-1].conj(), self.slopes])
-        matrices = np.repeat(slopes[None, :, lag], len(exponents), axis=0)
         if not self.dissipates:
-            return matrices
+            return np.repeat(slopes[None, :, lag], len(exponents), axis=0)
 
         rate = 1j * orders + exponents[:, None]
         rates = np.hstack([self._rates[:, :0:-1].conj(), self._rates])
-        matrices += rates[:, lag] * rate[:, None, None, :]
+        matrices = rates[:, lag] * rate[:, None, None, :] + slopes[:, lag]
 
         # The change of z'_minus by d_k, (i k + mu - z''/z') exp((i k + mu) phase), times the force for a change of 1.
         for pair, phase, bend, theta, weights in self._onsets:

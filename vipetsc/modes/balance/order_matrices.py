@@ -6,7 +6,7 @@ pair) has a row and a column for every pair at every order, pairs of one order s
 
 import numpy as np
 
-# Pairs up to which products are formed without BLAS, which pays for many pairs alone.
+# Pairs up to which determinants are those of all of them, though no force may act on some (``hill``).
 FEW_PAIRS = 3
 
 
@@ -20,6 +20,8 @@ def of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 def flat(jacobian: np.ndarray) -> np.ndarray:
     """J (..., pair, order, order) as a matrix (..., order pair, order pair)."""
     *several, pairs, rows, columns = jacobian.shape
+    if pairs == 1:
+        return jacobian[..., 0, :, :]
     out = np.zeros((*several, rows, pairs, columns, pairs), jacobian.dtype)
     for i in range(pairs):
         out[..., i, :, i] = jacobian[..., i, :, :]
@@ -38,8 +40,9 @@ def product_of(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, columns)."""
     count, pairs = g.shape[-3:-1]
     rows = matrix.reshape(*matrix.shape[:-2], count, pairs, -1)
-    if pairs <= FEW_PAIRS:
-        product = np.einsum("...kij,...kjn->...kin", g, rows)
+    # Of one pair each order has one number, for which a product of matrices would take twice as long.
+    if pairs == 1:
+        product = g * rows
     else:
         product = np.matmul(g, rows)
     return product.reshape(*product.shape[:-3], count * pairs, -1)

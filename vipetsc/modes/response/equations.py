@@ -24,6 +24,7 @@ import numpy as np
 
 from vipetsc.lattice import IncidentWave
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
 from vipetsc.modes.response.state import Response
@@ -146,6 +147,8 @@ class SteadyEquations(ABC):
         self.parameter = parameter
         self.tolerance = tolerance
         self.max_newton = max_newton
+        # Along a curve over the amplitude the drive's term is the same for all states of a step.
+        self._drive_terms = LatestValues[tuple[float, bytes], np.ndarray](1)
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:
@@ -188,7 +191,8 @@ class SteadyEquations(ABC):
         jacobian = self.balance.jacobian(x, omega, shift)
         if self.parameter.over == "amplitude":
             # The residual is linear in the amplitude: the drive's term for the amplitude 1.
-            column = self._drive_term(omega, 1.0, shift)
+            key = omega, shift.tobytes()
+            column = self._drive_terms.get(key, lambda: self._drive_term(omega, 1.0, shift))
         else:
             ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
             after, before = (self._drive_term(end, amplitude, shift) for end in ends)
