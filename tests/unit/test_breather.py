@@ -213,17 +213,25 @@ def followed(case: NnmCase, folder: Path, resume: bool = False, stop: StopReques
     return branches
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> tuple[Branch, Path]:
+    """The branch of ``chain_case``, followed at once, and its file."""
+    folder = tmp_path_factory.mktemp("whole")
+    (branch,) = followed(chain_case(), folder)
+    return branch, folder / "branch-breather-4000.h5"
+
+
 @pytest.mark.slow
-def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(tmp_path):
+def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(whole, tmp_path):
     """A branch of two points that is resumed has the bits of the whole branch, in memory and in its file."""
-    (whole,) = followed(chain_case(), tmp_path / "whole")
     (part,) = followed(chain_case(points=2), tmp_path / "part")
     assert "resume" in part.ending
 
     (resumed,) = followed(chain_case(), tmp_path / "part", resume=True)
 
-    stored = read_branch(tmp_path / "whole" / "branch-breather-4000.h5")
-    for point, other, read in zip(whole.points, resumed.points, stored.points, strict=True):
+    branch, file = whole
+    stored = read_branch(file)
+    for point, other, read in zip(branch.points, resumed.points, stored.points, strict=True):
         assert np.array_equal(point.x, other.x)
         assert np.array_equal(point.x, read.x)
         assert np.array_equal(point.tangent, read.tangent)
@@ -231,11 +239,10 @@ def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
+def test_a_branch_is_stored_with_states_and_a_table_and_drawn(whole):
     """The stored state has the energy of its point, u^T K u/2 plus the contact's; the branch has a table and figure."""
     case = chain_case()
-    (branch,) = followed(case, tmp_path)
-    file = tmp_path / "branch-breather-4000.h5"
+    branch, file = whole
 
     # The state at rest has the energy of the point: all of it is in springs and the contact.
     state = State.read(file, orbit=1)
@@ -254,7 +261,7 @@ def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
+def test_a_stopped_branch_is_resumed_to_the_same_energies(whole, tmp_path):
     """A branch stopped after its first point and resumed has the energies of a branch that was not stopped."""
     stop = StopRequest()
     # The stop is requested before the branch begins: the first point is kept, and no other one follows.
@@ -263,8 +270,8 @@ def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
     assert begun.ending.startswith("stopped on request after point 1")
 
     (resumed,) = followed(chain_case(), tmp_path / "stopped", resume=True)
-    (whole,) = followed(chain_case(), tmp_path / "whole")
-    assert [point.energy for point in resumed.points] == [point.energy for point in whole.points]
+    branch, _ = whole
+    assert [point.energy for point in resumed.points] == [point.energy for point in branch.points]
 
 
 @pytest.mark.slow

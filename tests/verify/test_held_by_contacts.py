@@ -35,7 +35,7 @@ def held(contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None 
         "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0, "cell": 2},
         "time": {"end": 10.0, "sample_interval": 0.1},
         "output": {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}], "forces": True},
-        "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 3.0], "fixed": [0.2], "harmonics": 41},
+        "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 3.0], "fixed": [0.2], "harmonics": 23},
     }
     table["lattice"] |= {"cell": {"masses": [1.0], "springs": [spring], "contact": [1, 1]}} | (lattice or {})
     table["contacts"] |= {"side": "minus", "clearance": 0.0, "precompression": DEPTH} | (contacts or {})

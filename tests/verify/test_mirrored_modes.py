@@ -64,9 +64,9 @@ CHAIN: dict[str, Any] = {
     "nnm": {
         "system": "chain",
         "modes": [1],
-        "start_energy": 1e-4,
+        "start_energy": 1.3e-4,
         "energy": [0.0, 1.6e-4],
-        "points": 60,
+        "points": 18,
         "tolerance": 1e-12,
     },
 }
@@ -136,7 +136,7 @@ def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map
 
 def test_so_do_those_of_condensed_motions():
     """Contacts of a mirrored lattice begin in pairs in condensed motions too, with the exact period."""
-    found = branches(own_case(["plus", "plus"], method="condensed", truncation=1e-5, first_step=0.05, largest_step=0.2))
+    found = branches(own_case(["plus", "plus"], method="condensed", truncation=1e-4, first_step=0.05, largest_step=0.2))
     for branch in found.values():
         assert "energy range" in branch.ending, branch.ending
         assert branch.regular()[-1].episodes == 2

@@ -24,7 +24,7 @@ CELL = TWO_MASSES["lattice"]["cell"] | {"springs": [{"start": 1, "end": 1, "stif
 ONE_MASS: dict[str, Any] = TWO_MASSES | {
     "lattice": TWO_MASSES["lattice"] | {"cells": 1, "cell": CELL},
     "contacts": TWO_MASSES["contacts"] | {"clearance": 0.4},
-    "nfrc": TWO_MASSES["nfrc"] | {"range": [0.9, 2.3], "harmonics": 61},
+    "nfrc": TWO_MASSES["nfrc"] | {"range": [0.9, 2.3], "harmonics": 31},
 }
 
 

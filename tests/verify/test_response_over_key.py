@@ -25,6 +25,9 @@ from vipetsc.modes.response.steps import first_state
 pytestmark = pytest.mark.parallel(1)
 
 FREQUENCY = 1.5  # rad/s
+# With this clearance the motion of the wall below closes the contact at 1.5 rad/s.
+CLOSER = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
+STEPS = {"first_step": 0.2, "largest_step": 1.0, "harmonics": 11}
 
 
 def over(key: str, low: float, high: float, table: dict[str, Any] = TWO_MASSES, **nfrc: Any) -> NfrcCase:
@@ -43,9 +46,18 @@ def equations(case: NfrcCase):
 def clearances(tmp_path_factory):
     """The case, the folder and the curve over the clearance, on which two folds and a period doubling lie."""
     folder = tmp_path_factory.mktemp("clearances")
-    case = over("contacts.clearance", 0.1, 1.0, harmonics=31, largest_step=1.0)
+    case = over("contacts.clearance", 0.125, 0.35, harmonics=31, largest_step=1.0)
     (curve,) = follow_all(case, folder, MPI.COMM_SELF)
     return case, folder, curve
+
+
+@pytest.fixture(scope="module")
+def by_frequency(tmp_path_factory):
+    """The curve over the frequency, up to 1.5 rad/s, of two masses with a clearance of 0.12 m."""
+    options = STEPS | {"source": "force", "over": "frequency", "range": [1.47, FREQUENCY], "fixed": [0.2]}
+    folder = tmp_path_factory.mktemp("by-frequency")
+    (curve,) = follow_all(NfrcCase.from_table(CLOSER | {"nfrc": options}), folder, MPI.COMM_SELF)
+    return curve
 
 
 @pytest.mark.slow
@@ -53,17 +65,16 @@ def clearances(tmp_path_factory):
     ("key", "low", "high"),
     [("contacts.clearance", 0.1, 0.12), ("lattice.cell.masses[1]", 0.98, 1.0), ("lattice.damping.mass", 0.05, 0.06)],
 )
-def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, tmp_path):
+def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, by_frequency, tmp_path):
     """A curve over a key and one over the frequency end in the same state, at the key's upper value and 1.5 rad/s."""
-    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
-    steps = {"first_step": 0.2, "largest_step": 1.0, "harmonics": 11}
-    (by_key,) = follow_all(over(key, low, high, table, **steps), tmp_path, MPI.COMM_SELF)
+    (by_key,) = follow_all(over(key, low, high, CLOSER, **STEPS), tmp_path, MPI.COMM_SELF)
     assert by_key.ending.startswith("reached the end")
 
-    changed = NfrcCase.from_table(table).model_dump(by_alias=True, exclude_none=True)
+    # The upper value of each key is that of the lattice of the curve over the frequency.
+    case = NfrcCase.from_table(CLOSER)
+    changed = case.model_dump(by_alias=True, exclude_none=True)
     assert not put(changed, key, high)
-    options = steps | {"source": "force", "over": "frequency", "range": [1.47, FREQUENCY], "fixed": [0.2]}
-    (by_frequency,) = follow_all(NfrcCase.from_table(changed | {"nfrc": options}), tmp_path, MPI.COMM_SELF)
+    assert NfrcCase.from_table(changed).model().chain == case.model().chain
     ends = [curve.points[-1].measured for curve in (by_key, by_frequency)]
     assert ends[0].episodes > 0
     # The frequencies are equal to the bit, since a curve ends exactly on its range.
@@ -79,8 +90,7 @@ def test_newtons_method_converges_quadratically():
     From a guess that is off by 1e-2 it needs three steps.
     """
     for key, low, high in (("contacts.clearance", 0.1, 0.2), ("lattice.cell.masses[1]", 0.9, 1.0)):
-        table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
-        states = equations(over(key, low, high, table))
+        states = equations(over(key, low, high, CLOSER))
         start = first_state(states)
         frame = states.frame(start)
         attempt = frame.correct(start.xi + 0.05 * start.tangent + 1e-2 * np.sin(np.arange(len(start.xi))), 0.05)
@@ -124,8 +134,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
 @pytest.mark.slow
 @pytest.mark.parametrize(("key", "low", "high"), [("contacts.restitution", 0.9, 1.0), ("contacts.clearance", 0.1, 0.2)])
 def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp_path):
-    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
-    case = over(key, low, high, table, first_step=0.2, largest_step=1.0)
+    case = over(key, low, high, CLOSER, first_step=0.2, largest_step=1.0)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert curve.ending == f"reached the end of nfrc.range, {high:g}"
     assert parameter_values(curve)[[0, -1]].tolist() == [low, high]
@@ -133,9 +142,9 @@ def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp
     # At a restitution of 1 the state is that of the elastic contact.
     if key == "contacts.restitution":
         alone = NfrcCase.from_table(
-            table
+            CLOSER
             | {
-                "drive": table["drive"] | {"frequency": FREQUENCY},
+                "drive": CLOSER["drive"] | {"frequency": FREQUENCY},
                 "nfrc": {"source": "force", "range": [0.2, 0.3], "fixed": [FREQUENCY], "harmonics": 11},
             }
         )
@@ -151,19 +160,18 @@ def test_files_have_the_values_of_the_key_with_its_unit(clearances, tmp_path):
         assert data["parameter"].attrs["units"] == "m"
         np.testing.assert_array_equal(data["parameter"].values, parameter_values(curve))
     header, first, *_ = (folder / f"branch-{curve.name}.csv").read_text().splitlines()
-    assert float(first.split(",")[header.split(",").index("parameter")]) == 0.1
+    assert float(first.split(",")[header.split(",").index("parameter")]) == 0.125
     assert [path.stem for path in draw("branches", [folder])] == [f"branch-{curve.name}"]
 
 
 @pytest.mark.slow
 def test_a_curve_goes_on_to_the_same_bits(tmp_path):
-    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     whole.mkdir()
     parts.mkdir()
-    (at_once,) = follow_all(over("contacts.stiffness", 10.0, 20.0, table, points=7), whole, MPI.COMM_SELF)
-    follow_all(over("contacts.stiffness", 10.0, 20.0, table, points=4), parts, MPI.COMM_SELF)
-    more = over("contacts.stiffness", 10.0, 20.0, table, points=7)
+    (at_once,) = follow_all(over("contacts.stiffness", 10.0, 20.0, CLOSER, points=7), whole, MPI.COMM_SELF)
+    follow_all(over("contacts.stiffness", 10.0, 20.0, CLOSER, points=4), parts, MPI.COMM_SELF)
+    more = over("contacts.stiffness", 10.0, 20.0, CLOSER, points=7)
     assert NfrcCase.from_toml(more.to_toml()) == more
     (resumed,) = follow_all(more, parts, MPI.COMM_SELF, resume=True)
     assert [point.xi.tolist() for point in resumed.points] == [point.xi.tolist() for point in at_once.points]

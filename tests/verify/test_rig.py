@@ -43,7 +43,7 @@ TEN_CELLS: dict[str, Any] = {
     "contacts": {"law": "bilinear", "stiffness": 8.0, "restitution": 1.0, "sites": [2, 4, 5], "clearance": 0.5},
     "drive": {"waveform": "harmonic", "amplitude": 0.3, "frequency": 0.9, "cell": 1, "mass": 1},
     "time": {"end": 10.0},
-    "nfrc": {"source": "force", "over": "frequency", "range": [0.5, 1.0], "fixed": [0.35], "harmonics": 31},
+    "nfrc": {"source": "force", "over": "frequency", "range": [0.5, 1.0], "fixed": [0.35], "harmonics": 21},
 }
 TEN_CELLS["nfrc"] |= {"points": 16, "largest_step": 0.3}
 TEN_CELLS["contacts"]["each"] = {

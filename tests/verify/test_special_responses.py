@@ -143,7 +143,7 @@ def test_a_place_without_a_unique_tangent_is_passed(place, tmp_path, monkeypatch
         return tangent_at(self, xi)
 
     monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
-    (curve,) = follow_all(case_of(FLIP), tmp_path, MPI.COMM_SELF)
+    (curve,) = follow_all(case_of(FLIP, harmonics=15), tmp_path, MPI.COMM_SELF)
     assert asked > 3
     assert curve.complete
 
