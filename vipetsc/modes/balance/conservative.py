@@ -24,9 +24,9 @@ one shift through a step of the continuation. It is
 
     s_k = +-(k Om)^2 m    (Om^2 m for k = 0),    1/m = (K Om)^2 |trace G(K Om)|/pairs,
 
-where m is the effective mass of a pair, since at high frequencies inertia alone counts, G = -1/(m omega^2). Of the two
-signs s_k has the one with the larger smallest singular value of 1 + s_k G(k Om): with it k Om is farther from the poles
-of G_s (``vipetsc.modes.balance.shifted_compliance``).
+where m is the effective mass of a pair, since at high frequencies inertia alone counts, G = -1/(m omega^2). The sign of
+s_k is the one with which the smallest singular value of 1 + s_k G(k Om) is larger: with it k Om is farther from the
+poles of G_s (``vipetsc.modes.balance.shifted_compliance``).
 
 **Number of harmonics.** The *truncation* of a motion estimates the harmonics that it leaves out, relative to those that
 it has:
@@ -49,8 +49,9 @@ stages.
        b_p + G_pp(0) F_p0(a_p, b_p) = 0,    a_p + G_pp(Om) F_p1(a_p, b_p) = 0.
 
    The first equation gives b_p for every a_p, and a_p is a root above the amplitude at which the pair begins to feel
-   its force, of a contact the clearance. Of several roots any one may be found; of a contact that is pressed at rest it
-   is one in the lowest of the brackets that are tried (``vipetsc.modes.balance.describing_function``).
+   its force: for a contact the clearance. If there are several roots, any one of them may be found; for a contact that
+   is pressed at rest it is one in the lowest of the brackets that are tried
+   (``vipetsc.modes.balance.describing_function``).
 2. *All pairs together.* From there Newton's method solves the equations of the mean and the first harmonic, K = 1. A
    solution in which a pair moves with another sign than it is to have is not taken: the third stage then tries from
    the motions of the first.
@@ -330,7 +331,7 @@ class ConservativeMotions:
                 step = LONGER * step
                 continue
 
-            # Of the step that was tried: the weight 1 may have cut it.
+            # The step that failed is shorter than ``step`` if it was cut at the weight 1.
             step = SHORTER * min(step, 1.0 - weight)
             if step < SMALLEST_WEIGHT:
                 why = f"Newton's method ends ({attempt.reason}); change nnm.start_frequency or raise nnm.max_newton"

@@ -18,14 +18,14 @@ from scipy.optimize import brentq
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.problem import ContinuationError
 
-# Amplitudes are sought up to this size, in units of ``SiteForces.amplitude_scale`` (of a contact its clearance), and
-# means up to so many amplitudes.
+# Amplitudes are sought up to this multiple of ``SiteForces.amplitude_scale``, which is the clearance of a contact, and
+# means up to this multiple of the amplitude.
 LARGEST = 1e3
-# Mean over the amplitude below which it is rounding, and taken to be 0.
+# A mean below this fraction of the amplitude is rounding, and taken to be 0.
 LEAST_MEAN = 1e-14
 # The force of a contact that is pressed at rest softens as it opens and hardens beyond. Its balance may therefore have
-# the same sign at the smallest and at the largest size, and change it twice between: so many sizes are tried, from this
-# one (in the depth by which it is pressed) on.
+# the same sign at the smallest and at the largest amplitude, and change it twice in between. It is evaluated at
+# TRIED_OF_PRESSED amplitudes, spaced evenly in their logarithms, from this multiple of the depth to ``LARGEST``.
 LEAST_OF_PRESSED = 1e-2
 TRIED_OF_PRESSED = 41
 
@@ -80,7 +80,7 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
         while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
             furthest *= 2
         if static_balance(furthest) * without >= 0:
-            # There is none so far: 0 is a guess, and the balance of all harmonics decides.
+            # No mean within the bound balances the force. 0 is then a guess: the balance of all harmonics decides.
             return 0.0
         return float(brentq(static_balance, furthest, 0.0))
 

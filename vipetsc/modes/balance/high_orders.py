@@ -35,7 +35,7 @@ KEPT = 48
 ABOVE = 1.25
 # The number of orders is a multiple of this one, so that neighbouring states of a curve have compliances in common.
 KEPT_TOGETHER = 16
-# A frequency so many times above the linear ones shows the masses, with an error of 1e-4.
+# At this multiple of the highest linear frequency the compliance is that of the masses alone, with an error of 1e-4.
 FAR = 100.0
 
 

@@ -23,14 +23,14 @@ from vipetsc.modes.latest import LatestValues
 # Radii, over the frequency, of circles on which Cauchy's formula gives the derivative of a real compliance. A smaller
 # one is taken where a pole is near a larger one.
 RADII = (1e-4, 1e-5, 1e-6, 1e-7)
-# Difference between G_s and its mean over a circle, over the largest of its values, that no near pole makes: it is the
-# error of the derivative by a pole ten radii away.
+# If G_s differs from its mean over a circle by more than this, over its largest value, a pole is near and a smaller
+# circle is taken. A pole at a distance of ten radii makes an error of this size in the derivative.
 MISFIT = 1e-8
 # The lower half of its eight nodes.
 NODES = np.exp(-1j * np.pi / 8 * np.array([1, 3, 5, 7]))
 # Relative step of a central difference, which is taken for a complex compliance: half a circle is not enough for it.
 STEP = 1e-6
-# The order 0 has no frequency of its own to scale a step by: this fraction of the highest.
+# The order 0 has no frequency of its own to scale a circle by: this fraction of the highest order's is taken.
 LEAST_RATE = 1e-3
 # Relative detuning of a frequency at which the compliance has a pole: a few units in the last place.
 DETUNING = 1e-15
@@ -96,8 +96,8 @@ class ShiftedCompliance:
         # At the highest order inertia alone counts: G = -1/(mass omega^2). This is the mass times omega^2, from the
         # mean of the pairs and without the weight.
         mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / self.weight / len(one))
-        # Of the two signs of the stiffness the one that keeps 1 + s G farther from singular, by its smallest singular
-        # value, has the poles of G_s farther away.
+        # The poles of G_s are farther away with the sign of the stiffness that keeps 1 + s G farther from singular, as
+        # measured by its smallest singular value.
         size = (mass * squared)[:, None, None]
         plus, minus = (np.linalg.svd(one + sign * size * g, compute_uv=False)[:, -1] for sign in (1, -1))
         return np.where((plus >= minus)[:, None, None], size, -size)

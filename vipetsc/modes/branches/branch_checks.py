@@ -37,8 +37,8 @@ SAME_DIRECTION = 0.999
 # The latest steps, which lie near the point anyway, are left out of that, and branches with few points are not checked.
 LATEST = 6
 FEWEST = 10
-# One of so many points is compared with another flow. The unknowns with which its Newton's method begins are off the
-# orbit by this: from the orbit itself it would not move if the residual of the flow were below the tolerance there.
+# One of COMPARED_EVERY points is compared with another flow. Its Newton's method begins with unknowns that are off the
+# orbit by OFF: from the orbit itself it would not move if the residual of that flow were below the tolerance there.
 COMPARED_EVERY = 4
 OFF = 1e-6
 

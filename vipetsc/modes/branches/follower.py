@@ -187,7 +187,7 @@ class Follower:
         """
         below = branch.failure_below
         if not branch.complete and not (below and below.complete_above):
-            # Of a method with both parts the direction is 1.
+            # If the branch has a part below its start as well, the direction is 1.
             self.growth.run(branch, problem, start, self.method.rule, self.method.direction)
             if below:
                 below = below._replace(ending_above=branch.ending, complete_above=branch.complete)

@@ -12,9 +12,9 @@ of phase; M. Peeters, G. Kerschen, J. C. Golinval, J. Sound Vib. 330 (2011) 486)
 
 Along an orbit that was shot with matrices the arc is integrated by Gauss's rule between its changes of contact. The
 rest of the period consists of images of the arc, some of them backwards in time, in which a contact begins with the
-velocity with which it ends in the arc. Of a whole lattice, shot without matrices, v^T C v is averaged over the state at
-uniform times of the arc. The mean of a smooth periodic function converges fast; with contacts it errs by 1e-9 to 1e-7
-(``FEWEST``). The integrals over contacts use the nodes of the substeps by which the orbit itself was integrated.
+velocity with which it ends in the arc. Along an orbit of a whole lattice, shot without matrices, v^T C v is averaged
+over uniform times of the arc. The mean of a smooth periodic function converges fast; with contacts it errs by 1e-9 to
+1e-7 (``FEWEST``). The integrals over contacts use the nodes of the substeps by which the orbit itself was integrated.
 """
 
 import itertools
@@ -41,7 +41,7 @@ from vipetsc.modes.system import elongation_rows
 # stiffer than all springs may be one piece: 12 nodes err by 1e-4 of its loss, 24 by 1e-12.
 NODES = 24
 LONGEST = 2.0
-# Times of a period at which the state of a whole lattice is looked at: this many at least, and no more than so many
+# Times of a period at which the state of a whole lattice is looked at: FEWEST at least, and no more than BETWEEN
 # radians of the fastest motion apart.
 FEWEST = 512
 BETWEEN = 0.5

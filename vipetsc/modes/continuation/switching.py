@@ -72,7 +72,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
     problem has the tolerance that the map's rounding at the special point allows, and as many Newton steps as ``old``.
     Raises ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
-    # Of the quarter's two symmetries a crossing branch may keep either; the quarter map sees a branch that keeps both.
+    # A crossing branch may keep either of the quarter map's two symmetries; the quarter map sees one that keeps both.
     names: tuple[str, ...] = (old.map.name,)
     if old.map.quarter:
         names = ("quarter", "half", "half-centre")
@@ -100,8 +100,8 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
     if rounding > NO_ORBIT:
         return None
 
-    # Of the right singular vectors the last one is the null vector that always exists. The one before belongs to the
-    # smallest singular value, and is the second null vector if that vanishes.
+    # The last right singular vector is the null vector that always exists. The one before belongs to the smallest
+    # singular value, and is the second null vector if that vanishes.
     values, directions = np.linalg.svd(frame.jacobian_of(problem.arc(x, period), frame.xi))[1:]
     singular.append(f"{name} {values[-1] / values[0]:.1e}")
     if values[-1] > SINGULAR * values[0]:

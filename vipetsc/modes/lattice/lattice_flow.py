@@ -116,9 +116,9 @@ class LatticeFlow:
         return max(int(np.ceil(self._omega * duration / largest)), 1)
 
     def watch(self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None]) -> None:
-        """Let ``look`` see the block (2 mass, owned cell) ``start`` of an arc and that after each of so many ``steps``.
+        """Call ``look`` with the block (2 mass, owned cell) ``start`` of an arc, and with the block after each step.
 
-        All ranks must call it. Raises FlowError on all ranks.
+        The arc of ``duration`` seconds has so many ``steps``. All ranks must call it. Raises FlowError on all ranks.
         """
         look(start)
         engine, _ = self._run(start, duration, steps, look)
@@ -127,7 +127,10 @@ class LatticeFlow:
     def _run(
         self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None] | None = None
     ) -> tuple[TangentPropagator, np.ndarray]:
-        """The engine that has run an orbit in so many ``steps``, on a tape unless they are looked at, and its end."""
+        """The engine that has run an orbit in so many ``steps``, and the block at its end.
+
+        The engine keeps the orbit on a tape, along which it can move variations, unless ``look`` is called.
+        """
         model = self._model(duration, steps)
         why = TangentPropagator.refusal(model)
         if why:

@@ -6,8 +6,8 @@ a Neimark-Sacker bifurcation, behind which the motion is quasi-periodic. On the 
 determinant D is real, and a zero passes the line where its sign there changes. What these zeros leave of a change of
 the number of growing perturbations is due to pairs.
 
-Two changes between two neighbouring states that cancel, as of two pairs of which one begins to grow and one to decay,
-are not seen.
+Two changes between neighbouring states that cancel are not seen, as where one pair begins to grow and another one to
+decay.
 """
 
 from collections.abc import Iterator
@@ -124,7 +124,7 @@ class StabilityChanges:
             return self._measured(point, fewer, exponents.get(point.xi.tobytes()))
 
         stable, growing = sorted((self.left, self.right), key=lambda point: states.stability(point.xi).unstable)
-        # Of the pairs that grow at one end the slowest is nearest to the line.
+        # The pair that grows most slowly at this end is nearest to the line.
         with suppress(ArithmeticError, IndexError):
             exponents[growing.xi.tobytes()] = states.growing_pairs(growing.xi)[0]
             if distance(stable) < 0:

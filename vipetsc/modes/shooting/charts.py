@@ -16,7 +16,7 @@ needs it.
 
 **Why grazing needs a chart.** An orbit that starts at rest on its largest sigma w, beyond D, is in contact for the time
 2 [2 (sigma w - D)/|w''|]^1/2. The impulse of a force that grows as (sigma w - D)^n then changes the orbit by the order
-(sigma w - D)^(n + 1/2). Of the bilinear contact, n = 1, the derivative by w has a square root, whose slope at D is
+(sigma w - D)^(n + 1/2). For the bilinear contact, n = 1, its derivative by w is a square root, whose slope at D is
 infinite: tangents turn without bound there. In y the change is of the order y^(2 n + 1), and smooth enough.
 """
 
@@ -204,7 +204,7 @@ def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
 
     Left out are contacts that close a ring, each from a host to a resonator that is the host of the next.
     """
-    # Of several contacts with one resonator the last has its place.
+    # If several contacts have one resonator, the elongation of the last one is the unknown in its place.
     host_of: dict[int, int | None] = {}
     for number, pair in enumerate(contacts):
         mass = pair.host

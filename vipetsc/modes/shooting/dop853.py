@@ -338,7 +338,7 @@ class Dop853Flow(Flow):
         return state, self._events[:count].copy(), closed
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
-        """The states as of ``Flow.states``, without variations."""
+        """The states that ``Flow.states`` describes, computed without variations."""
         states = np.empty((1 + count, 2 * self.system.dofs))
         states[0] = start
         self._alone.start[: states.shape[1], 0] = start

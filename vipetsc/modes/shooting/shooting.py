@@ -110,7 +110,7 @@ class Shooting(ShootingEquations[Arc]):
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
 
     def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[Arc]:
-        """The frame at an orbit, as of ``ShootingEquations``; the latest one is kept."""
+        """The frame at an orbit, as ``ShootingEquations.frame`` describes it; the latest one is kept."""
         # A step of a branch and the search for its special points begin at the same orbit.
         return self._frames.get((point, chart), lambda: super(Shooting, self).frame(point, chart))
 

@@ -57,7 +57,8 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
     else:
         product = c.T @ b
 
-    # Of two masses the trivial eigenvalue is 0 and the trace is the other one, more exactly than by a projection.
+    # With two masses one eigenvalue is the trivial one, 0, so that the trace is the other one: more exact than a
+    # projection.
     if n == 2:
         eigenvalues = np.array([np.trace(product)])
     else:
