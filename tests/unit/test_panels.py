@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 from vipetsc.figures.identified import DETERMINED, _draw_profile
 from vipetsc.figures.nfrc import lag_of
+from vipetsc.figures.spring_line import draw_spring
 from vipetsc.identification import uncertainty
 from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
@@ -244,3 +245,20 @@ def test_the_profile_of_a_parameter_whose_best_value_is_0_is_drawn(value, label)
 def test_the_line_of_undetermined_parameters_is_that_of_the_fit():
     """The dashed line of the picture is at the error above which the fit takes a parameter for not determined."""
     assert DETERMINED == uncertainty.DETERMINED
+
+
+@pytest.mark.parametrize("degrees", range(0, 360, 15))
+def test_the_text_of_a_spring_is_next_to_its_zigzag(degrees):
+    """The text lies on no part of a spring's line, in whatever direction the spring is drawn."""
+    figure = Figure(figsize=(4, 4), dpi=100)
+    axes = figure.subplots()
+    axes.set(xlim=(-2.5, 2.5), ylim=(-2.5, 2.5), aspect="equal")
+    angle = np.radians(degrees)
+    draw_spring(axes, [(0.0, 0.0), (1.4 * np.cos(angle), 1.4 * np.sin(angle))], "6 kN/m")
+    figure.draw_without_rendering()
+
+    (text,) = axes.texts
+    (line,) = axes.lines
+    corners = axes.transData.transform(line.get_xydata())
+    dense = np.concatenate([np.linspace(begin, end, 20) for begin, end in itertools.pairwise(corners)])
+    assert not any(text.get_window_extent().contains(*point) for point in dense)

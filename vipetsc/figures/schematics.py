@@ -16,6 +16,7 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.lattice_strip import draw_lattice, draw_wall
 from vipetsc.figures.panels import band_diagram, note
+from vipetsc.figures.spring_line import ROD, Point, draw_spring
 from vipetsc.figures.style import with_prefix
 from vipetsc.lattice import Spring, UnitCell
 from vipetsc.lattice.chain import Pair
@@ -32,9 +33,6 @@ SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
 LEGEND = "above: cell; below: clearance in mm; arrow: drive"
-ROD = {"color": style.BLACK, "lw": 0.7}  # the look of a spring's line
-
-Point = tuple[float, float]
 
 
 def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -90,8 +88,8 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
 
     draw_wall(axes, (-0.35, -0.8), 0.35, 1.9)
     axes.plot([0, 0], [-0.8, 1.1], color=style.BLACK, lw=1.0)
-    _draw_spring(axes, [(0, 0), (host - SIDE, 0)], rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
-    _draw_spring(axes, [(start, 0.26), (end, 0.26)], rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
+    draw_spring(axes, [(0, 0), (host - SIDE, 0)], rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
+    draw_spring(axes, [(start, 0.26), (end, 0.26)], rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
 
     # The contact as two stops that face each other over a gap.
     middle = (start + end) / 2
@@ -251,14 +249,14 @@ def _draw_springs(axes: Axes, cell: UnitCell, layout: CellLayout, nested_pair: s
             # One zigzag up to the right border, and the end of that of the cell before.
             leaving = layout.corners(start, SpringEnd(layout.right, start.y, 0), level)
             arriving = layout.corners(SpringEnd(layout.left, end.y, 0), end, level)
-            _draw_spring(axes, leaving, text)
-            _draw_spring(axes, arriving, "", turns=0)
+            draw_spring(axes, leaving, text)
+            draw_spring(axes, arriving, "", turns=0)
             for (x, y), direction in ((leaving[-1], 1), (arriving[0], -1)):
                 axes.plot([x, x + 0.4 * direction], [y, y], ls=(0, (1, 1.5)), zorder=2, **ROD)
             goes_round = len(leaving) > 2 or len(arriving) > 2
         else:
             corners = layout.corners(start, end, level)
-            _draw_spring(axes, corners, text)
+            draw_spring(axes, corners, text)
             goes_round = len(corners) > 2
         if goes_round:
             highest = max(highest, level)
@@ -349,7 +347,7 @@ def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell, has_sto
     # From behind to the front: the host as a frame, its stops, the spring, the resonator.
     box(-WIDE, -TALL, 2 * WIDE, 2 * TALL, style.SKY, zorder=3)
     box(0.1 - WIDE, 0.1 - TALL, 2 * WIDE - 0.2, 2 * TALL - 0.2, "white", zorder=3)
-    _draw_spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09, zorder=6)
+    draw_spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09, zorder=6)
     box(-reach, -reach, 2 * reach, 2 * reach, style.ORANGE, zorder=5)
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
 
@@ -365,35 +363,3 @@ def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell, has_sto
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
     caption = f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}"
     axes.text(x, y - TALL - 0.08, caption, ha="center", va="top", linespacing=1.3)
-
-
-def _draw_spring(
-    axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13, zorder: int = 2
-) -> None:
-    """Draw a spring along ``corners``: a zigzag with straight leads on the longest leg, and ``text`` next to it.
-
-    The zigzag has ``turns`` turns, ``height`` to either side.
-    """
-    legs = np.stack([corners[:-1], corners[1:]], axis=1)
-    lengths = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
-    longest = int(np.argmax(lengths))
-    for leg in np.delete(legs, longest, axis=0):
-        axes.plot(*leg.T, zorder=2, **ROD)
-
-    start = legs[longest, 0]
-    along = legs[longest, 1] - start
-    across = np.array([-along[1], along[0]]) / np.hypot(*along)
-    # Straight leads of a fifth of the leg at either end; between them two turning points for each turn, at equal
-    # distances, on either side of the leg alternately.
-    position = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
-    swing = np.zeros(len(position))
-    swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)
-    points = start + position[:, None] * along + swing[:, None] * across
-    axes.plot(*points.T, zorder=zorder, solid_joinstyle="round", **ROD)
-
-    middle = start + along / 2
-    is_upright = abs(along[1]) > abs(along[0])
-    if is_upright:
-        axes.text(middle[0] + 0.2, middle[1], text, ha="left", va="center")
-    else:
-        axes.text(middle[0], middle[1] + 0.2, text, ha="center", va="bottom")
