@@ -33,7 +33,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import style
 from vipetsc.identification.uncertainty import uncertainty_of
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.identification import Identification, read_records
+from vipetsc.studies.identification import Identification, read_measured_records
 
 EXAMPLE = Path(__file__).parents[1] / "vipetsc" / "examples" / "identify.toml"
 PICTURE = Path(__file__).parents[1] / "vipetsc" / "manual" / "pictures" / "identify-derivatives.png"
@@ -44,7 +44,7 @@ CLEARANCES = (1.32e-3, 1.20e-3, 1.08e-3, 0.96e-3, 0.90e-3)
 def work_of(table: dict[str, Any]) -> Identification:
     """The identification of the case ``table``, ready for its fits."""
     plan = IdentifyCase.from_table(table)
-    return Identification(plan, read_records(plan), StopRequest())
+    return Identification(plan, read_measured_records(plan), StopRequest())
 
 
 def computed_record(table: dict[str, Any], folder: Path, noise: float = 0.0, seed: int = 1) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.uncertainty import quantile, uncertainty_of
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.identification import Identification, read_records
+from vipetsc.studies.identification import Identification, read_measured_records
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
     # Each seed gives a record of the same lattice with other noise.
     for seed in range(seeds):
         plan = IdentifyCase.from_table(identify_table(table, measured_table(folder, table, noise=noise, seed=seed)))
-        work = Identification(plan, read_records(plan), StopRequest())
+        work = Identification(plan, read_measured_records(plan), StopRequest())
         windows, z = work.solution(work.fit(0))
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
         # Intervals are symmetric in the coordinates of the fit, which are logarithms of positive quantities.

@@ -138,7 +138,7 @@ def test_designs_keep_what_differs_from_site_to_site():
 # For a drive at the left end the cells after site 11 are beyond it; for one at the right end those before site 14 are.
 @pytest.mark.parametrize(("driven", "site", "beyond"), [(1, 11, slice(11, None)), (24, 14, slice(None, 13))])
 def test_what_is_beyond_the_last_site_is_what_came_through(driven, site, beyond):
-    """The transmitted share is the energy beyond the last site over the work, for a wave from either end."""
+    """The transmitted fraction is the energy beyond the last site over the work, for a wave from either end."""
     case = small_case(
         contacts={"sites": [site], "clearance": 1.0},
         drive={"cell": driven, "cycles": 2},
