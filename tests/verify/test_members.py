@@ -64,7 +64,7 @@ def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(s
 
 
 def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
-    """The work of members without contact is proportional to the square of the amplitude; their shares are equal."""
+    """The work of members without contact is proportional to the square of the amplitude; their fractions are equal."""
     _, ensemble, _ = sweep
     amplitude = ensemble["amplitude"].values[:2]
     work = ensemble["work"].values[:2]

@@ -35,8 +35,8 @@ def judged(case: Case, *objectives: ObjectiveTable):
     return measured(run, result.statistics, objectives), run
 
 
-def test_shares_of_the_work_sum_to_one():
-    """Shares of the work sum to one: in bands, lost as the ledger says, in contacts, and in modes in gaps."""
+def test_fractions_of_the_work_sum_to_one():
+    """Fractions of the work sum to one: in bands, lost as the ledger says, in contacts, and in modes in gaps."""
     case = small_case(time={"end": 0.08, "engine": "auto", "rtol": 1e-9})
     bands = pass_bands(case.lattice.unit_cell())
     assert len(gaps(bands)) == 3
