@@ -83,6 +83,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         item.add_marker(pytest.mark.skip(reason=f"another number of ranks: {command}"))
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Leave modules and tests, half a million objects that live to the end, out of every search for garbage."""
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def ranks_end_together():
     """End each test on all ranks together: MPI keeps a core busy for a rank that waits in a call of the next test."""
