@@ -31,6 +31,7 @@ UNKNOWNS = [
     {"quantity": "amplitude", "bounds": [1.0, 100.0]},
 ]
 POWER = {"law": "power", "exponent": 1.4, "stiffness": 2e6}
+SAMPLES = {"time": [0.0, 2e-3, 4e-3, 6e-3, 0.02], "value": [0.0, 3.0, -2.0, 1.0, 0.5]}
 # These unknowns start from the values of the case, which are the true ones. The default unknowns start far from them.
 FROM_THE_TRUTH = [
     {"quantity": "clearance", "of": "each", "bounds": [5e-5, 3e-3]},
@@ -157,6 +158,34 @@ def test_a_force_is_that_of_its_drive_behind_a_wall_of_two_springs(tmp_path):
     *of_springs, second = work.plan.base.model().drives
     assert len(of_springs) == 2
     assert values[:, 1] == pytest.approx(second.waveform.force(times), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [{"waveform": "samples", "samples": SAMPLES}, {"waveform": "step", "ramp": 5e-3, "amplitude": 2.0}],
+    ids=["samples", "step"],
+)
+def test_a_drive_of_polynomials_has_a_rate(tmp_path, drive):
+    """Derivatives by the offset of a force without a frequency, and of the acceleration it makes, are differences."""
+    table = lattice_table() | {"drive": {"frequency": 500.0} | drive}
+    # No sample is at the beginning of a piece, across which a difference would not be that of one polynomial.
+    times = 1e-4 + 2.5e-4 * np.arange(4, 18)
+    path = tmp_path / "pushed.csv"
+    np.savetxt(path, np.column_stack([times, np.sin(times)]), delimiter=",")
+    sensors = [{"quantity": "acceleration", "column": 2, "cell": 1}, {"quantity": "force", "column": 2}]
+    record = {"file": str(path), "time": 1, "offset": [-1e-4, 1e-4], "contact": False, "sensors": sensors}
+    unknowns = [{"quantity": "amplitude", "bounds": [0.1, 10.0]}]
+    work = fits_of(identify_table(table, record, unknowns=unknowns))
+    misfit = work.windows().misfit
+    z = work.starts()[0]
+    _, slopes = misfit.predicted(z, 0, 1.0, [1])
+
+    shift = np.array([0.0, 1e-4])
+    later, _ = misfit.predicted(z + shift, 0, 1.0)
+    earlier, _ = misfit.predicted(z - shift, 0, 1.0)
+    expected = (later - earlier) / (2 * shift[1])
+    error = np.abs(slopes[:, :, 0] - expected).max(axis=0)
+    assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
 
 
 @pytest.mark.slow

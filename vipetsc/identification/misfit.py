@@ -16,6 +16,7 @@ from vipetsc.identification.motion import (
     MotionCoefficients,
     MotionError,
     RecordedMotion,
+    fastest_of,
     no_slopes,
     respond,
     stacked_slopes,
@@ -276,7 +277,7 @@ class Misfit:
         place = first_built(case.drive, model.chain)[drive]
         drives = create_drives(model.drives, range(len(model.drives)))
         times = self.times(z, number, end)
-        short = SHORT / model.drives[place].waveform.highest
+        short = SHORT / fastest_of(model.drives[place].waveform)
         before, force, after = (drive_forces(drives, times + shift)[place] for shift in (-short, 0.0, short))
         # Before its beginning there is no drive.
         started = times > 0

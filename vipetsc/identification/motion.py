@@ -19,7 +19,7 @@ from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
 from vipetsc.identification.motion_rates import CurvedSprings, Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
 from vipetsc.identification.precision import EXACT, Tolerances
-from vipetsc.lattice import Chain, UnitCell, nonlinear_places
+from vipetsc.lattice import Chain, UnitCell, Waveform, nonlinear_places
 from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
 
@@ -209,6 +209,8 @@ def respond(
     drives = create_drives(model.drives, range(len(model.drives)))
     for row, drive in zip(drives.rows, model.drives, strict=True):
         row["target"] = drive.cell * chain.cell.dofs + drive.mass
+        # The rate of the force is a difference over a time in which no part of it turns.
+        row["highest"] = fastest_of(drive.waveform)
 
     ends = np.zeros((len(sites), 2), np.int64)
     for row, cell, pair in zip(ends, chain.sites, chain.contact_pairs, strict=True):
@@ -256,6 +258,11 @@ def respond(
     tracker.tracks = tracks
     episodes = tracker.take_episodes(np.zeros(len(sites)), unfinished=True)
     return RecordedMotion(motion, np.sort(episodes, order=("onset", "site")), reached)
+
+
+def fastest_of(waveform: Waveform) -> float:
+    """The frequency in rad/s of the fastest part of a ``waveform``; of polynomials, which have none, the main one."""
+    return waveform.highest or waveform.frequency
 
 
 def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
