@@ -219,6 +219,14 @@ def test_scattering_raises_every_average():
         assert getattr(after, name) > getattr(before, name) + 0.1
 
 
+@pytest.mark.parametrize(("strong", "counted"), [(31, False), (5, True)])
+def test_the_mask_heeds_samples_between_the_snapshots_after_the_start(strong, counted):
+    """A sample with a hundred times the motion masks all snapshots though it is none, if it is not before the start."""
+    signal = noise((40, 64))
+    signal[strong] *= 100.0
+    assert (entropy(signal, start=10, every=2).masked > 0.0) == counted
+
+
 def test_a_lattice_at_rest_has_no_entropy():
     found = entropy(np.zeros((3, 50)))
     assert not found.local.any()

@@ -83,22 +83,30 @@ def entropy(
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
     snapshots = velocity[::every]
-    if first is None:
-        local, weight = local_entropy(snapshots, stride)
-    else:
-        rest = local_entropy(snapshots[len(first.local) :], stride)
-        local = np.concatenate([first.local, rest.local])
-        weight = np.concatenate([first.weight, rest.weight])
-
+    if first is not None:
+        snapshots = snapshots[len(first.local) :]
     # The threshold of Eq. (d) should not depend on which samples are snapshots.
-    largest = 0.0
-    if every > 1:
-        energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
-        strongest = np.argsort(energy)[-STRONGEST:]
-        largest = local_entropy(velocity[start:][strongest], stride)[1].max()
+    others = velocity[_strongest_others(velocity, start, every)]
+
+    local, weight = local_entropy(np.concatenate([snapshots, others]), stride)
+    largest = weight[len(snapshots) :].max(initial=0.0)
+    local = local[: len(snapshots)]
+    weight = weight[: len(snapshots)]
+    if first is not None:
+        local = np.concatenate([first.local, local])
+        weight = np.concatenate([first.weight, weight])
 
     arrival = min(-(-start // every), len(local) - 1)
     return averages(local, weight, arrival, stride, largest)
+
+
+def _strongest_others(velocity: np.ndarray, start: int, every: int) -> np.ndarray:
+    """The numbers of the samples from ``start`` on in which the largest weight is sought and that are no snapshots."""
+    if every == 1:
+        return np.zeros(0, int)
+    energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
+    strongest = start + np.argsort(energy)[-STRONGEST:]
+    return strongest[strongest % every != 0]
 
 
 def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, largest: float = 0.0) -> Entropy:
@@ -202,7 +210,8 @@ class _FastOctave(NamedTuple):
         for group in self.groups:
             x = np.empty((len(signal), len(group.values), self.length), dtype=complex)
             _filter(spectrum, group.first, group.values, x)
-            yield fft.ifft(x, overwrite_x=True)
+            # Transforms "forward" are the ones that are divided by the length: here the filters are.
+            yield fft.ifft(x, norm="forward", overwrite_x=True)
 
 
 class _NarrowOctave(NamedTuple):
@@ -226,7 +235,7 @@ class _NarrowOctave(NamedTuple):
         waves = np.exp(-2j * np.pi * turns)
         return cls(
             waves=waves.view(float),
-            filters=filters[:, inside] * (stride / padded),
+            filters=filters[:, inside],
             waves_back=np.ascontiguousarray(waves[::stride].conj().T),
         )
 
@@ -253,7 +262,8 @@ def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
         nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
         length = fft.next_fast_len(-(-padded_length(cells, KC, nodes[0]) // stride))
         padded = length * stride
-        filters = transform_filters(nodes, KC, padded) / stride
+        # The inverse transforms are not divided by the length of the line.
+        filters = transform_filters(nodes, KC, padded) / padded
 
         # Additions and multiplications for one snapshot, by products (real times complex, then complex times complex)
         # and by transforms, 5/2 n log2 n of a real and 5 n log2 n of a complex signal of length n.
@@ -283,10 +293,12 @@ def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray)
     """
     length = x.shape[2]
     end = first + values.shape[1]
+    begin = first // length * length
     for t in range(x.shape[0]):
         for i in range(x.shape[1]):
-            x[t, i] = 0.0
-            for cut in range(first // length * length, end, length):
+            x[t, i, : first - begin] = 0.0
+            x[t, i, min(end - begin, length) :] = 0.0
+            for cut in range(begin, end, length):
                 low = max(first, cut)
                 high = min(end, cut + length)
                 unfiltered = spectrum[t, low:high]
@@ -296,7 +308,10 @@ def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray)
                     z = unfiltered[k]
                     value = factors[k]
                     # Part by part: a real factor would be multiplied as a complex one, which takes longer.
-                    filtered[k] += complex(z.real * value, z.imag * value)
+                    product = complex(z.real * value, z.imag * value)
+                    if cut > begin:
+                        product += filtered[k]
+                    filtered[k] = product
 
 
 @njit(error_model="numpy", fastmath={"contract"})
