@@ -12,7 +12,7 @@ A chunk holds the samples between two checkpoints. Each rank stores a part of it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Container, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -138,17 +138,21 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
 
 
-def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """The dataset of ``GIVEN`` and of all that rank 0 has of every sample, with the root ``attributes`` of the run.
+def small_variables(output: Chunks) -> dict[str, Any]:
+    """The variables of ``GIVEN`` and of all that rank 0 has of every sample, by name, as a dataset takes them.
 
     The fields' own times are left out where the fields are of every sample.
     """
-    import xarray as xr
-
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]
-    variables = tabulated(SAMPLED | DAMPING | MOTION | GIVEN, arrays)
+    return dict(tabulated(SAMPLED | DAMPING | MOTION | GIVEN, arrays))
+
+
+def run_dataset(output: Chunks, variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> xr.Dataset:
+    """The dataset of a run's ``variables``, with its case and the ``attributes`` as its own."""
+    import xarray as xr
+
     return xr.Dataset(variables, attrs={"case": output.case, **attributes})
 
 
@@ -159,8 +163,8 @@ class Description(NamedTuple):
     attributes: dict[str, str]
 
 
-def described(name: str, data: xr.Dataset) -> Description:
-    """The description of the variable ``name`` of ``LARGE`` in a file that holds the small dataset ``data``.
+def described(name: str, data: Container[Any]) -> Description:
+    """The description of the variable ``name`` of ``LARGE`` in a file that holds the small variables ``data``.
 
     Fields are over ``time`` if the file has no times of the fields alone.
     """

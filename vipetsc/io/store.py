@@ -58,10 +58,12 @@ class RunFolder:
 
     It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end. The caller
     sets ``recording``, which describes their contents, before the first one. A chunk has at most ``longest`` samples.
+    An output that ``keeps_in_place`` what is in a chunk makes no copies of it, for which chunks would have to be small.
     """
 
     recording: Recording
     saves_states = True
+    keeps_in_place = False
     longest = sys.maxsize
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
@@ -202,7 +204,8 @@ class RunFolder:
             sys.audit("vipetsc.assemble", str(target))
             if not writes:
                 return None
-            return chunks.small_dataset(self, attributes), chunks.read_log(self)
+            small = chunks.run_dataset(self, chunks.small_variables(self), attributes)
+            return small, chunks.read_log(self)
 
         def write() -> None:
             try:
@@ -312,6 +315,8 @@ class RunMemory:
         self.comm = comm
         self._memory = fields
         self.saves_states = states_every is not None
+        # One rank's fields are not copied.
+        self.keeps_in_place = comm.size == 1
         self.longest = states_every or sys.maxsize
         self.states: list[list[Arrays]] = []
         self.count = 0
@@ -375,7 +380,7 @@ class RunMemory:
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Create the dataset; all ranks must call it."""
         if self.comm.rank == 0:
-            small = chunks.small_dataset(self, attributes)
+            variables = chunks.small_variables(self)
             log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
             large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(log.rows)}
             recorded = self._fields[:, : self._rows].swapaxes(2, 3)
@@ -383,12 +388,11 @@ class RunMemory:
             if self.end is not None:
                 displacement, velocity = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
                 large |= {"end/displacement": displacement, "end/velocity": velocity}
-            variables = {}
             for name, values in large.items():
-                description = chunks.described(name, small)
+                description = chunks.described(name, variables)
                 variables[name] = (description.dims, values, description.attributes)
-            # Added in one call, since xarray compares the dimensions of all variables whenever some are added.
-            self.dataset = with_point_names(small.assign(variables))
+            # In one call, since xarray compares the dimensions of all variables whenever some are added.
+            self.dataset = with_point_names(chunks.run_dataset(self, variables, attributes))
         self._chunks = []
 
 

@@ -183,12 +183,13 @@ class SweepRuns:
             """Prepare the member's folder, and empty it unless it holds the beginning of a run of the same case."""
             marker = folder / "case.toml"
             text = case.to_toml()
-            if fields and not (marker.exists() and marker.read_bytes() == text.encode()):
+            if not (marker.exists() and marker.read_bytes() == text.encode()):
                 discard(folder)
                 folder.mkdir()
                 write_text(marker, text)
 
-        on_root(self.recorded.team, begin)
+        if fields:
+            on_root(self.recorded.team, begin)
         # Measures need all samples and cells, also those that the member does not keep.
         memory = RunMemory(self.recorded.team, fields=self._fields)
         output: RunMemory | RunFolder = memory

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.io.read import field_interval, field_time, first_site
+from vipetsc.io.read import field_interval, field_time
 from vipetsc.lattice import wave_bands
+from vipetsc.lattice.chain import cells_between
 
 
 class VelocityRecord:
@@ -40,8 +41,11 @@ class VelocityRecord:
         self.time = field_time(run)
         self.interval = field_interval(run)
         self.cells = run["cell"].values
-        first = first_site(run)
-        self.site = None if first is None else int(run["sites/cell"].values[first])
+        sites = run["sites/cell"].values
+        self.site = None
+        if sites.size:
+            distance = cells_between(sites, case.drive.cell, case.lattice.cells, case.lattice.ends)
+            self.site = int(sites[np.argmin(distance)])
 
         # Rounded up: a map has at most so many pixels on either side.
         self.sizes = (-(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels))
