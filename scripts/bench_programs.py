@@ -214,10 +214,12 @@ def programs_table(rows: list[dict]) -> str:
         f"| program | ranks | wall s at {commit} | now | ratio (range) | CPU s at {commit} | now | ratio (range) |",
         "|---" * 8 + "|",
     ]
+
     for row in rows:
         if "failure" in row:
             lines.append(f"| {row['program']} | {row['ranks']} | failed | | | | | |")
             continue
+
         cells = [row["program"], str(row["ranks"])]
         for kind in ("wall", "cpu"):
             low, high = row[f"{kind}_range"]

@@ -88,11 +88,13 @@ def bands_table(cell: UnitCell) -> dict[str, Any]:
     alone: dict[str, Any] = {}
     if cell.springs and not cell.joins_cells:
         alone["cell_modes"] = modes_of_a_cell(cell).tolist()
+
     rows = []
     for band in edges:
         kappa, frequency, speed = max_group_velocity(cell, band.number)
         fastest = {"wavenumber": kappa, "frequency": frequency, "group_velocity": speed}
         rows.append({"band": band.number, "low": band.low, "high": band.high, "max_group_velocity": fastest})
+
     return {
         "units": {"frequency": "rad/s", "group_velocity": "cells/s", "wavenumber": "rad/cell"},
         "bands": rows,

@@ -12,7 +12,7 @@ from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest
 
-# Seconds of compilation: to load all kernels from their cache takes less, to compile one of them more.
+# Time in s that tells loading from compiling: to load all kernels from their cache takes less, to compile one more.
 LOADING = 1.0
 
 
@@ -33,7 +33,9 @@ def compile_now(comm: MPI.Comm) -> None:
     from vipetsc.studies.first_calls import compile_kernels
 
     seconds = compile_kernels(comm)
-    outcome = f"compiled in {duration(seconds)}" if seconds > LOADING else "already compiled"
+    outcome = "already compiled"
+    if seconds > LOADING:
+        outcome = f"compiled in {duration(seconds)}"
     echo(comm, f"kernels of runs, modes and measures: {outcome}")
 
 

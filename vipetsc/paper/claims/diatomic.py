@@ -143,12 +143,12 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
 def _on_branches(run: AnalysedMember) -> float:
     """Fraction of the energy in the space-time spectrum of a ``run`` that lies near a Bloch branch.
 
-    Near are frequencies less than ``HALF_WIDTH`` times the top edge of the bands away.
+    A frequency is near a branch if it is at most ``HALF_WIDTH`` times the top edge of the bands away from it.
     """
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
     branches = bloch(cell, wavenumber).frequency
-    # From the nearest branch: a new wave may belong to any of them.
+    # The distance from the nearest branch counts: a new wave may belong to any of them.
     distance = np.abs(frequency[None, :, None] - branches[:, None, :]).min(axis=2)
     return energy[distance <= HALF_WIDTH * pass_bands(cell)[-1].high].sum() / energy.sum()
 

@@ -9,7 +9,8 @@ from vipetsc.spectra import FEWEST, doubt, normalised
 from vipetsc.wording import counted
 
 # Steps with sites that are spread, and with sites in neighbouring cells.
-SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
+SPREAD = "scattering"
+NEIGHBOURS = "scattering-neighbours"
 AVERAGES = ("energy_weighted", "masked", "joint")
 
 
@@ -74,11 +75,12 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     several = [c for c in spread if c.sites >= SEVERAL]
     # Where the peak lies at a higher amplitude, the value belongs to the rise, not to the decay.
     behind = [c.interpolate(HIGH) for c in several if c.peak_amplitude < HIGH]
-    highest = floor = None
+    highest = None
     if several:
         highest = np.nan
         if len(behind) == len(several):
             highest = np.max(behind)
+    floor = None
     if quiet.size:
         floor = quiet.max()
     result.value |= {
@@ -119,8 +121,10 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
     result.value[f"fraction of configurations of {sites} sites with {fit}"] = straight
     for c in configurations:
-        # None, as a missing number, for those that cannot be relied on.
-        r2 = exponent = half_width = None
+        # Numbers that cannot be relied on are missing.
+        r2 = None
+        exponent = None
+        half_width = None
         name = f"{counted(c.sites, 'site')}, {kind}"
         doubts = doubt(c.points, c.r2)
         if c.points >= FEWEST:
