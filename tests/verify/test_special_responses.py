@@ -22,6 +22,7 @@ from vipetsc.figures.registry import draw
 from vipetsc.modes.balance.hill import Hill, Stability
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.continuation.special import locate
 from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
@@ -115,13 +116,15 @@ def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, tmp_path, monkeypatch):
+def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, monkeypatch):
     """A pair that cannot be followed is located by the number of multipliers beyond 1, and has no sideband."""
-    _, points = with_pair
-    at = [point.measured.frequency for point in points if point.kind == "neimark-sacker"]
+    states, points = with_pair
+    places = [i for i, point in enumerate(points) if point.kind == "neimark-sacker"]
+    at = [points[place].measured.frequency for place in places]
     monkeypatch.setattr("vipetsc.modes.response.steady.SteadyStates.growing_pairs", lambda self, xi: [])
-    _, points = followed(case_of(PAIR), tmp_path / "counted")
-    counted = [point for point in points if point.kind == "neimark-sacker"]
+    # Only the steps in which the pair passes are searched again.
+    counted = [point for place in places for point in locate(states, points[place - 1], points[place + 1])]
+    assert [point.kind for point in counted] == ["neimark-sacker"] * 2
     np.testing.assert_allclose([point.measured.frequency for point in counted], at, rtol=1e-9)
     assert np.isnan([point.measured.sideband for point in counted]).all()
 
