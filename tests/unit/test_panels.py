@@ -1,6 +1,7 @@
 """Panels that several figures use show their data at their coordinates, with marks, bands, gaps and regions."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
-from vipetsc.figures.identified import DETERMINED, _draw_profile
+from vipetsc.figures.identified import DETERMINED, _draw_profile, growing_windows
 from vipetsc.figures.nfrc import lag_of
 from vipetsc.figures.spring_line import draw_spring
 from vipetsc.identification import uncertainty
@@ -240,6 +241,25 @@ def test_the_profile_of_a_parameter_whose_best_value_is_0_is_drawn(value, label)
     assert np.isfinite(drawn.get_xdata()).all()
     assert parabola.get_ydata()[[0, -1]] == pytest.approx([1.0, 1.0])
     assert parabola.get_xdata()[[0, -1]] == pytest.approx(drawn.get_xdata()[[0, -1]])
+
+
+def test_windows_of_an_identification_have_whole_numbers(monkeypatch):
+    """The axes of fourteen windows have ticks at whole numbers only."""
+    monkeypatch.setattr("vipetsc.figures.identified.IdentifyCase.of", lambda data: SimpleNamespace(parameters=()))
+    number = np.arange(1, 15)
+    identified = xr.Dataset(
+        {
+            "windows/misfit": ("window", 1 + 1 / number),
+            "windows/impacts": ("window", 3 * number),
+            "windows/value": (("window", "parameter"), np.zeros((14, 0))),
+            "starts/valley": ("start", [1]),
+        },
+        coords={"window": number},
+    )
+    misfit, course, _ = growing_windows(identified).axes
+    for axes in (misfit, course):
+        ticks = axes.get_xticks()
+        assert np.array_equal(ticks, np.round(ticks))
 
 
 def test_the_line_of_undetermined_parameters_is_that_of_the_fit():

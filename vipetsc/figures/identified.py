@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
@@ -170,6 +171,9 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     for number, impacts in zip(windows, identified["windows/impacts"].values, strict=True):
         misfit.annotate(str(impacts), (number, 0.02), xycoords=("data", "axes fraction"), fontsize=5, ha="center")
     misfit.set(xlabel="window (below: contacts)", ylabel="misfit / noise", title="Misfit")
+    for panel in (misfit, course):
+        # Windows are counted: a tick between two of them would mean nothing.
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
 
     values = identified["windows/value"].values
     for number, parameter in enumerate(plan.parameters):
