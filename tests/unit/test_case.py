@@ -45,7 +45,7 @@ def problems(table: dict[str, Any], *overrides: str) -> dict[str, str]:
 
 
 def test_the_builtin_case_has_the_papers_contacts_and_drive():
-    """Clearances, stiffness, frequency and speed are those of SPEC sections 1 to 4."""
+    """Sites, clearances, stiffness, frequency and contact law are those of the paper's four-band lattice."""
     case = Case.load()
     assert case.contacts.sites == [75, 106, 138, 169, 200]
     np.testing.assert_allclose(case.contacts.clearance, np.geomspace(10**-2.65, 10**-2.75, 5), rtol=1e-12)

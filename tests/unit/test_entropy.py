@@ -176,7 +176,7 @@ def test_snapshots_do_not_see_each_other():
 
 
 def test_averages_are_those_of_their_definitions():
-    """Averages are those of their definitions in SPEC.md, from the local entropy and weight after the start."""
+    """Averages are those of their definitions, from the local entropy and weight after the start."""
     signal = scattering_run()
     start = 5
     # Loud before the averages start: it must not count.

@@ -214,7 +214,7 @@ def test_a_tone_stays_in_its_part():
 
 
 def test_parts_name_bands_and_gaps():
-    """The four-band lattice's parts are its bands and gaps, with the edges in SPEC.md, and the part above all bands."""
+    """The four-band lattice's parts are its bands and gaps, with known edges, and the part above all bands."""
     parts = Parts.of(pass_bands(four_band("calibrated")))
     assert parts.names == ("band 1", "gap 1", "band 2", "gap 2", "band 3", "gap 3", "band 4", "above")
     assert np.allclose(parts.edges[1:-1], [612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75], atol=0.006)

@@ -294,7 +294,7 @@ def test_between_points_the_law_is_linear_in_log_z():
 
 
 def test_matched_clearances_meet_each_site_at_the_best_z():
-    """Matched clearances are A env(s_k) sqrt(T^k)/z* (SPEC section 13), where z* has the largest U/(1 - T)."""
+    """Matched clearances are A env(s_k) sqrt(T^k)/z*, where z* has the largest U/(1 - T)."""
     law = law_by_hand()
     z, transmitted = law.matched()
     # U/(1 - T) is 0.15/0.3 = 0.5 at z = 1.2, and 0.08/0.2 = 0.4 next to the onset.

@@ -28,7 +28,7 @@ def losses(run, analysis):
 
 @pytest.mark.slow
 def test_modal_energies_of_the_built_in_run(builtin):
-    """Modal energies sum to the energy, change in contacts alone, and end with the shares of SPEC section 12."""
+    """Modal energies sum to the energy, change in contacts alone, and end with known shares."""
     run, analysis = builtin
     energy = analysis["bands/modal_energy"]
     time = analysis["bands/instant"].values
@@ -60,11 +60,11 @@ def test_modal_energies_of_the_built_in_run(builtin):
     assert parts.modes.frequency[at_ends] == pytest.approx([2034.825] * 2, abs=1e-3)
 
 
-# SPEC's value at 0.25 s is left out: amid the first contacts the share changes by a tenth from one sample to the next.
+# 0.25 s is left out: amid the first contacts the share changes by a tenth from one sample to the next.
 @pytest.mark.slow
 @pytest.mark.parametrize(("time", "share"), [(0.3, 0.1113), (0.4, 0.2351), (0.5, 0.3365), (0.6, 0.3385)])
 def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
-    """The share of the upper bands in the work of the built-in run has the values of SPEC section 12 at four times."""
+    """The share of the upper bands in the work of the built-in run has known values at four times."""
     run, analysis = builtin
     model = Case.of(run).model()
     sample = int(np.searchsorted(run["time"].values, time - 1e-9))

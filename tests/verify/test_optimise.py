@@ -186,7 +186,7 @@ def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
 
 @pytest.mark.slow
 def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, monkeypatch):
-    """A search begins with clearances A env(s_k) sqrt(T^k)/z* (SPEC section 13), k in the order of the wave's path."""
+    """A search begins with clearances A env(s_k) sqrt(T^k)/z*, k in the order of the wave's path."""
     requests = []
 
     class Law:

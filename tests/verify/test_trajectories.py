@@ -53,7 +53,7 @@ class Reference:
         return drive.window_amplitude * (1 - math.cos(phase / drive.cycles)) * math.sin(phase)
 
     def contact_forces(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Forces (mass,) in N of the closed contacts (SPEC section 2)."""
+        """Forces (mass,) in N of the closed contacts, by the case's law."""
         contact = self.model.contact
         w = u[self.resonator] - u[self.host]
         w_rate = v[self.resonator] - v[self.host]
@@ -213,7 +213,7 @@ PRESETS = {"four-band": {"clearance": 2e-3, "end": 0.07}, "diatomic": {"clearanc
     ("preset", "amplitude"), [("four-band", 1e-3), ("four-band", 30), ("four-band", 1000), ("diatomic", 200)]
 )
 def test_ledger_closes(preset, amplitude, law, restitution):
-    """Work less dissipated energy is what the lattice holds, to 1e-8 of the work at every sample (SPEC section 5)."""
+    """Work less dissipated energy is what the lattice holds, to 1e-8 of the work at every sample."""
     setting = PRESETS[preset]
     table = {
         "lattice": {"preset": preset, "cells": 24},
