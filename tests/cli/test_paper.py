@@ -90,11 +90,12 @@ def test_every_figure_of_the_paper_is_offered(made):
 
     with Files() as files:
         stems = [picture.stem for figure in PAPER_FIGURES for picture in figure.offers(folders, files)]
+        ours = [picture.stem for figure in drawing(plan).figures for picture in figure.offers(folders, files)]
     assert len(stems) == len(set(stems))
     assert {stem.partition("-")[0] for stem in stems} == {figure.id for figure in PAPER_FIGURES}
+    assert {stem.partition("-")[0] for stem in ours} == {*DRAWN}
 
     drawn = {path.name for path in (made / "figures").iterdir()}
-    ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
     assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf", "json")}
 
 
