@@ -88,7 +88,7 @@ energy = [0.0, 1.0]
 """
 SEARCH = """
 [optimise]
-budget = 24
+budget = 12
 curve = [8.0]
 
 [optimise.variables]
@@ -325,7 +325,7 @@ def test_a_frequency_response(typed, put, tmp_path):
     """Curves of steady states over the amplitude, with conservative and with lossy stops, fold and turn back."""
     put("response.toml", NFRC)
     # The case allows so few points that its curves would end before they turn back.
-    command = "nfrc response.toml --set nfrc.harmonics=5 --set nfrc.points=200 --set output.figures=false"
+    command = "nfrc response.toml --set nfrc.points=200 --set output.figures=false"
     typed(f"{command}\nexport runs/response")
     curves = {
         restitution: table(tmp_path / f"runs/response/curves/branch-r{restitution}-1023.27-point.csv")
@@ -360,7 +360,8 @@ def test_the_best_clearances(typed, put, tmp_path):
 def test_a_movie_and_tables(typed, put, tmp_path):
     """A run is drawn as a movie, and exported as tables whose numbers are those of the run."""
     put("mine.toml", my_lattice(), PLAIN)
-    typed("run mine.toml\nplot runs/mine --movie --format gif --width 320 --from 0.05 --to 0.06\nexport runs/mine")
+    movie = "plot runs/mine --movie --format gif --width 320 --rate 2 --from 0.05 --to 0.06"
+    typed(f"run mine.toml\n{movie}\nexport runs/mine")
     assert (tmp_path / "runs/mine/figures/movie-energy.gif").read_bytes()[:4] == b"GIF8"
 
     rows = table(tmp_path / "runs/mine/curves/run-time.csv")
