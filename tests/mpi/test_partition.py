@@ -146,14 +146,15 @@ def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
 
 
 @pytest.mark.parallel([1, 2])
-def test_of_cells_that_move_equally_fast_the_first_is_named():
-    """A state that is not finite is so in many cells, of several ranks."""
+@pytest.mark.parametrize(("ends", "site"), [("fixed", "site 1 in cell 6"), ("periodic", "site 2 in cell 20")])
+def test_of_cells_that_move_equally_fast_the_first_is_named(ends, site):
+    """Many cells of several ranks may be not finite. On a ring the last cell is next to the first."""
     comm = MPI.COMM_WORLD
     layout = SimpleNamespace(comm=comm, dofs=1, owned=3, start=3 * comm.rank)
     engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
-    model = SimpleNamespace(chain=SimpleNamespace(sites=(4,)))
+    model = SimpleNamespace(chain=SimpleNamespace(sites=(5, 19), cells=20, ends=ends))
     place = _fastest_cell(SimpleNamespace(layout=layout, engine=engine, model=model))
-    assert place == "cell 2, nearest site 1 in cell 5"
+    assert place == f"cell 2, nearest {site}"
 
 
 @pytest.mark.parallel([2, 3])

@@ -144,3 +144,27 @@ def test_a_lattice_without_dashpots_has_no_loss_of_theirs():
 
     assert "dissipated_by_damping" not in result.statistics
     assert "energy/dissipated_by_damping" not in run
+
+
+@pytest.mark.parametrize("ends", ["periodic", "free"])
+def test_dashpots_that_a_profile_takes_away_change_nothing(ends):
+    """A lattice all of whose dashpots have a damping of 0, unlike the cell's, moves as one that has none."""
+    motions = []
+    for damping in (0.5, 0.0):
+        springs = [
+            {"start": 1, "end": 1, "next_cell": True, "stiffness": 2e4, "damping": damping},
+            {"start": 1, "end": 2, "stiffness": 6e3},
+        ]
+        cell = {"masses": [0.01, 0.004], "springs": springs, "contact": [1, 2]}
+        profiles = {"springs[1].damping": [0.0] * 30} if damping else {}
+        table = {
+            "lattice": {"cells": 30, "ends": ends, "cell": cell, "profiles": profiles},
+            "contacts": {"sites": [5], "clearance": 1e-5, "stiffness": 1e6},
+            "drive": {"amplitude": 20.0, "cycles": 5, "frequency": 600.0},
+            "time": {"end": 0.01, "engine": "propagator"},
+        }
+        run, result = simulated(Case.from_table(table))
+        assert result.statistics["episodes"] > 0
+        motions.append(run["impacts/onset"].values)
+
+    np.testing.assert_allclose(*motions, rtol=0, atol=1e-9 * np.abs(motions[1]).max())

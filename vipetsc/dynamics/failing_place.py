@@ -4,6 +4,7 @@ import numpy as np
 
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.torn_spring import torn_spring
+from vipetsc.lattice.chain import cells_between
 
 
 def failing_place(setup: Setup) -> str:
@@ -23,8 +24,8 @@ def _fastest_cell(setup: Setup) -> str:
     _, fastest = max(layout.comm.allgather(local), key=lambda of_rank: of_rank[0])
 
     cell = f"cell {fastest + 1}"
-    sites = setup.model.chain.sites
-    if not sites:
+    chain = setup.model.chain
+    if not chain.sites:
         return cell
-    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest))
-    return f"{cell}, nearest site {nearest + 1} in cell {sites[nearest] + 1}"
+    nearest = int(np.argmin(cells_between(chain.sites, fastest, chain.cells, chain.ends)))
+    return f"{cell}, nearest site {nearest + 1} in cell {chain.sites[nearest] + 1}"

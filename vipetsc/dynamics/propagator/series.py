@@ -51,7 +51,7 @@ class StepSeries:
     cells near it, for an even power of time; the same rows times H say what the next, odd power takes from the
     velocities. With dashpots rows are (..., 2 term, 2 dof, cell), one for each power of time: what it takes from
     displacements (P_k, the first dof) and from H times velocities (Q_k). A chain must have at least ``width`` cells.
-    With ``spans_cells`` forces act between masses of two cells, be they no contacts of ``chain`` that join cells.
+    With ``spans_cells`` forces act between masses of two cells, also if no contact of ``chain`` joins cells.
     """
 
     chain: Chain
@@ -66,8 +66,8 @@ class StepSeries:
 
     @property
     def is_damped(self) -> bool:
-        """Whether there is a dashpot."""
-        return self.bounds.damping > 0
+        """Whether rows are those with dashpots: also where the cell has one, and all of the lattice have damping 0."""
+        return self.chain.is_damped
 
     @property
     def omega_max_h(self) -> float:
