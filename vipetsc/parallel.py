@@ -113,7 +113,7 @@ def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
 
 
 def smallest(comm: MPI.Comm, *numbers: float) -> list[float]:
-    """Each of the ``numbers`` where it is smallest on any rank, in one reduction; all ranks must call it."""
+    """The smallest value that each of the ``numbers`` has on any rank, in one reduction; all ranks must call it."""
     if comm.size == 1:
         return [*numbers]
     reduced = np.array(numbers)
@@ -139,7 +139,7 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
 
 
 def _comes_of_an_end(error: BaseException) -> bool:
-    """Whether a library raised ``error`` while EndedError left it halfway."""
+    """Whether a library raised ``error`` while EndedError interrupted it."""
     cause = error.__context__
     while cause and not isinstance(cause, EndedError):
         cause = cause.__context__
@@ -155,7 +155,7 @@ def _value_or_raise(attempt: _Attempt) -> Any:
 
 
 class SortedRows(NamedTuple):
-    """Part of a table sorted over ranks: this rank's ``rows`` in order, behind the ``first`` of all ``total``."""
+    """Part of a table sorted over ranks: this rank's ``rows`` in order, which begin with row ``first`` of ``total``."""
 
     rows: np.ndarray
     first: int

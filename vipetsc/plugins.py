@@ -1,7 +1,7 @@
 """Modules of users, which register parts (``vipetsc.register``): how they are located, imported and distinguished.
 
 A module is named by a file ending in ``.py``, by an entry point of the group ``vipetsc.plugins``, or as Python imports
-it, in this order, as pytest takes the name behind ``-p``. What is installed is imported only where a case names it.
+it, in this order, as pytest takes the name after ``-p``. What is installed is imported only where a case names it.
 """
 
 import importlib

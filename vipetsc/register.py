@@ -51,7 +51,7 @@ class Parameter(NamedTuple):
 class RegisteredPart:
     """A part that a module registers: its ``name``, the source ``file`` and its ``sha256``.
 
-    ``modules`` are those in Python that register it: copies of a file are modules of their own, with one part.
+    ``modules`` are the names of the Python modules that register it: several, if they are copies of one file.
     """
 
     name: str

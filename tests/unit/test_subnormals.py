@@ -34,7 +34,7 @@ def test_subnormal_results_and_operands_are_zeros_within_the_block_alone():
         result = half(SMALLEST)
         of_operand = double(subnormal)
         normal = half(2 * SMALLEST)
-    # Compared behind the block: within it a subnormal number is equal to zero.
+    # Compared after the block: within it a subnormal number is equal to zero.
     assert result == 0
     assert of_operand == 0
     assert normal == SMALLEST

@@ -6,7 +6,9 @@ of one of two switching functions of the site's mode, each affine in w or in w':
 - free: w - D and -w - D, an onset on either side;
 - closed: D - side w, the separation, and with clipping -g (the force would turn into a pull);
 - clipped: D - side w, and g;
-- resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing.
+- resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing;
+- permanent: side w - D and D - side w, where the masses meet and part. The mode stays: only a search for kinks, by an
+  engine whose steps end on them, asks for these.
 """
 
 from typing import Any, NamedTuple

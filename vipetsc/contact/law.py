@@ -114,10 +114,10 @@ def create_contacts(
 
 
 def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: float) -> None:
-    """Make the sites ``which`` (site,) permanent (see the package's docstring); they touch or are pressed at w = 0.
+    """Make the sites that the mask ``which`` (site,) marks permanent (see the package's docstring).
 
-    ``laws`` (site,) are those of all ``sites``. ``speed`` in m/s, that of the relative motion to be expected, takes the
-    place of w'_minus: errors of steps in contact are relative to it.
+    They touch or are pressed at w = 0. ``laws`` (site,) are those of all ``sites``. ``speed`` in m/s, that of the
+    relative motion to be expected, takes the place of w'_minus: errors of steps in contact are relative to it.
     """
     # A contact that is pressed at rest has one stop, that of the smaller clearance. The clearance is negative: minus
     # it is the indentation at rest.

@@ -65,7 +65,8 @@ class OwnRows(NamedTuple):
     def of(cls, series: StepSeries) -> Self:
         """The needs of the cells that differ in the lattice of ``series``."""
         cells, tables = series.own_rows()
-        return cls(cells, tables, (2 * series.chain.cell.dofs) ** 2 * (2 * series.reach + 1))
+        numbers = (2 * series.chain.cell.dofs) ** 2 * (2 * series.reach + 1)
+        return cls(cells=cells, tables=tables, numbers=numbers)
 
     def describe(self, ranks: int) -> str:
         """Note on how many cells differ and on the memory of their tables, which the ranks divide among them."""
@@ -155,7 +156,8 @@ def _runge_kutta_seconds(model: Model, episodes: float, ranks: int) -> Seconds:
     if ranks > 1:
         step += EXCHANGES * EXCHANGE
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
-    return Seconds(SAMPLED_STEPS * model.samples * steps_per_sample * step, EPISODE_STEPS * episodes * step)
+    steps = SAMPLED_STEPS * model.samples * steps_per_sample
+    return Seconds(linear=steps * step, contacts=EPISODE_STEPS * episodes * step)
 
 
 def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, episodes: float, ranks: int) -> Seconds:
@@ -163,11 +165,11 @@ def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, epi
     steps = model.samples * round(model.sample_interval / series.interval)
     numbers = own_rows.numbers / ranks
     step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * own_rows.cells * numbers
-    step += 1e-6 * spring_cost(model.chain, series.reach)
+    step += 1e-6 * spring_cost(model.chain, series.reach)  # which is in us
     if ranks > 1:
         step += LINEAR_EXCHANGE
     begin = BEGIN + MAKE_NUMBER * own_rows.tables * numbers
-    return Seconds(begin + steps * step, EPISODE * episodes)
+    return Seconds(linear=begin + steps * step, contacts=EPISODE * episodes)
 
 
 def expected_episodes(model: Model) -> float:

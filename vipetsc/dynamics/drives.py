@@ -1,7 +1,7 @@
 """Compiled drives: their records, the force at a time, the times at which it is not smooth.
 
-The active piece of a waveform is no function of time alone: within a step it is continued beyond its end, so that no
-kink lies inside; engines end their steps on the ``breaks`` and select the pieces anew.
+Which piece of a waveform acts does not depend on the time alone: within a step a piece is continued beyond its end, so
+that no kink lies inside. Engines end their steps on the ``breaks`` and select the pieces anew there.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,13 @@ DRIVE = np.dtype(
     [(name, np.int64) for name in ("number", "target", "first", "last", "piece")]
     + [(name, float) for name in ("amplitude", "frequency", "cycles", "duration", "highest", "stiffness", "inverse")]
 )
-"""A drive: its number in the model; the component of the state that it acts on, by 1/mass (1/kg); its rows of the
-pieces, half open, none of a burst, and the one that is on, -1 of none; a burst's factor before 1 - cos in N, frequency
-in rad/s and cycles; its end in s, highest frequency in rad/s; of a wall the stiffness of its spring in N/m, else 0."""
+"""A drive: its ``number`` in the model; ``target``, the component of the state that it acts on, and ``inverse``, 1/mass
+there in 1/kg; its ``duration`` in s and its ``highest`` frequency in rad/s.
+
+A tone burst has its ``amplitude`` in N, the factor before 1 - cos, its ``frequency`` in rad/s and its ``cycles``. Other
+waveforms have the pieces ``first`` to ``last``, half open, of which ``piece`` is on, -1 if none is. ``stiffness`` in
+N/m is that of the spring to a moving wall, 0 where the drive is a force.
+"""
 
 
 class Drives(NamedTuple):
@@ -44,8 +48,8 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
             continue
 
         drive = drives[number]
-        # A moving wall at the end of a spring acts as a force: its displacement times the spring's stiffness.
         wave = drive.waveform
+        # A moving wall at the end of a spring acts as a force: its displacement times the spring's stiffness.
         factor = drive.stiffness or 1.0
         row["duration"] = wave.duration
         row["highest"] = wave.highest

@@ -106,11 +106,11 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
         other = y[end : end + inside]
 
         for i in range(inside):
-            stretch = other[i] - here[i]
-            energies[i] += 0.5 * spring.stiffness * stretch * stretch
+            elongation = other[i] - here[i]
+            energies[i] += 0.5 * spring.stiffness * elongation * elongation
         if leaves and not shape.right_free:
-            stretch = displacement(y, lattice, n, spring.end) - y[spring.start * n + n - 1]
-            energies[inside] += 0.5 * spring.stiffness * stretch * stretch
+            elongation = displacement(y, lattice, n, spring.end) - y[spring.start * n + n - 1]
+            energies[inside] += 0.5 * spring.stiffness * elongation * elongation
         if spring.next_cell == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
             energies[0] += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
 
@@ -236,4 +236,11 @@ class EnergyMeter:
 
         whole, fine, works = np.split(total, [ENERGY_SUMS, 2 * ENERGY_SUMS])
         kinetic, spring, contact, dissipated, damping = whole * self.unit + fine * (self.unit / _FINE)
-        return Energies(kinetic, spring, contact, works.sum(axis=0), dissipated, damping)
+        return Energies(
+            kinetic=kinetic,
+            spring=spring,
+            contact=contact,
+            work=works.sum(axis=0),
+            dissipated=dissipated,
+            dissipated_by_damping=damping,
+        )

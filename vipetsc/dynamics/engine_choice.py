@@ -24,7 +24,9 @@ def choose_engine(case: Case, model: Model) -> EngineChoice:
     """The engine that ``case`` names, by default the propagator; ``ts`` where that does not suit its ``model``."""
     if case.time.engine == TS:
         return EngineChoice(TS, None)
-    reason = "PETSc options require ts" if options_of(case) else refusal(model)
-    if reason is None:
-        return EngineChoice(PROPAGATOR, None)
-    return EngineChoice(TS, f"{PROPAGATOR} refused: {reason}")
+    if options_of(case):
+        return EngineChoice(TS, f"{PROPAGATOR} refused: PETSc options require ts")
+    reason = refusal(model)
+    if reason is not None:
+        return EngineChoice(TS, f"{PROPAGATOR} refused: {reason}")
+    return EngineChoice(PROPAGATOR, None)

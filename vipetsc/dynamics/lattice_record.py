@@ -19,9 +19,11 @@ COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np
 NONLINEAR = np.dtype(
     [(name, np.int64) for name in ("mass", "offset", "other", "law", "stride")] + [("sign", np.float64)]
 )
-"""A spring that is not linear as one of its masses sees it: that mass, cells to the other one, that one; the number of
-the law in the rank's first cell, and the step from a cell's law to the next one's; 1 at the end ``start`` of the
-spring, which comes first, -1 at the other: the sign by which the other mass is ahead where the spring is longer.
+"""A nonlinear spring as one of its masses sees it: ``mass``, and the ``other`` mass, which is ``offset`` cells further.
+
+``law`` is the number of its law in the rank's first cell, ``stride`` the step from a cell's law to the next cell's, 0
+if all have one. ``sign`` is 1 where ``mass`` is the spring's ``start`` and -1 where it is its ``end``: the elongation
+is ``sign`` times the displacement of the other mass less that of this one.
 """
 SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
 """A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
@@ -147,7 +149,7 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
 
 
 def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of each of a cell's springs that is not linear in some cell, of dtype ``NONLINEAR``, and the laws."""
+    """Both ends of each of a cell's springs that is nonlinear in some cell, of dtype ``NONLINEAR``, and the laws."""
     # One law of each spring where cells have equal ones; else one for each cell, from that before the first one on.
     table = np.stack(chain.spring_terms(layout.start - 1, layout.stop), axis=-1)
     if np.array_equal(table, np.broadcast_to(table[:1], table.shape)):

@@ -2,9 +2,9 @@
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
 mass 2, ...), velocities likewise, then its ledger components (what the dashpots of each owned cell have dissipated, if
-there are any; work of each drive whose cell it owns; dissipated energy of each owned site). Behind
-them lie the ghosts: displacements of the neighbouring cell on the left, with velocities where there are dashpots to
-integrate or contacts with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
+there are any; work of each drive whose cell it owns; dissipated energy of each owned site). Behind them lie the ghosts:
+displacements of the neighbouring cell on the left, with velocities where there are dashpots to integrate or contacts
+with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
 """
 
 from collections.abc import Mapping, Sequence
@@ -157,7 +157,7 @@ class Layout:
 
 
 def cell_cuts(cells: int, ranks: int) -> list[int]:
-    """The first cell of every rank, and behind the last one: equal blocks, the first ranks have one more."""
+    """The first cell (rank + 1) of every rank, and ``cells``: equal blocks, of which the first may have one more."""
     return [r * (cells // ranks) + min(r, cells % ranks) for r in range(ranks + 1)]
 
 

@@ -10,6 +10,7 @@ from vipetsc.case import Case, CaseError, CaseFile, Problem
 from vipetsc.case.schema import RENAMED_OPTIONS, PetscTable, only_looks
 from vipetsc.dynamics.petsc_library import petsc_library
 
+# The version of PETSc since which options of time stepping have other names (``RENAMED_OPTIONS``).
 RENAMING_VERSION = (3, 25)
 
 

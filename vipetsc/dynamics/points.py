@@ -122,7 +122,8 @@ class PointMotion:
         for column, number in enumerate(self.sites.tolist()):
             for direction, place in _ends_of(chain, number, pairs[number]):
                 if place == (cell, mass):
-                    contacts.append(_ForceAtPoint(column, direction, float(preloads[column])))
+                    force = _ForceAtPoint(column=column, direction=direction, preload=float(preloads[column]))
+                    contacts.append(force)
         return _PointTerms(
             column=int(np.searchsorted(self.cells, cell)),
             mass=mass,

@@ -136,7 +136,7 @@ def simulate(
     if observers or not issubclass(ENGINES[choice.name], OpeningEngine):
         opening = None
 
-    simulation = Simulation(case, model, choice, stop, watching, opening)
+    simulation = Simulation(case=case, model=model, engine=choice, stop=stop, watching=watching, opening=opening)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
         if folder is None:
@@ -175,14 +175,21 @@ class Simulation:
         if self.opening and checkpoints is None:
             opening = self.opening()
 
-        begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
+        begin = Begin(wall=time.perf_counter(), cpu=time.process_time(), compiled=compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
             layout = Layout(self.model, output.comm, dashpots=True)
             engine = ENGINES[self.engine.name](self.model, layout, self.stop)
         with released(engine, output.comm):
-            meter = EnergyMeter(self.model, layout)
-            run = Run(Setup(self.case, self.model, layout, meter, engine, output), self.watching)
+            setup = Setup(
+                case=self.case,
+                model=self.model,
+                layout=layout,
+                meter=EnergyMeter(self.model, layout),
+                engine=engine,
+                output=output,
+            )
+            run = Run(setup, self.watching)
             if checkpoints is not None:
                 run.restore(checkpoints)
             elif opening is not None:
@@ -216,7 +223,7 @@ def released(engine: Engine, comm: MPI.Comm) -> Iterator[None]:
 class Run:
     """One run: its engine goes through blocks of samples, and its observers look at each block, the recorder last.
 
-    A sample that one observer refuses is not seen by the observers behind it, nor recorded.
+    A sample that one observer refuses is not seen by the observers after it, nor recorded.
     """
 
     def __init__(self, setup: Setup, observers: Sequence[type[Observer]]) -> None:
@@ -295,7 +302,8 @@ class Run:
             try:
                 observer.observe(block)
             except RunawayError as error:
-                # The samples before are good, and all that the observers behind see. They end before a stall does.
+                # The samples before this one are good, and the only ones that the observers after this one see. This
+                # failure replaces that of an engine which has stalled after them.
                 failure = Failure(str(error), block.times[error.sample])
                 block = self.block(samples, error.sample)
         return block, failure
@@ -304,7 +312,9 @@ class Run:
         """The block of the first ``count`` of ``samples``, with energies of all ranks; all ranks must call it."""
         energies = self.setup.meter.total(samples.sums[:count], samples.work[:count])
         times = np.arange(samples.number, samples.number + count) * self.setup.model.sample_interval
-        return Block(samples.number, times, energies, samples, self.setup.engine.state)
+        return Block(
+            first=samples.number, times=times, energies=energies, samples=samples, state=self.setup.engine.state
+        )
 
     def checkpoint(self) -> None:
         """Write the checkpoint from which a run is resumed."""

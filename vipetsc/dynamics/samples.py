@@ -44,6 +44,7 @@ class Samples(NamedTuple):
 
     def rows(self, samples: int) -> int:
         """Number of the first so many ``samples`` whose fields are recorded."""
+        # Of the numbers below n the stride divides ceil(n/stride).
         return -(-(self.number + samples) // self.stride) + -self.number // self.stride
 
 

@@ -1,4 +1,4 @@
-"""The compiled force of a spring that is not linear, beyond its linear part: the twin of ``vipetsc.lattice.Spring``.
+"""The compiled force of a nonlinear spring, beyond its linear part: the twin of ``vipetsc.lattice.Spring``.
 
 Time stepping, energies and normal modes ask these kernels. A further term of the force has its parameter and formulas
 in these two files, and its keys in the sections of cases.

@@ -2,8 +2,8 @@
 
 A mass m feels from each spring of the stiffness k, with a dashpot c parallel to it, the force k (u_other - u) + c
 (v_other - v), and from its dashpot to the ground -c_g v; ``spring_accelerations`` divides the sum by m. ``add_squares``
-sums k z^2, twice the energy, and c z'^2, the power, over the elongations z. The parts of springs that are not linear
-have functions of their own (``dynamics.spring_law``).
+sums k z^2, twice the energy, and c z'^2, the power, over the elongations z. The nonlinear parts of springs have
+functions of their own (``dynamics.spring_law``).
 
 A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
 result does not depend on the partition, to the last bit. Where all cells are alike and undamped, a mass and a spring
@@ -29,7 +29,7 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall.
 
     A ``mass`` of dofs + j stands for the velocity in m/s of mass j, which lies there in ``y`` (component,). Ghosts have
-    velocities in lattices with dashpots only.
+    velocities only where dashpots are integrated or contacts join cells (``Layout.ghost_rows``).
     """
     shape = lattice.shape
     if 0 <= cell < shape.cells:
@@ -90,8 +90,8 @@ def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass:
         if _is_beyond_free_end(lattice, other_cell):
             continue
         entry = _table_entry(lattice, coupling, cell)
-        stretch = displacement(y, lattice, other_cell, coupling.other) - y[mass * n + cell]
-        force += lattice.stiffness[entry] * stretch
+        difference = displacement(y, lattice, other_cell, coupling.other) - y[mass * n + cell]
+        force += lattice.stiffness[entry] * difference
         if is_damped:
             rate = displacement(y, lattice, other_cell, d + coupling.other) - y[(d + mass) * n + cell]
             force += lattice.damping[entry] * rate
@@ -208,7 +208,7 @@ def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> flo
 
 @kernel
 def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Force in N on one mass of an owned ``cell`` by the parts of its springs that are not linear.
+    """Force in N on one mass of an owned ``cell`` by the nonlinear parts of its springs.
 
     ``y`` (component,) is the rank's part of the state, with ghosts.
     """
@@ -242,11 +242,11 @@ def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, en
 def add_squares(
     y: np.ndarray, lattice: LatticeRecord, first: int, half: int, values: np.ndarray, sums: np.ndarray
 ) -> None:
-    """Add to ``sums`` (cell,), of cells from ``first`` on, a value times the stretch squared of each of their springs.
+    """Add to ``sums`` (cell,), of cells from ``first`` on, value times elongation squared of each of their springs.
 
     ``y`` (component,) is the rank's part of the state, with ghosts. ``values`` (spring and cell,) is the lattice's
-    table ``stiffness`` in N/m with ``half`` 0, or ``damping`` in N s/m with ``half`` = dofs: the stretch is then that
-    of velocities. A spring to a wall on the left is the first cell's.
+    table ``stiffness`` in N/m with ``half`` 0, or ``damping`` in N s/m with ``half`` = dofs: the square is then that of
+    the elongation's rate. A spring to a wall on the left is the first cell's.
     """
     shape = lattice.shape
     n = lattice.shape.cells
@@ -262,11 +262,11 @@ def add_squares(
         other = y[end * n + first + spring.next_cell :][:inside]
 
         for i in range(inside):
-            stretch = other[i] - here[i]
-            sums[i] += factors[i] * stretch * stretch
+            elongation = other[i] - here[i]
+            sums[i] += factors[i] * elongation * elongation
         if leaves and not shape.right_free:
-            stretch = displacement(y, lattice, n, end) - y[start * n + n - 1]
-            sums[inside] += factors[inside] * stretch * stretch
+            elongation = displacement(y, lattice, n, end) - y[start * n + n - 1]
+            sums[inside] += factors[inside] * elongation * elongation
         if spring.next_cell == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
             sums[0] += values[s * (n + 1)] * y[end * n] * y[end * n]
 

@@ -49,7 +49,7 @@ class LawParameter(NamedTuple):
 
 def parameter(law: str, unit: str, text: str, least: float, most: float) -> dict[str, LawParameter]:
     """Metadata of a field of ``Contact`` that is a parameter of a shipped elastic law."""
-    return {"parameter": LawParameter(law, unit, text, least, most)}
+    return {"parameter": LawParameter(law=law, unit=unit, text=text, least=least, most=most)}
 
 
 def registered_law(name: str) -> LawPart | None:

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from vipetsc.spectra.modal_energies import ModalParts, upper_fraction
     from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
 
-# Their compiled kernels take half a second to load, and a case that is only checked needs the names of measures alone.
+# Modules with compiled kernels, which take half a second to load: a case that is only checked needs no more of this
+# package than the names of measures.
 COMPILED = {
     "band_energies": ("PartEnergies", "Parts", "front_arrival", "ibtet", "part_energies"),
     "entropies": ("Entropy", "averages", "entropy", "local_entropy"),

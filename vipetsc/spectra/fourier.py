@@ -35,7 +35,7 @@ class Dispersion:
         energy = self.energy[zero:].copy()
         # 0 is its own opposite, and so is pi, which an even number of wavenumbers has once.
         energy[1 : zero + 1] += self.energy[:zero][::-1]
-        return Dispersion(self.wavenumber[zero:], self.frequency, energy)
+        return Dispersion(wavenumber=self.wavenumber[zero:], frequency=self.frequency, energy=energy)
 
     def pooled(self, wavenumbers: int, frequencies: int) -> "Dispersion":
         """Dispersion in bins ``wavenumbers`` and ``frequencies`` times as wide: sums of energies, at the bins' middles.
@@ -127,7 +127,8 @@ def dispersions(
     t, x = velocity.shape[:2]
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
-    taken = range(nt)[: np.count_nonzero(frequency <= highest)][rows]
+    # Numbers of the frequencies that are computed: a slice of a range is a range.
+    taken = range(np.count_nonzero(frequency <= highest))[rows]
     flanks = taper(t, in_time)[:, None]
 
     energies = [np.zeros((len(taken), nx)) for _ in windows]
@@ -153,7 +154,9 @@ def dispersions(
         # Half of m v^2, its mean over the t samples, and Parseval's theorem for both transforms of padded lengths.
         energy /= 2 * t * nt * nx
         energy[has_opposite] *= 2
-    return [Dispersion(wavenumber, frequency[taken], energy.T[order]) for energy in energies]
+    return [
+        Dispersion(wavenumber=wavenumber, frequency=frequency[taken], energy=energy.T[order]) for energy in energies
+    ]
 
 
 def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Curves of steady states: what their files hold, and the numbers that a whole curve has."""
+"""Curves of steady states: the variables of their files, and numbers that are measured of a whole curve."""
 
 from typing import NamedTuple
 

@@ -145,7 +145,7 @@ class Bank:
     Each of these steps multiplies every wavenumber eta by a number, and so do all three together: ``transfer`` (bin, k)
     over the wavenumbers of the padded ``length``,
     T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is at most 1:
-    over nodes from 0 to infinity it would be 1. It is 0.99 at least from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at
+    over nodes from 0 to infinity it would be 1. It is 0.99 at least from 1.3 pi/60 to pi, 0.55 at pi/60 and 0 at
     eta = 0 (kc = 6).
     """
 

@@ -88,7 +88,7 @@ the sum over forces up to then. All are smooth in a and b: their coefficients in
 and a force enters by its moments with these polynomials, those of the substeps before and, up to each node, that of the
 substep itself.
 
-**11. Springs that are not linear** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
+**11. Nonlinear springs** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
 elongation z, of which k belongs to K. The rest is a force on the DoF z = c u, with c as for the w of a site,
 
     F = -(k_2 z^2 + k_3 z^3),

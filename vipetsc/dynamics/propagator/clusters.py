@@ -20,8 +20,8 @@ from P_0 = 1 and Q_0 = 0, and the rows are c P_k and c Q_k, two for each power o
 powers of A count, ``terms``, which make twice as many powers of s (with dashpots there is a row for each of these), and
 at how many cells' distance they end, ``reach``.
 
-**Numbers of DoFs** are those of ``contact_dofs``: 0 to n - 1 the n sites, then the springs that are not linear, and
--1 - i for the i-th drive. Its array has the drives last and in reverse, so that a negative number is an index from the
+**Numbers of DoFs** are those of ``contact_dofs``: 0 to n - 1 the n sites, then the nonlinear springs, and -1 - i for
+drive i, counted from 0. Its array has the drives last and in reverse, so that a negative number is an index from the
 end.
 
 **Rows that serve both ways** (Maxwell's reciprocity). M and K are symmetric, so that (-A)^m M^-1 is: what the force on
@@ -59,8 +59,8 @@ class DofTables(NamedTuple):
     """The contact DoFs of a rank, cluster by cluster, and the tables by which they and the lattice move each other.
 
     The DoFs of cluster c begin at ``first[c]`` and end before ``first[c + 1]``: its sites, ``sites[c]`` of them,
-    ``springs[c]`` springs that are not linear, and then its driven masses. A DoF's rows span ``StepSeries.width``
-    cells, from ``reach`` before its own on. ``column`` (dof,) is the first of these among the columns of the halo,
+    ``springs[c]`` nonlinear springs, and then its driven masses. A DoF's rows span ``StepSeries.width`` cells, from
+    ``reach`` before its own on. ``column`` (dof,) is the first of these among the columns of the halo,
     ``owned`` (dof, cell) their numbers among the rank's cells, -1 for cells of other ranks. ``clearance`` (dof,) in m
     is the displacement below which no force acts. For a site it is the lesser of its two clearances, 0 or negative for
     one that touches or is pressed at rest, which therefore acts in every step; for a spring the elongation below which
@@ -98,7 +98,7 @@ def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: La
     if layout.periodic:
         turns = (-layout.cells, 0, layout.cells)
     near = np.zeros(len(dofs), bool)
-    # "last" is a DoF's last cell, ``stop`` the cell behind the rank's last one.
+    # "last" is a DoF's last cell, ``stop`` the cell after the rank's last one.
     for turn in turns:
         near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
 
@@ -217,13 +217,8 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
     form_cells = np.arange(forms.shape[1])
     velocities = tables.inverse_masses[:, :, series.reach + form_cells].swapaxes(1, 2) * forms
 
-    sizes = np.diff(groups.first)
-    response = np.zeros((len(cells), max(sizes, default=0), rows.shape[-1]))
-    for j in range(response.shape[1]):
-        # The j-th DoF is the source, in every cluster that has more than j.
-        targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
-        sources = np.repeat(groups.first[:-1], sizes)[targets] + j
-
+    response = np.zeros((len(cells), max(np.diff(groups.first), default=0), rows.shape[-1]))
+    for j, targets, sources in groups.pairs():
         # Columns of the target's rows in which the cells of the source lie. A ring has at least ``width`` cells: each
         # of them is in one column at most.
         columns = series.reach + (cells[sources] - cells[targets])[:, None] + form_cells

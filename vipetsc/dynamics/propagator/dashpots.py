@@ -29,7 +29,7 @@ class DashpotRows:
     """Rows of the dashpots of each cell of a damped lattice, of the springs that begin in it and of its masses.
 
     Cells with equal dashpots and equal surroundings are of one *kind*; ``interior`` is that of a cell far from ends and
-    from cells that differ. A kind's rows span the cells from ``reach`` before the cell to ``reach`` behind the next
+    from cells that differ. A kind's rows span the cells from ``reach`` before the cell to ``reach`` after the next
     one, ``width`` of them.
     """
 

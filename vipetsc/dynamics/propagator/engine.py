@@ -185,7 +185,10 @@ class Propagator(OpeningEngine):
         loss_stencil = self._stencil
         if dashpots is not None:
             loss_stencil = create_loss_stencil(dashpots, layout, self._regions)
-        self._tables = StepTables(self._stencil, loss_stencil, *self._forces.losses)
+        by_forces, by_pairs = self._forces.losses
+        self._tables = StepTables(
+            stencil=self._stencil, free_losses=loss_stencil, by_forces=by_forces, by_pairs=by_pairs
+        )
         ghosts = [cell for cell in layout.neighbours() if cell is not None]
         for cell in ghosts:
             self._regions.add(cell, 1)
@@ -245,7 +248,7 @@ class Propagator(OpeningEngine):
         self.state = self._states[self.steps % 2]
         self.time = self._time_after(min(failed, self.steps))
         if failed > last:
-            return FillResult(len(samples.work), bool(stop))
+            return FillResult(samples=len(samples.work), stopped=bool(stop))
 
         reason = "the state is not finite"
         acting = forces.describe(int(progress["cluster"]))
@@ -253,7 +256,8 @@ class Propagator(OpeningEngine):
             reason = f"{acting} at {progress['time']:.9g} s"
         # Of ranks that fail in one step the first: all have the same reason then, on any number of ranks.
         _, reason = min(comm.allgather((int(progress["failed"]), reason)), key=lambda of_rank: of_rank[0])
-        return FillResult(failed // parts - samples.number + 1, bool(stop), reason)
+        taken = failed // parts - samples.number + 1
+        return FillResult(samples=taken, stopped=bool(stop), stalled=reason)
 
     def _time_after(self, steps: int) -> float:
         """Time in s after so many ``steps``, summed as in ``take_steps``."""

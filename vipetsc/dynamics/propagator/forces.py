@@ -205,7 +205,7 @@ class Forces:
 
         leaders = all_dofs["cell"][groups.numbers[groups.first[:-1]]]
         self.logs = (leaders >= layout.start) & (leaders < layout.stop)
-        # The same by DoF of this rank, and by number in the model.
+        # Which DoFs belong to a logged cluster: by their place on this rank, and by their number in the model.
         self._is_logged = np.repeat(self.logs, np.diff(groups.first))
         self._logs_number = np.zeros(len(all_dofs), bool)
         self._logs_number[groups.numbers[self._is_logged]] = True

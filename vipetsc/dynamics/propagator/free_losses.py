@@ -12,7 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.dashpots import NO_DASHPOTS, DashpotRows
-from vipetsc.dynamics.propagator.loss_modes import gauss, mode_count
+from vipetsc.dynamics.propagator.loss_modes import mode_count
+from vipetsc.dynamics.propagator.nodes import gauss
 from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, in_fours, ranges_of, sparse_rows
 from vipetsc.dynamics.vectors import LANES
 
@@ -39,7 +40,7 @@ class _Gramian:
         return rows.reshape(-1, *rows.shape[2:])
 
     def table(self, kinds: np.ndarray) -> np.ndarray:
-        """The table of a cell, from the ``kinds`` of those from ``reach`` + 1 before it to ``reach`` behind it."""
+        """The table of a cell, from the ``kinds`` of those from ``reach`` + 1 before it to ``reach`` after it."""
         width = self._dashpots.width
         rows = 2 * self._dashpots.chain.cell.dofs
         out = np.zeros((rows, rows, width))

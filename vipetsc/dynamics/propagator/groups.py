@@ -1,9 +1,10 @@
 """Degrees of freedom on which forces act, and the groups of them that are solved for together.
 
-They are contact sites, springs that are not linear, and driven masses. Those that feel one another within a step form a
+They are contact sites, nonlinear springs, and driven masses. Those that feel one another within a step form a
 group (sec. 6 of the derivation in the package's docstring).
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ NEGLIGIBLE = float(np.finfo(float).epsneg)
 class Groups(NamedTuple):
     """Groups of ``contact_dofs``: those of group g are ``numbers[first[g] : first[g + 1]]``.
 
-    In each group the sites' numbers come first, in their own order, then those of springs, which go on behind the
+    In each group the sites' numbers come first, in their own order, then those of springs, which go on after the
     lattice's last site, then -1 for the first drive, -2 for the second.
     """
 
@@ -31,9 +32,20 @@ class Groups(NamedTuple):
         before = np.append(0, np.cumsum(marked))
         return before[self.first[1:]] - before[self.first[:-1]]
 
+    def pairs(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yield, for each place j in a group, j and two arrays (pair,) of DoFs, counted in ``numbers``.
+
+        The first has all DoFs of the groups with more than j DoFs, the second the j-th DoF of the same group: the j-th
+        is thus paired with all of its group, itself included.
+        """
+        sizes = np.diff(self.first)
+        for j in range(int(sizes.max(initial=0))):
+            targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
+            yield j, targets, np.repeat(self.first[:-1], sizes)[targets] + j
+
 
 def spans_cells(chain: Chain) -> bool:
-    """Whether forces act between masses of two cells: by contacts, or by springs that are not linear."""
+    """Whether forces act between masses of two cells: by contacts, or by nonlinear springs."""
     cells, numbers = nonlinear_numbers(chain).T
     inside = cells[[chain.cell.springs[number].next_cell for number in numbers]]
     if chain.ends == "fixed":
@@ -46,7 +58,7 @@ def spans_cells(chain: Chain) -> bool:
 def contact_dofs(model: Model) -> np.ndarray:
     """The DoFs on which forces act: relative displacements of the sites, elongations, displacements of driven masses.
 
-    The array (dof,) can be indexed by a site's number, behind the sites by that of a spring, or, from the end, by -n
+    The array (dof,) can be indexed by a site's number, after the sites by that of a spring, or, from the end, by -n
     for the n-th drive: drives come last, in reverse. ``cell`` is a DoF's first cell and ``last`` its last one, the same
     or the next. ``form`` (cell, mass) are the weights c of the displacements in these cells: one cell if no force of
     the lattice ``spans_cells``, else two. ``clearance`` in m is the lesser of a site's two, inf for a driven mass, and

@@ -10,7 +10,9 @@ from functools import lru_cache
 from itertools import count
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss, legvander
+from numpy.polynomial.legendre import legvander
+
+from vipetsc.dynamics.propagator.nodes import gauss
 
 # Coefficients below this fraction of the largest loss are left out.
 SMALLEST_MODE = 1e-13
@@ -30,12 +32,6 @@ def mode_count(theta: float) -> int:
         if bound < SMALLEST_MODE and p > 1:
             return p
     raise AssertionError("factorials outgrow powers")
-
-
-def gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss's nodes and weights on [0, 1]."""
-    x, weight = leggauss(nodes)
-    return (1 + x) / 2, weight / 2
 
 
 @lru_cache(maxsize=4)

@@ -8,7 +8,6 @@ r_m that earlier forces have left. Both integrals are smooth in what remains of 
 expanded in the polynomials of ``loss_modes``.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ class _Responses(NamedTuple):
 def no_losses(dofs: int, clusters: int) -> tuple[FreeLosses, PairLosses]:
     """The tables of a rank with so many DoFs and clusters in a lattice without dashpots."""
     none = np.zeros(0, np.int64)
-    free = FreeLosses(none, none, np.zeros((0, 0, 0, 0)), none)
+    free = FreeLosses(column=none, table=none, rows=np.zeros((0, 0, 0, 0)), leader=none)
     return free, PairLosses(
         kinds=np.zeros((dofs, 0), np.int64),
         kernels=np.zeros((0, 0, 0)),
@@ -90,7 +89,7 @@ def _create_responses(dofs: np.ndarray, model: Model, dashpots: DashpotRows) -> 
     chain = model.chain
     reach = dashpots.series.reach
     span = dofs["form"].shape[1]
-    # A dashpot's rows begin ``reach`` before its cell and end ``reach`` behind the next one.
+    # A dashpot's rows begin ``reach`` before its cell and end ``reach`` after the next one.
     first = dofs["cell"] - reach - 1
     count = dashpots.width + span - 1
     kinds = dashpots.kinds((first[:, None] + np.arange(count)).ravel()).reshape(len(dofs), count)
@@ -118,7 +117,7 @@ def _create_responses(dofs: np.ndarray, model: Model, dashpots: DashpotRows) -> 
                 column = 2 * reach + 1 + i - k
                 if 0 <= column < dashpots.width:
                     out[k % distinct] += np.einsum("rkj,j->rk", rows[..., column], velocity)
-    return _Responses(first, table, kinds[examples][:, :distinct], rates)
+    return _Responses(first=first, table=table, kinds=kinds[examples][:, :distinct], rates=rates)
 
 
 def _free_rows(responses: _Responses, from_start: np.ndarray, dashpots: DashpotRows) -> np.ndarray:
@@ -143,14 +142,6 @@ def _free_rows(responses: _Responses, from_start: np.ndarray, dashpots: DashpotR
     return 2 * dashpots.series.interval * np.ascontiguousarray(np.moveaxis(out, 1, -1))
 
 
-def _pairs(groups: Groups) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
-    """Yield, of each place j in a cluster, the DoFs of clusters with more than j DoFs, their j-th one, and j."""
-    sizes = np.diff(groups.first)
-    for j in range(max(sizes, default=0)):
-        targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
-        yield targets, np.repeat(groups.first[:-1], sizes)[targets] + j, j
-
-
 def _pair_kernels(
     groups: Groups, responses: _Responses, integrals: np.ndarray, dashpots: DashpotRows
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -164,7 +155,7 @@ def _pair_kernels(
     number_of: dict[tuple[int, int, int], int] = {}
     kernels: list[np.ndarray] = []
     modes = len(integrals)
-    for targets, sources, j in _pairs(groups):
+    for j, targets, sources in groups.pairs():
         distances = responses.first[sources] - responses.first[targets]
         for target, source, distance in zip(targets.tolist(), sources.tolist(), distances.tolist(), strict=True):
             if chain.ends == "periodic":

@@ -44,12 +44,12 @@ def _lay_out(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache
 def at_end() -> np.ndarray:
     """Weights (node,) that extrapolate what is smooth in z from its values at the nodes to a substep's end, z = 1."""
-    z, _ = _gauss(NODES)
+    z, _ = gauss(NODES)
     return np.array([np.prod([(1 - a) / (b - a) for a in z if a != b]) for b in z])
 
 
-def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss's nodes and weights on [0, 1]."""
+def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss's nodes (node,) and weights (node,) on [0, 1]; ``count`` is their number."""
     nodes, weights = leggauss(count)
     return (1 + nodes) / 2, weights / 2
 
@@ -57,12 +57,12 @@ def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache
 def collocation(powers: int) -> Collocation:
     """Tables for the powers 0 to ``powers`` - 1."""
-    z, weight = _gauss(NODES)
+    z, weight = gauss(NODES)
     position, slope = _lay_out(z)
 
     # Integrals from 0 to node j by a finer rule. In z the integrand has a degree of 2 powers + NODES at most, the power
     # and the slope being quadratic and linear in it: so many nodes integrate it exactly.
-    fine, fine_weight = _gauss(powers + NODES)
+    fine, fine_weight = gauss(powers + NODES)
     fine_z = z[:, None] * fine  # (node j, fine)
     fine_position, fine_slope = _lay_out(fine_z)
 
@@ -79,4 +79,4 @@ def collocation(powers: int) -> Collocation:
 
     last_degrees = (NODES - 2, NODES - 1)
     tail = np.stack([(2 * k + 1) * weight * legval(2 * z - 1, np.eye(NODES)[k]) for k in last_degrees])
-    return Collocation(position, weight * slope, np.stack(tables, axis=1), tail)
+    return Collocation(position=position, weight=weight * slope, powers=np.stack(tables, axis=1), tail=tail)

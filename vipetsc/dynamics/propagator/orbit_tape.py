@@ -129,7 +129,7 @@ def _departures(rows: np.ndarray, is_open: np.ndarray, begin: np.ndarray, end: n
     # The first substep after an onset is marked. One that begins with the orbit is not, though it begins a contact as
     # well: that of a site which is closed at the start.
     closes = (rows["onset"] > 0) | (begin == 0.0)
-    # An opening begins behind a substep in which the contact is closed.
+    # An opening begins after a substep in which the contact is closed.
     opens = is_open & ~np.append(False, is_open[:-1])
     number = np.cumsum(np.where(is_pressed, opens, closes))
     is_away = is_open | ~is_pressed

@@ -85,7 +85,7 @@ def local_recursion(
     acts = np.ones_like(exists)
     if chain.ends == "free":
         acts = exists & np.roll(exists, -1, axis=-1)
-    neighbours = _Neighbourhoods(chain, masses[:, None], exists[:, None, None], acts[:, None])
+    neighbours = _Neighbourhoods(chain=chain, masses=masses[:, None], exists=exists[:, None, None], acts=acts[:, None])
 
     h = number(interval)
     by_stiffness = partial(_multiply, neighbours, h**2 * stiffness, None)

@@ -66,7 +66,8 @@ class HaloRegions:
             scatter = self._scatter.handle
             vector = self._vector.handle
         native.bind_symbols()
-        return Halo(columns, cells, scatter, vector, np.array([state.handle for state in states], np.int64))
+        handles = np.array([state.handle for state in states], np.int64)
+        return Halo(columns=columns, cells=cells, scatter=scatter, vector=vector, states=handles)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

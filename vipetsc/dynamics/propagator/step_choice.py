@@ -1,8 +1,8 @@
 """The length of a linear step, and which lattices such steps do not suit: decided before any kernel is loaded.
 
 The step H is a sample interval over a whole number: long, because a step costs the same whatever its length, but not so
-long that many sites feel one another within it. Springs that are not linear act in every step: where they are so many
-that ``ts`` costs less, linear steps are refused.
+long that many sites feel one another within it. Nonlinear springs act in every step: where they are so many that ``ts``
+costs less, linear steps are refused.
 """
 
 from dataclasses import replace
@@ -48,8 +48,7 @@ def step_series(model: Model) -> StepSeries | None:
 
     Long steps are few, but sites that feel one another within a step must be followed together.
     """
-    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
-    fastest = max(bursts, default=0.0)
+    fastest = _fastest_burst(model)
 
     best = None
     least = np.inf
@@ -71,6 +70,11 @@ def step_series(model: Model) -> StepSeries | None:
             best = series
             least = cost
     return best
+
+
+def _fastest_burst(model: Model) -> float:
+    """The highest frequency in rad/s of the tone bursts of ``model``; 0 without one."""
+    return max((drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)), default=0.0)
 
 
 def _series(model: Model, parts: int) -> StepSeries:
@@ -98,8 +102,7 @@ def _no_step(model: Model) -> str:
     if model.chain.cells < series.width:
         return f"{model.chain.cells} cells are fewer than the {series.width} cells that {step} couples"
 
-    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
-    fastest = max([series.omega_max_h / series.interval, *bursts])
+    fastest = max(series.omega_max_h / series.interval, _fastest_burst(model))
     return f"{step} is too long for {fastest:.5g} rad/s, of the drive or the lattice"
 
 

@@ -30,7 +30,7 @@ without their repetitions that end on a kink or a change, of those rejected, of 
 mode."""
 
 SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
-"""A spring that is not linear: what its force has beyond the linear part; the size in m of elongations."""
+"""A nonlinear spring: what its force has beyond the linear part; the size in m of elongations."""
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
@@ -59,8 +59,8 @@ class Sums(NamedTuple):
 
     At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
-    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (power,) of one DoF's force about the substep's
-    end; ``series`` (power, coefficient), whose row k is the polynomial in s that term k of a response makes of them;
+    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (power,) of one DoF's force about the substep's end;
+    ``series`` (power, coefficient), whose row k is the polynomial in s that term k of a response makes of them;
     and ``bernstein`` (2, 6), the coefficients of two quintics for w.
     """
 
@@ -81,9 +81,8 @@ class Trial(NamedTuple):
     """A substep that has been computed but not yet taken.
 
     Forces act on the DoFs ``active``: first the sites that are not free, ``closed``, then all ``springs``, then masses
-    whose drive is on.
-    ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are
-    as in ``Cluster``, at its end.
+    whose drive is on. ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and
+    ``site_motion`` are as in ``Cluster``, at its end.
     """
 
     active: np.ndarray

@@ -29,7 +29,7 @@ from vipetsc.dynamics.propagator.linear_system import solve_in_place
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
-from vipetsc.dynamics.propagator.taylor import copy, shift
+from vipetsc.dynamics.propagator.taylor import copy, evaluate, shift
 
 
 class Variations(NamedTuple):
@@ -134,12 +134,7 @@ def _fill_free_forces(
     for node in range(NODES):
         s = substep.length * cluster.nodes.position[substep.kind, node]
         for j in range(x.shape[0]):
-            # Horner's scheme, for the value and the slope of the series.
-            w = 0.0
-            v = 0.0
-            for k in range(terms - 1, -1, -1):
-                v = v * s + w
-                w = w * s + x[j, i * terms + k]
+            w, v = evaluate(x[j, i * terms : (i + 1) * terms], s)
             change = slopes[node, 0] * w + slopes[node, 1] * v / cluster.interval
             out[node, j] = change + slopes[node, 2] * x[j, dofs * terms + i]
 
@@ -155,7 +150,7 @@ def _subtract_responses(slopes: np.ndarray, to_w: np.ndarray, to_v: np.ndarray, 
 
 @kernel
 def _end_of_substep(rows: np.ndarray, begin: int) -> int:
-    """The row behind the last one of the substep of which the row ``begin`` is the first: it has one of each site."""
+    """The row after those of the substep that begins with the row ``begin``: it has one for each closed site."""
     stop = begin
     while stop < rows.size and rows[stop].position == rows[begin].position:
         stop += 1

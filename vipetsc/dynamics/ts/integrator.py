@@ -166,7 +166,7 @@ class Integrator(Engine):
             if not self._step(target):
                 stopped = True
             trials += 1
-        # As a run does that goes on from a checkpoint here: both have the same bits.
+        # A run that is resumed from a checkpoint here restarts, too: both then have the same bits.
         self.ts.restartStep()
         return not stopped
 

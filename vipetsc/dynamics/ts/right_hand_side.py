@@ -165,19 +165,19 @@ def _lattice_at(address: int) -> LatticeRecord:
     at = context.address
     size = context.length
     return LatticeRecord(
-        context.shape,
-        array_at(at.masses, size.masses, MASS),
-        array_at(at.couplings, size.couplings, COUPLING),
-        array_at(at.springs, size.springs, SPRING),
-        array_at(at.site_dofs, size.site_dofs, SITE_DOFS),
-        array_at(at.contacts, size.contacts, SITE),
-        Drives(array_at(at.rows, size.rows, DRIVE), array_at(at.pieces, size.pieces, PIECE)),
-        array_at(at.nonlinear, size.nonlinear, NONLINEAR),
-        array_at(at.spring_laws, size.spring_laws, SPRING_LAW),
-        array_at(at.inverse_masses, size.inverse_masses, np.float64),
-        array_at(at.grounding, size.grounding, np.float64),
-        array_at(at.stiffness, size.stiffness, np.float64),
-        array_at(at.damping, size.damping, np.float64),
+        shape=context.shape,
+        masses=array_at(at.masses, size.masses, MASS),
+        couplings=array_at(at.couplings, size.couplings, COUPLING),
+        springs=array_at(at.springs, size.springs, SPRING),
+        site_dofs=array_at(at.site_dofs, size.site_dofs, SITE_DOFS),
+        contacts=array_at(at.contacts, size.contacts, SITE),
+        drives=Drives(array_at(at.rows, size.rows, DRIVE), array_at(at.pieces, size.pieces, PIECE)),
+        nonlinear=array_at(at.nonlinear, size.nonlinear, NONLINEAR),
+        spring_laws=array_at(at.spring_laws, size.spring_laws, SPRING_LAW),
+        inverse_masses=array_at(at.inverse_masses, size.inverse_masses, np.float64),
+        grounding=array_at(at.grounding, size.grounding, np.float64),
+        stiffness=array_at(at.stiffness, size.stiffness, np.float64),
+        damping=array_at(at.damping, size.damping, np.float64),
     )
 
 
@@ -203,6 +203,10 @@ def find_change(address: int, start: np.ndarray, end: np.ndarray, h: float, plac
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
+    """The function that ``compile_callback`` compiles: puts the rates of the state ``u`` at PETSc's time t into ``f``.
+
+    ``ts``, ``u`` and ``f`` are handles, ``address`` is that of a ``CONTEXT``. Returns PETSc's error code.
+    """
     context: Any = array_at(address, 1, CONTEXT)[0]
     shape = context.shape
     error = 0

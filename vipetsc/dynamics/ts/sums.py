@@ -57,6 +57,11 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
 
 
 def _callback(y: int, count: int, factors: int, vectors: int) -> int:
+    """The function that ``_compile`` compiles: adds ``count`` vectors, each times its factor, to the vector ``y``.
+
+    ``y`` is a handle; ``factors`` and ``vectors`` are the addresses of numbers and of handles. Returns PETSc's error
+    code.
+    """
     handles = array_at(vectors, count, np.int64)
     # Of the vectors, then of y, then its size.
     addresses = np.zeros(count + 2, np.int64)
