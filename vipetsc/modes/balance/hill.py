@@ -91,7 +91,7 @@ class ContourLine(NamedTuple):
         turned = -float(self.logs[-1].imag) / np.pi
         # With all orders D is real at both ends, and it has turned by a whole number of half circles. A number that is
         # far from whole, or below 0, says that orders are left out that matter, and NaN that D is not finite or 0 at a
-        # position. (Whether a turn was missed it cannot say: ``_line`` sees to that.)
+        # position. (Whether a turn was missed it cannot say: ``_follow_line`` sees to that.)
         count = np.round(turned)
         is_whole = abs(turned - count) < 0.25
         if is_whole and count >= 0:
@@ -167,6 +167,8 @@ class Hill:
         # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
         self._compliances: dict[tuple[int, int, complex], np.ndarray] = {}
         self._reduced: tuple[ForceSeries, list[KeptOrders]] | None = None
+        # The number of perturbations that grow and the fastest one, or the pairs, are asked for one after the other.
+        self._least_line: tuple[ForceSeries, ContourLine] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
         """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases. NaN with too few orders."""
@@ -238,6 +240,14 @@ class Hill:
         return [self._compliances[key] for key in keys]
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
+        """D on Re lambda = ``growth`` Om; of the latest motion the line of ``least`` is kept."""
+        if growth != self.least:
+            return self._follow_line(series, growth)
+        if self._least_line is None or self._least_line[0] is not series:
+            self._least_line = series, self._follow_line(series, growth)
+        return self._least_line[1]
+
+    def _follow_line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.
 
         Nor does log|D| change by more than ``STEEP`` there.
@@ -329,7 +339,7 @@ class Hill:
             if len(zeros) >= count:
                 break
             mu = self._zero(series, complex(guess.real, abs(guess.imag)), zeros)
-            # A zero may lie a little to the left of the line, and be counted to its right: see ``_line``.
+            # A zero may lie a little to the left of the line, and be counted to its right: see ``_follow_line``.
             if mu is None or mu.real <= 0.9 * growth:
                 continue
             if REAL < mu.imag < 0.5 - REAL:
