@@ -76,7 +76,8 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
         return list(range(count))
 
     position = wavenumber * count / np.pi
-    driven = min(int(position), count - 1)
+    # A wavenumber on the border of two bins is in the upper one, however it is rounded.
+    driven = min(int(position + 1e-9), count - 1)
     neighbour = driven - 1
     if position - driven >= 0.5:
         neighbour = driven + 1
