@@ -23,24 +23,36 @@ def measure(claim: str, root: Path, reading: str = "calibrated") -> SimpleNamesp
         return SimpleNamespace(**measure_claim(claim, reading, evidence))
 
 
+def put_analysis(home: Path, case: Case, row: dict[str, Any]) -> None:
+    """Write the analysis of a member, with the measures of ``row``, into its folder."""
+    home.mkdir(parents=True, exist_ok=True)
+    with h5py.File(home / "analysis.h5", "w") as file:
+        file.attrs["case"] = case.to_toml()
+        for name, value in row.items():
+            file[name] = value
+        if "bands/energy" in row:
+            parts = Parts.of(pass_bands(case.lattice.unit_cell()))
+            file["bands/energy"].attrs["parts"] = list(parts.names)
+
+
 def put_sweep(
-    folder: Path, table: dict[str, Any], content: Callable[[Case], dict[str, Any]], episodes: Callable[[Case], int]
+    folder: Path,
+    table: dict[str, Any],
+    content: Callable[[Case], dict[str, Any]],
+    episodes: Callable[[Case], int],
+    analyses: bool = True,
 ) -> None:
-    """Write a finished sweep: ``content(case)`` is each member's analysis, ``episodes(case)`` counts its contacts."""
+    """Write a finished sweep: ``content(case)`` is each member's analysis, ``episodes(case)`` counts its contacts.
+
+    Without ``analyses`` members have no file of their own, for claims that read ``ensemble.h5`` alone.
+    """
     plan = Sweep.from_table(table)
     names = plan.ids()
 
     def outcome(number: int, case: Case) -> dict[str, Any]:
-        home = folder / names[number]
-        home.mkdir(parents=True, exist_ok=True)
         row = content(case)
-        with h5py.File(home / "analysis.h5", "w") as file:
-            file.attrs["case"] = case.to_toml()
-            for name, value in row.items():
-                file[name] = value
-            if "bands/energy" in row:
-                parts = Parts.of(pass_bands(case.lattice.unit_cell()))
-                file["bands/energy"].attrs["parts"] = list(parts.names)
+        if analyses:
+            put_analysis(folder / names[number], case, row)
 
         statistics = {
             "episodes": episodes(case),

@@ -71,9 +71,9 @@ def put_entropies(
         },
     }
     if neighbours:
-        put_sweep(root / NEIGHBOURS, table, content, episodes)
+        put_sweep(root / NEIGHBOURS, table, content, episodes, analyses=False)
     table["sweep"]["drive"]["wavenumber"] = list(wavenumbers)
-    put_sweep(root / SPREAD, table, content, episodes)
+    put_sweep(root / SPREAD, table, content, episodes, analyses=False)
 
 
 def set_fits(root: Path, step: str, average: str = "energy_weighted", **values: float) -> None:

@@ -45,7 +45,10 @@ def put_transfer(
         # The floor of the whole record comes from its ends, but for a fiftieth.
         return {"ibtet": 0.02 * floor + transfer, "ibtet_whole": floor + transfer}
 
-    put_sweep(root / "interband", table, content, episodes=lambda case: int(case.drive.amplitude > ONSET))
+    def episodes(case: Case) -> int:
+        return int(case.drive.amplitude > ONSET)
+
+    put_sweep(root / "interband", table, content, episodes, analyses=False)
 
 
 @pytest.mark.slow
@@ -116,7 +119,7 @@ def put_scatter(root: Path) -> None:
         clearance = case.contacts.clearance[0]
         return {"ibtet": case.drive.amplitude * clearance / nominal[len(case.contacts.sites)]}
 
-    put_sweep(root / "interband-scatter", table, content, episodes=lambda case: 1)
+    put_sweep(root / "interband-scatter", table, content, episodes=lambda case: 1, analyses=False)
 
 
 @pytest.mark.slow
@@ -198,7 +201,7 @@ def put_amplitudes(root: Path, content: Callable[[Case], dict[str, Any]]) -> Non
             "drive": {"amplitude": [1.0, 24.0, 200.0]},
         },
     }
-    put_sweep(root / "interband-amplitudes", table, content, episodes=lambda case: 1)
+    put_sweep(root / "interband-amplitudes", table, content, episodes=lambda case: 1, analyses=False)
 
 
 @pytest.mark.parametrize(("medium", "high", "expected"), [(0.3, 0.02, HOLDS), (0.1, 0.2, IN_PART)])
