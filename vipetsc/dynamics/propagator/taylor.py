@@ -29,11 +29,15 @@ def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
     """Expand series ``taylor`` (dof, coefficient) about ``s`` instead of 0, into ``out``, which may be ``taylor``."""
     dofs, coefficients = taylor.shape
     copy(taylor, out[:dofs])
-    # Horner's scheme k times over: the k-th pass leaves the coefficient of (x - s)^k in place.
+    # Horner's scheme, a + x q(x) for each coefficient a from the last but one down, with the q so far by powers of
+    # (x - s): as x = s + (x - s), each coefficient is the one before it in q (at first a) plus s times its own in q.
     for j in range(dofs):
-        for k in range(coefficients - 1):
-            for i in range(coefficients - 2, k - 1, -1):
-                out[j, i] += s * out[j, i + 1]
+        for k in range(coefficients - 2, -1, -1):
+            before = out[j, k]
+            for i in range(k, coefficients - 1):
+                after = out[j, i + 1]
+                out[j, i] = before + s * after
+                before = after
 
 
 @kernel
