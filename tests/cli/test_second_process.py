@@ -93,39 +93,38 @@ class Immediate(Recorded):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draws_alone", [True, False])
-def test_two_processes_draw_what_one_draws(draws_alone, run, tmp_path, caplog):
+def test_two_processes_draw_what_one_draws(run, tmp_path, caplog):
     """Two processes together draw the same pictures, byte by byte, as one process alone, and print the same."""
     alone = shutil.copytree(run, tmp_path / "alone", ignore=shutil.ignore_patterns("figures"))
     with caplog.at_level("INFO", "vipetsc"):
         expected = draw_pictures(PICTURES, [alone], MPI.COMM_SELF)
     printed = caplog.messages
-    caplog.clear()
     assert "no picture of" in printed[0]
 
-    folder = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("figures", "analysis.h5"))
-    with SecondProcess(draws_alone) as second:
-        draw_unmeasured(PICTURES, folder, second)
-        with caplog.at_level("INFO", "vipetsc"):
-            drawn = draw_pictures(PICTURES, [folder], MPI.COMM_SELF, afresh=False, helper=second)
-        # Of each request every picture was given to one process, and every process found once that none was left.
-        processes = len(second._channels) + (not draws_alone)
-        assert (
-            next(CommonTurns(second._file, place=0)) == len(WITHOUT_MEASURES & pictures_in(folder).keys()) + processes
-        )
-        assert (
-            next(CommonTurns(second._file, place=1)) == len(pictures_in(folder).keys() - WITHOUT_MEASURES) + processes
-        )
+    for draws_alone in (True, False):
+        caplog.clear()
+        folder = tmp_path / f"run-{draws_alone}"
+        shutil.copytree(run, folder, ignore=shutil.ignore_patterns("figures", "analysis.h5"))
+        with SecondProcess(draws_alone) as second:
+            draw_unmeasured(PICTURES, folder, second)
+            with caplog.at_level("INFO", "vipetsc"):
+                drawn = draw_pictures(PICTURES, [folder], MPI.COMM_SELF, afresh=False, helper=second)
+            # Of each request every picture was given to one process, and every process found once that none was left.
+            processes = len(second._channels) + (not draws_alone)
+            unmeasured = WITHOUT_MEASURES & pictures_in(folder).keys()
+            measured = pictures_in(folder).keys() - WITHOUT_MEASURES
+            assert next(CommonTurns(second._file, place=0)) == len(unmeasured) + processes
+            assert next(CommonTurns(second._file, place=1)) == len(measured) + processes
 
-        # A request that fails does not end the second process.
-        second.ask("run", [folder], names=["no figure"])
-        assert second.drawn() is None
-        second.ask("run", [folder], names=["unit_cell"])
-        assert second.drawn().files == [folder / "figures" / "unit_cell.png"]
+            # A request that fails does not end the second process.
+            second.ask("run", [folder], names=["no figure"])
+            assert second.drawn() is None
+            second.ask("run", [folder], names=["unit_cell"])
+            assert second.drawn().files == [folder / "figures" / "unit_cell.png"]
 
-    assert [path.name for path in drawn] == [path.name for path in expected]
-    assert pictures_in(folder) == pictures_in(alone)
-    assert caplog.messages == printed
+        assert [path.name for path in drawn] == [path.name for path in expected]
+        assert pictures_in(folder) == pictures_in(alone)
+        assert caplog.messages == printed
 
 
 @pytest.mark.parametrize("draws_alone", [True, False])
