@@ -27,7 +27,7 @@ class InParts(Observer):
 @pytest.mark.parametrize("engine", ["ts", *on_two("propagator")])
 def test_same_bits_under_several_drives(folder, engine):
     """An impulse, a chirp and a moved end, besides the first drive, act alike on any number of ranks."""
-    runs_alike(folder, small_case(drive={"more": DRIVES}, time={"end": 0.03, "engine": engine}))
+    runs_alike(folder, small_case(drive={"more": DRIVES}, time={"end": 0.022, "engine": engine}))
 
 
 @pytest.mark.parallel([1, 2, 3])
@@ -36,7 +36,7 @@ def test_same_bits_under_several_drives(folder, engine):
 @pytest.mark.parametrize(("engine", "looks"), [*on_two(("ts", 31)), ("propagator", 2)])
 def test_a_run_goes_on_amid_its_drives(folder, engine, looks):
     """A run that is stopped while its drives act, and resumed, has the bits of an uninterrupted one."""
-    case = small_case(drive={"more": DRIVES}, time={"end": 0.02, "engine": engine})
+    case = small_case(drive={"more": DRIVES}, time={"end": 0.012, "engine": engine})
     simulate(case, folder / "whole", observers=[InParts])
 
     assert simulate(case, folder / "parts", stop=StopAt(looks), observers=[InParts]).resumable

@@ -39,7 +39,7 @@ CHAIN = {
         next_cell=[True, True, False, True, True, False, True, False],
     ),
     "drive": {"amplitude": 30.0, "cycles": 2, "frequency": 2e3},
-    "time": {"end": 0.02, "sample_interval": 2e-4, "rtol": 1e-8},
+    "time": {"end": 0.008, "sample_interval": 2e-4, "rtol": 1e-8},
 }
 
 # A ring for the propagator: a contact joins the last cell and the first, and another one is pressed at rest.

@@ -22,7 +22,7 @@ def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, 
         contacts={"sites": [6, 8, 9, 12, 13, 16, 17], "clearance": 1e-3, "stiffness": 1e5},
         drive={"amplitude": 0.0},
         initial=initial,
-        time={"engine": engine, "end": 0.02},
+        time={"engine": engine, "end": 0.008},
     )
     runs_alike(folder, case)
 
