@@ -27,7 +27,8 @@ from scipy.ndimage import uniform_filter1d
 from vipetsc.compiled import kernel, njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
-# The paper's number of wavenumbers at which wavelets are taken, and their centre wavenumber.
+# The number of wavenumbers at which wavelets are taken, and their centre wavenumber. The paper states neither. An
+# entropy depends on both, so that they are the same for all runs.
 NODES = 60
 KC = 12.0
 # Snapshots that are transformed together, and nodes that are filtered together: for 300 cells such an array just fits
