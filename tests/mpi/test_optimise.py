@@ -62,8 +62,9 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
 
 
 @pytest.mark.parallel([1, 2])
-# The search stops at its first look at the request, or after some designs.
-@pytest.mark.parametrize("looks", [1, 12])
+# The search stops at its first look at the request, or after some designs. A rank looks twice for each design that it
+# computes: on two ranks 14 to 26 times, as ranks take designs when they are free.
+@pytest.mark.parametrize("looks", [1, 4])
 def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
     """A request to stop on one rank ends the search on all; the resumed search has the bits of an unstopped one."""
     comm = MPI.COMM_WORLD
