@@ -201,7 +201,7 @@ def put_amplitudes(root: Path, content: Callable[[Case], dict[str, Any]]) -> Non
             "drive": {"amplitude": [1.0, 24.0, 200.0]},
         },
     }
-    put_sweep(root / "interband-amplitudes", table, content, episodes=lambda case: 1, analyses=False)
+    put_sweep(root / "interband-amplitudes", table, content, episodes=lambda case: 1)
 
 
 @pytest.mark.parametrize(("medium", "high", "expected"), [(0.3, 0.02, HOLDS), (0.1, 0.2, IN_PART)])
