@@ -127,9 +127,9 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
     # Rank 0 of a team measures and writes for the team. Without teams the fault meets rank 1.
     failing = 0 if team == 2 else 1
     if comm.rank == failing:
-        # The fault comes at the third record of rank 0, whose first one is that of the linear run, and at the second
+        # The fault comes at the third record of rank 0, whose first one is that of the linear run, and at the first
         # record of rank 1, which gets few members where rank 0 is faster.
-        time_of_fault = {"append": 3 - comm.rank, "step": 1, "analyse": 2}
+        time_of_fault = {"append": 1 if comm.rank else 3, "step": 1, "analyse": 2}
         injector.arm(phase, time_of_fault[phase], kind)
 
     if kind == "full-disk":
