@@ -19,6 +19,19 @@ CONTACTS = {"sites": [10], "clearance": CLEARANCE, "restitution": 1.0}
 # The range holds the fold at which a sweep to larger amplitudes jumps: at amplitude/clearance = 1.0014.
 NFRC = {"harmonics": 11, "range": [0.98, 1.01]}
 
+# The oscillator u'' + c u' + u + u^3 = F cos(Om t), c = 0.1: a mass of 1 kg between two springs, without contacts.
+CUBIC_OSCILLATOR: dict[str, Any] = {
+    "lattice": {
+        "cells": 1,
+        "cell": {
+            "masses": [1.0],
+            "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.05, "next_cell": True}],
+            "contact": [1, 1],
+        },
+    },
+    "contacts": {"sites": []},
+}
+
 
 def nfrc_case(lattice: dict[str, Any] | None = None, contacts: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
     """The case of one site of a four-band lattice under a wave; arguments update the tables of the case."""

@@ -18,7 +18,7 @@ from scipy.special import ellipk
 
 import vipetsc
 from tests.rigs import period_map, rate_of
-from tests.steady_states import motion_at
+from tests.steady_states import CUBIC_OSCILLATOR, motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
@@ -170,19 +170,10 @@ def test_a_curve_over_the_amplitude_has_no_such_search():
         absorber(over="amplitude", fixed=[1.7], range=[0.1, 0.3])
 
 
-# The oscillator u'' + c u' + u + u^3 = F cos(Om t), c = 0.1, under a force of 0.3 N. The range of frequencies ends
-# between its two folds, which are at 1.32 and 1.83 rad/s.
-DUFFING: dict[str, Any] = {
+# The oscillator under a force of 0.3 N. The range of frequencies ends between its two folds, which are at 1.32 and
+# 1.83 rad/s.
+DUFFING: dict[str, Any] = CUBIC_OSCILLATOR | {
     "name": "duffing",
-    "lattice": {
-        "cells": 1,
-        "cell": {
-            "masses": [1.0],
-            "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.05, "next_cell": True}],
-            "contact": [1, 1],
-        },
-    },
-    "contacts": {"sites": []},
     "drive": {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1},
     "time": {"end": 10.0},
 }

@@ -14,7 +14,16 @@ from scipy.optimize import root
 
 from tests.conftest import assert_same_bits, datasets, run_of
 from tests.models import CLEARANCE
-from tests.steady_states import CONTACTS, LATTICE, curve_of, first_harmonic, motion_at, nfrc_case, refined
+from tests.steady_states import (
+    CONTACTS,
+    CUBIC_OSCILLATOR,
+    LATTICE,
+    curve_of,
+    first_harmonic,
+    motion_at,
+    nfrc_case,
+    refined,
+)
 from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.verb_cases import load_every
@@ -341,16 +350,7 @@ def test_a_resumed_curve_finds_two_folds_in_its_first_step(tmp_path):
     That they may lie there shows in the direction of the point before. An oscillator with hardening springs has two
     folds close together, at an amplitude little above that of the first fold at all.
     """
-    table = {
-        "lattice": {
-            "cells": 1,
-            "cell": {
-                "masses": [1.0],
-                "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.05, "next_cell": True}],
-                "contact": [1, 1],
-            },
-        },
-        "contacts": {"sites": []},
+    table = CUBIC_OSCILLATOR | {
         "drive": {"waveform": "harmonic", "amplitude": 0.05138, "frequency": 1.0, "cell": 1, "mass": 1},
         "time": {"end": 100.0},
         "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.05138], "harmonics": 3},
