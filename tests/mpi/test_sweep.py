@@ -15,6 +15,7 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
+from vipetsc.dynamics import recorded_sizes
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies import linear_history
@@ -151,6 +152,21 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
     assert run_sweep(plan, folder / "out", comm).complete
     assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
     comm.Barrier()
+
+
+@pytest.mark.parallel([2])
+def test_members_begin_from_the_same_checkpoints_on_any_number_of_ranks(folder, monkeypatch):
+    """The samples of a checkpoint of a linear run do not depend on how many its ranks store at once."""
+    case = sweep("sweep.ranks=2").member(0).case
+    # As in a lattice of many cells, of which 64 samples would be too many bytes for one chunk.
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 20)
+
+    checkpoints = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        history = LinearHistory.of(case, comm, StopRequest())
+        checkpoints.append([int(parts[0]["samples"]) for parts in history.checkpoints])
+
+    assert checkpoints[0] == checkpoints[1] == [*range(64, case.model().samples, 64)]
 
 
 @pytest.mark.parallel([2])

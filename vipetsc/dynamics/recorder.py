@@ -72,11 +72,9 @@ class Recorder(Observer):
             # Rank 0 keeps the chunks that it gathers from all ranks.
             self._columns = np.array([[0, len(recorded)]])
             most = layout.comm.allreduce(numbers, MPI.SUM)
-        length = chunk_samples(8 * most)
-        if setup.output.keeps_in_place:
-            # One more than there are samples: a chunk that is full at the end would have an empty one behind it.
-            length = setup.model.samples + 1
-        self._length = min(length, setup.output.longest)
+        length = setup.output.chunk_length or chunk_samples(8 * most)
+        # One more than there are samples: a chunk that is full at the end would have an empty one behind it.
+        self._length = min(length, setup.model.samples + 1)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
         # Of the fields, 1 for velocities, which engines take from the second half of the state.

@@ -57,14 +57,13 @@ class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
     It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end. The caller
-    sets ``recording``, which describes their contents, before the first one. A chunk has at most ``longest`` samples.
-    An output that ``keeps_in_place`` what is in a chunk makes no copies of it, for which chunks would have to be small.
+    sets ``recording``, which describes their contents, before the first one. A chunk has ``chunk_length`` samples; if
+    that is None, as many as are copied and written at once.
     """
 
     recording: Recording
     saves_states = True
-    keeps_in_place = False
-    longest = sys.maxsize
+    chunk_length: int | None = None
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
         self.folder = Path(folder)
@@ -315,9 +314,11 @@ class RunMemory:
         self.comm = comm
         self._memory = fields
         self.saves_states = states_every is not None
-        # One rank's fields are not copied.
-        self.keeps_in_place = comm.size == 1
-        self.longest = states_every or sys.maxsize
+        # Checkpoints are the same on any number of ranks: what continues from one has the same bits then.
+        self.chunk_length = states_every
+        if states_every is None and comm.size == 1:
+            # One rank's fields are not copied, for which chunks would have to be small.
+            self.chunk_length = sys.maxsize
         self.states: list[list[Arrays]] = []
         self.count = 0
         self.dataset: xr.Dataset | None = None
