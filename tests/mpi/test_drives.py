@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two, small_case
@@ -32,14 +33,19 @@ def test_same_bits_under_several_drives(folder, engine):
 
 @pytest.mark.parallel([1, 2, 3])
 # The time stepper looks for a request to stop after every step, the propagator after every ten samples: both runs stop
-# while the drives act.
-@pytest.mark.parametrize(("engine", "looks"), [*on_two(("ts", 31)), ("propagator", 2)])
+# while the drives act, and a second time during a contact.
+@pytest.mark.parametrize(("engine", "looks"), [*on_two(("ts", (31, 36))), ("propagator", (2, 1))])
 def test_a_run_goes_on_amid_its_drives(folder, engine, looks):
-    """A run that is stopped while its drives act, and resumed, has the bits of an uninterrupted one."""
+    """A run that is stopped while its drives act and a contact is closed, and resumed, has the bits of a whole one."""
     case = small_case(drive={"more": DRIVES}, time={"end": 0.012, "engine": engine})
     simulate(case, folder / "whole", observers=[InParts])
 
-    assert simulate(case, folder / "parts", stop=StopAt(looks), observers=[InParts]).resumable
+    for number in looks:
+        stopped = simulate(case, folder / "parts", stop=StopAt(number), observers=[InParts])
+        assert stopped.resumable
     assert simulate(case, folder / "parts", resume=True, observers=[InParts]).complete
 
-    assert_same_bits(datasets(folder / "whole/run.h5"), datasets(folder / "parts/run.h5"))
+    whole = datasets(folder / "whole/run.h5")
+    last = stopped.statistics["end"]
+    assert np.any((whole["impacts/onset"] < last) & (last < whole["impacts/separation"]))
+    assert_same_bits(whole, datasets(folder / "parts/run.h5"))
