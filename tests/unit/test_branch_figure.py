@@ -1,6 +1,7 @@
 """Figures of branches: curves through points and tangents, kinds of branches, axes, rows, and what is left out."""
 
 import errno
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,14 +10,16 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.cli.drawing import draw_pictures
 from vipetsc.cli.verbs.branch_verbs import PICTURES, parameter_unit
-from vipetsc.figures import branch_curves, nfrc, registry, response_outputs, style
+from vipetsc.figures import branch_curves, nfrc, registry, response_family, response_outputs, style
 from vipetsc.figures.sources import BRANCHES
+from vipetsc.figures.stability import SPACING, StabilityLook, draw_states
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
@@ -156,15 +159,16 @@ def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
 
 
 @pytest.mark.parametrize(
-    ("clearance", "unstable", "axis", "dashes"),
+    ("clearance", "unstable", "axis", "legend"),
     [
-        (1e-3, [0, 0, 0], "largest |w| / clearance", None),
-        (1e-3, [0, 2, 0], "largest |w| / clearance", "unstable"),
-        (0.0, [0, 2, -1], "largest |w| (mm)", "unstable or undecided"),
+        (1e-3, [0, 0, 0], "largest |w| / clearance", ["stable"]),
+        (1e-3, [0, 2, 0], "largest |w| / clearance", ["stable", "unstable"]),
+        (0.0, [0, 2, -1], "largest |w| (mm)", ["stable", "unstable", "undecided"]),
+        (0.0, [-1, -1, 0], "largest |w| (mm)", ["stable", "undecided"]),
     ],
 )
-def test_the_panel_of_displacements_is_named_by_them(clearance, unstable, axis, dashes):
-    """The axis is that of the displacement, and the dashed line has a name, whichever states are stable."""
+def test_the_panel_of_displacements_is_named_by_them(clearance, unstable, axis, legend):
+    """The axis is that of the displacement, and the legend names the states that the curve has."""
     branch = branch_of(amplitude=[0.5, 0.9, 1.2], unstable=unstable, kind=[0, 0, 0])
     branch["largest"] = (("point", "site"), [[5e-4], [9e-4], [1.1e-3]])
     branch["clearance"] = ("site", [clearance])
@@ -174,8 +178,66 @@ def test_the_panel_of_displacements_is_named_by_them(clearance, unstable, axis, 
     axes = Figure().subplots()
     nfrc._draw_displacement(axes, branch)
     assert axes.get_ylabel() == axis
-    dashed = [line.get_label() for line in axes.lines if line.get_linestyle() == "--"]
-    assert dashed == [dashes] * (dashes is not None)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["sweep up", "sweep down", *legend]
+    dashed = [line for line in axes.lines if line.get_linestyle() == "--"]
+    assert len(dashed) == any(unstable)
+    assert crosses_of(axes) == [i for i in range(3) if unstable[i] < 0]
+
+
+def crosses_of(axes: Axes) -> list[float]:
+    """Return amplitudes 0.5, 0.9 and 1.2 at which a panel has crosses, as 0, 1 and 2."""
+    crossed = [line.get_xdata() for line in axes.lines if line.get_marker() == "x"]
+    return np.searchsorted([0.5, 0.9, 1.2], np.concatenate([[], *crossed])).tolist()
+
+
+@pytest.mark.parametrize("unstable", [[0, 0, 0], [0, 2, 0], [0, -1, 2], [-1, 0, -1], [-1, -1, -1]])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        nfrc._draw_phase,
+        nfrc._draw_energies,
+        partial(response_outputs._draw_amplitude, quantity="displacement"),
+        response_outputs._draw_lag,
+        response_outputs._draw_forces,
+        lambda axes, branch: response_family._draw_curve(axes, branch, np.arange(3.0), "curve", "black"),
+    ],
+    ids=["phase", "energies", "amplitude", "lag", "forces", "family"],
+)
+def test_undecided_states_look_the_same_in_all_panels_of_responses(draw, unstable):
+    """Every panel has a broad line at stable states, a thin one through all, and crosses at the undecided ones."""
+    branch = branch_of(amplitude=[0.5, 0.9, 1.2], unstable=unstable, kind=[0, 0, 0])
+    branch["harmonics"] = (("point", "site", "harmonic"), np.ones((3, 1, 2)))
+    branch["harmonics_imaginary"] = branch["harmonics"]
+    branch["share"] = (("point", "way"), [[0.6], [0.5], [0.4]])
+    for name in ("lag", "peak_displacement", "first_displacement"):
+        branch[name] = (("point", "location"), [[1.0], [2.0], [3.0]])
+    branch["largest_force"] = (("point", "site"), [[1.0], [2.0], [3.0]])
+    branch = branch.assign_coords(site=[1], way=["lost"], location=["mass"])
+    branch.attrs["over"] = "amplitude"
+
+    axes = Figure().subplots()
+    draw(axes, branch)
+    assert crosses_of(axes) == [i for i in range(3) if unstable[i] < 0]
+    (broad,) = [line for line in axes.lines if line.get_linewidth() > 1 and line.get_marker() == "None"]
+    assert np.isfinite(broad.get_ydata()).tolist() == [count == 0 for count in unstable]
+    thin = [line for line in axes.lines if line.get_linewidth() <= 0.6 and line.get_alpha() is None]
+    assert np.isfinite(thin[0].get_ydata()).all()
+    if axes.get_legend():
+        names = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert names.count("undecided") == (min(unstable) < 0)
+
+
+def test_crosses_of_many_states_keep_apart_and_that_of_one_state_is_drawn():
+    """Of a hundred states side by side few have crosses, at equal distances; a state alone has one."""
+    unstable = np.full(103, -1)
+    unstable[[0, 101]] = 0
+    axes = Figure(figsize=(3.0, 3.0)).subplots()
+    draw_states(axes, np.arange(103.0), np.arange(103.0), unstable, StabilityLook("black"))
+    along, alone = [line for line in axes.lines if line.get_marker() == "x"]
+    assert along.get_xdata().tolist() == list(range(1, 101))
+    assert along.get_markevery() == SPACING
+    assert alone.get_xdata().tolist() == [102]
+    assert alone.get_markevery() is None
 
 
 def test_fractions_that_are_rounding_have_no_panel():

@@ -17,6 +17,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.figures.optimum import compared_curves, convergence
+from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
@@ -167,11 +168,29 @@ def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
     _, folder, _ = searched
     with open_netcdf(folder / "optimum.h5", "search") as file:
         optimum = file.load()
-    (responses,) = compared_curves(optimum).axes
+    with rc_style():
+        (responses,) = compared_curves(optimum).axes
     assert responses.get_ylabel() == "peak_displacement/mass (m)"
     assert [text.get_text() for text in responses.get_legend().get_texts()] == ["case", "best"]
+    assert responses.get_title(loc="left") == "(a) Responses (thin: unstable)"
     (objective,) = convergence(optimum).axes
     assert objective.get_ylabel() == "peak_displacement/mass"
+
+
+def test_undecided_states_have_crosses_in_the_picture_of_responses(searched):
+    _, folder, _ = searched
+    with open_netcdf(folder / "optimum.h5", "search") as file:
+        optimum = file.load()
+    # One state of the case's curve, two of that of the best design.
+    of_line = optimum["response/of"].values
+    undecided = [*np.flatnonzero(of_line == 0)[3:4], *np.flatnonzero(of_line == 1)[5:7]]
+    optimum["response/unstable"].values[undecided] = -1
+    with rc_style():
+        (responses,) = compared_curves(optimum).axes
+    crosses = [line for line in responses.lines if line.get_marker() == "x"]
+    drawn = np.concatenate([line.get_xdata() for line in crosses])
+    assert drawn.tolist() == optimum["response/parameter"].values[undecided].tolist()
+    assert responses.get_title(loc="left") == "(a) Responses (thin: unstable; x: undecided)"
 
 
 @pytest.mark.slow

@@ -17,6 +17,8 @@ from vipetsc.case import CaseError
 from vipetsc.case.case_file import put
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.figures import response_family
+from vipetsc.figures.nfrc import responses_in
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.figures.sweep_members import Files
@@ -70,6 +72,19 @@ def test_files_and_legends_name_the_keys(family):
     assert legend[0] == "contacts.clearance 0.7 m, lattice.cell.masses[1] 1 kg"
     assert len(set(legend)) == 4
     assert unit_of("lattice.cell.springs[1].stiffness", {}) == "N/m"
+
+
+@pytest.mark.parametrize(("unstable", "last"), [(2, []), (-1, ["undecided"])])
+def test_the_legend_of_a_family_names_undecided_states_behind_the_curves(family, monkeypatch, unstable, last):
+    folder, _ = family
+    paths = sorted(folder.glob("branch-*.h5"))
+    curves = responses_in(paths)
+    for curve in curves[1:3]:
+        curve["unstable"][1] = unstable
+    monkeypatch.setattr(response_family, "responses_in", lambda paths: curves)
+    figure = response_family.response_family(paths)
+    (legend,) = figure.subfigs[1].legends
+    assert [text.get_text() for text in legend.get_texts()] == [*legend_of(curves), *last]
 
 
 def test_curves_that_differ_by_what_is_fixed_have_it_in_the_legend():

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
+from vipetsc.figures.stability import StabilityLook, draw_states, draw_undecided
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.wording import with_unit
 
@@ -142,10 +143,12 @@ def lag_of(branch: xr.Dataset) -> np.ndarray:
 def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the largest motion of the first site, and in thin lines that of the others, over the parameter.
 
-    Stable states are a line, unstable ones dashes; broad pale lines show where slow sweeps up and down went.
+    Stable states are a line, unstable ones dashes, undecided ones dashes with crosses; broad pale lines show where slow
+    sweeps up and down went.
     """
     parameter = parameter_of(branch)
-    stable = branch["unstable"].values == 0
+    unstable = branch["unstable"].values
+    stable = unstable == 0
     largest = largest_motions(branch)
     clearance = branch["clearance"].values
     # Springs and contacts that touch at rest have no clearance to compare with, and along a curve over another key the
@@ -184,10 +187,11 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         after = np.insert(~stable[:-1], 0, False)
         before = np.append(~stable[1:], False)
         dashed = np.where(~stable | before | after, size, np.nan)
-        dashed_label = "unstable"
-        if np.any(branch["unstable"].values < 0):
-            dashed_label = "unstable or undecided"
+        dashed_label = None
+        if np.any(unstable > 0):
+            dashed_label = "unstable"
         axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label=dashed_label)
+    draw_undecided(axes, parameter, size, unstable, style.BLACK)
 
     draw_special(axes, branch, size, labelled=True)
     axes.set_ylabel(motion_label)
@@ -207,28 +211,24 @@ def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: b
 
 
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw the phase of the first site's fundamental behind the drive; unstable states thin."""
-    parameter = parameter_of(branch)
-    stable = branch["unstable"].values == 0
-    lag = lag_of(branch)
-
-    axes.plot(parameter, lag, color=style.BLACK, lw=0.6, ls="--")
-    axes.plot(parameter, np.where(stable, lag, np.nan), color=style.BLACK, lw=1.3)
+    """Draw the phase of the first site's fundamental behind the drive."""
+    look = StabilityLook(style.BLACK, thin=0.6)
+    draw_states(axes, parameter_of(branch), lag_of(branch), branch["unstable"].values, look)
     axes.set_ylabel("phase lag (degrees)")
     panels.mark_degrees(axes)
 
 
 def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw T, R, U and L over the parameter; unstable states thin."""
+    """Draw T, R, U and L over the parameter."""
     parameter = parameter_of(branch)
-    stable = branch["unstable"].values == 0
+    unstable = branch["unstable"].values
     for i, name in enumerate(branch["way"].values.astype(str)):
         label, colour, line = ENERGIES[name]
         fraction = branch["share"].values[:, i]
         # No wave leaves a finite lattice: of its fractions only the losses are finite.
         if np.isfinite(fraction).any():
-            axes.plot(parameter, fraction, color=colour, lw=0.5, ls=line)
-            axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, ls=line, label=label)
+            look = StabilityLook(colour, broad=1.4, thin_dashes=line, broad_dashes=line)
+            draw_states(axes, parameter, fraction, unstable, look, label)
 
     axes.set(ylabel="fraction of the energy", ylim=(-0.02, 1.04))
     if axes.get_legend_handles_labels()[0]:

@@ -11,6 +11,7 @@ from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.figures import panels, style
+from vipetsc.figures.stability import StabilityLook, draw_states
 from vipetsc.spectra.measures import row_of
 from vipetsc.wording import with_unit
 
@@ -197,7 +198,7 @@ def compared_curves(optimum: xr.Dataset) -> Figure:
 
 
 def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:
-    """Draw the frequency responses from which objective number ``index`` is taken; unstable states are thin."""
+    """Draw the frequency responses from which objective number ``index`` is taken."""
     objective = plan.options.objective[index]
     of_line = optimum["response/of"].values
     lines = optimum["response/compared"].values
@@ -207,9 +208,9 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
             points = np.flatnonzero(of_line == line)
             parameter = optimum["response/parameter"].values[points]
             value = optimum["response/value"].values[points, index]
-            is_stable = optimum["response/unstable"].values[points] == 0
-            axes.plot(parameter, value, color=COLOURS[design.name], lw=0.4)
-            axes.plot(parameter, np.where(is_stable, value, np.nan), color=COLOURS[design.name], lw=1.2, label=label)
+            unstable = optimum["response/unstable"].values[points]
+            look = StabilityLook(COLOURS[design.name], thin=0.4, broad=1.2, thin_dashes="-")
+            draw_states(axes, parameter, value, unstable, look, label)
             # Of several curves of a design the first one is named.
             label = "_"
 
@@ -224,7 +225,10 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
     if case.nfrc.over == "frequency":
         over += " (rad/s)"
     axes.set_xlabel(over)
-    axes.set_title("Responses (thin: unstable)")
+    title = "Responses (thin: unstable)"
+    if np.any(optimum["response/unstable"].values < 0):
+        title = "Responses (thin: unstable; x: undecided)"
+    axes.set_title(title)
     axes.set_ylabel(with_unit(label, unit))
 
 

@@ -17,6 +17,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, parameter_label, parameter_of, responses_in
+from vipetsc.figures.stability import UNDECIDED, StabilityLook, draw_states
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
 
@@ -54,7 +55,8 @@ def response_family(paths: Sequence[Path]) -> Figure:
 
     names = legend_of(curves)
     height = 1.7 * len(rows) + 0.3
-    legend_height = 0.1 + LEGEND_LINE * min(len(curves), MOST_CURVES)
+    has_undecided = any(np.any(curve["unstable"].values < 0) for curve in curves)
+    legend_height = 0.1 + LEGEND_LINE * (min(len(curves), MOST_CURVES) + has_undecided)
     figure = style.new_figure(1.3 * style.COLUMN, height + legend_height)
     upper, lower = figure.subfigures(2, 1, height_ratios=[height, legend_height])
     column = upper.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
@@ -67,7 +69,9 @@ def response_family(paths: Sequence[Path]) -> Figure:
         panels.mark_degrees(column[-1])
     column[-1].set_xlabel(parameter_label(curves[0]))
     handles, texts = column[0].get_legend_handles_labels()
-    lower.legend(handles[:MOST_CURVES], texts[:MOST_CURVES], loc="center", fontsize=6)
+    of_curves = [handle for handle, text in zip(handles, texts, strict=True) if text != UNDECIDED]
+    crosses = [handle for handle, text in zip(handles, texts, strict=True) if text == UNDECIDED]
+    lower.legend(handles=[*of_curves[:MOST_CURVES], *crosses], loc="center", fontsize=6)
     if len(rows) > 1:
         panels.label_panels(column)
     return figure
@@ -134,14 +138,8 @@ def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:
-    """Draw ``values`` (point,) of a curve: stable states as a broad line, unstable ones thin and dashed.
-
-    Special points are marked.
-    """
-    parameter = parameter_of(curve)
-    stable = curve["unstable"].values == 0
-    axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
-    axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, label=name)
+    """Draw ``values`` (point,) of a curve, with that ``name`` in the legend; special points are marked."""
+    draw_states(axes, parameter_of(curve), values, curve["unstable"].values, StabilityLook(colour), name)
     draw_special(axes, curve, values)
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, responses_in
+from vipetsc.figures.stability import StabilityLook, draw_states
 
 # Labels of the rows of the page by the quantities that they show.
 AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
@@ -84,11 +85,7 @@ def _draw_forces(axes: Axes, curve: xr.Dataset) -> None:
 
 
 def _draw_states(axes: Axes, curve: xr.Dataset, values: np.ndarray, number: int, label: str | None = None) -> None:
-    """Draw ``values`` over the parameter: stable states broad, unstable ones thin; special points are marked."""
-    colour = style.band_colour(number + 1)
-    parameter = parameter_of(curve)
-    stable = curve["unstable"].values == 0
-    axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
-    dash = DASHES[number % len(DASHES)]
-    axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, ls=dash, label=label)
+    """Draw ``values`` over the parameter in the look of curve ``number``; special points are marked."""
+    look = StabilityLook(style.band_colour(number + 1), broad_dashes=DASHES[number % len(DASHES)])
+    draw_states(axes, parameter_of(curve), values, curve["unstable"].values, look, label)
     draw_special(axes, curve, values)
