@@ -342,9 +342,11 @@ def impulse(amplitude: float, duration: float) -> Pieces:
 
 
 def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: float, hold: bool = False) -> Pieces:
-    """``amplitude`` times the cubic spline through ``values`` (sample,) at ``times`` (sample,); 0 before and after.
+    """``amplitude`` times the cubic spline through ``values`` (sample,) at ``times`` (sample,), two or more.
 
-    Times in s begin with 0; ``frequency`` in rad/s is the main one. With ``hold`` it stays at the last sample.
+    ``times`` in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
+    waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps the last sample's value after
+    that, unless this is 0.
     """
     times = np.asarray(times, float)
     values = np.asarray(values, float)
