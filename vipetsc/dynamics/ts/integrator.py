@@ -110,13 +110,13 @@ class Integrator(Engine):
 
     def observe(self, motion: np.ndarray, time: float | None = None) -> None:
         """Fill ``motion`` (sites, 3) with w, w', w'' of the state at ``time`` in s, else at the present; collective."""
-        if self.lattice.shape.exchange:
-            self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         if time is None:
             time = self.time
         if not self.lattice.shape.paired:
+            if self.lattice.shape.exchange:
+                self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
             return observe_at(time, self._components, self._stepper.context_address, motion)
-        self.ts.computeRHSFunction(time, self.state, self.rates)
+        self.ts.computeRHSFunction(time, self.state, self.rates)  # which updates the state's ghosts
         self.rates.ghostUpdate()
         with self.rates.localForm() as rates:
             observe_pairs(self._components, rates.array, self.lattice, motion)
