@@ -84,8 +84,7 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     state = cluster.state[0]
     # Before the switch: an episode that ends takes its extremes along.
     _update_open_episodes(contacts, cluster.history, tracks)
-    # Workspace that every substep fills anew.
-    had_contact = cluster.trial.sums.reaches[0]
+    had_contact = cluster.trial.sums.had_contact
     for i in range(contacts.size):
         had_contact[i] = in_episode(contacts[i].mode)
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)

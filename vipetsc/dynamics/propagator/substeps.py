@@ -61,7 +61,8 @@ class Sums(NamedTuple):
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
     DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (power,) of one DoF's force about the substep's end;
     ``series`` (power, coefficient), whose row k is the polynomial in s that term k of a response makes of them;
-    and ``bernstein`` (2, 6), the coefficients of two quintics for w.
+    ``bernstein`` (2, 6), the coefficients of two quintics for w; and ``had_contact`` (dof,), whether a site was in
+    contact before the sites switched at the substep's end.
     """
 
     free_w: np.ndarray
@@ -75,6 +76,7 @@ class Sums(NamedTuple):
     moments: np.ndarray
     series: np.ndarray
     bernstein: np.ndarray
+    had_contact: np.ndarray
 
 
 class Trial(NamedTuple):
@@ -160,6 +162,7 @@ def create_trial(dofs: int, terms: int) -> Trial:
         moments=np.zeros(2 * terms),
         series=np.zeros((2 * terms, 2 * terms)),
         bernstein=np.zeros((2, 6)),
+        had_contact=np.zeros(dofs, bool),
     )
     return Trial(
         active=np.arange(dofs),
