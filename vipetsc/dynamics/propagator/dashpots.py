@@ -148,11 +148,13 @@ class DashpotRows:
         existing = [cell for cell in velocities if chain.ends == "periodic" or 0 <= cell < chain.cells]
         at = np.array(existing, int) % chain.cells
 
-        # Beyond the reach and a cell more a wall stands: it changes the rows by less than what they leave out.
+        # Beyond the reach and a cell more a wall stands: it changes the rows by less than what they leave out. A cell
+        # that no end is within reach of has the rows of an endless chain: any such cell may be the first of its kind.
         distances = np.arange(-series.reach - 2, series.reach + 3)
         neighbours = at[:, None] + distances
         is_inside = (neighbours >= 0) & (neighbours < chain.cells)
-        exists = (is_inside | (chain.ends == "periodic")) & (np.abs(distances) < series.reach + 2)
+        is_endless = ~series.is_near_end(at)[:, None]
+        exists = (is_inside | is_endless) & (np.abs(distances) < series.reach + 2)
         zeroth = np.zeros((len(at), d, d, len(distances)))
         zeroth[..., series.reach + 2] = np.eye(d)
         recursion = local_recursion(chain, series.interval, at, exists, series.reach + 1, float)

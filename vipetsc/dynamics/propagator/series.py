@@ -193,7 +193,7 @@ class StepSeries:
         for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
             neighbours = batch[:, None] + distances
             is_inside = (neighbours >= 0) & (neighbours < self.chain.cells)
-            exists = is_inside | ~self._is_near_end(batch)[:, None]
+            exists = is_inside | ~self.is_near_end(batch)[:, None]
             # One cell more than the reach: the spring that enters the leftmost cell is stored with the cell before.
             recursion = local_recursion(self.chain, self.interval, batch, exists, self.reach + 1)
             yield from power_rows(np.repeat(self._zeroth, len(batch), axis=0), self.terms, recursion)
@@ -215,7 +215,7 @@ class StepSeries:
             return np.array([h**i / factorial(k) for i in range(2) for k in powers])
         return np.array([h ** (k % 2) / factorial(k) for k in powers])
 
-    def _is_near_end(self, cells: ArrayLike) -> np.ndarray:
+    def is_near_end(self, cells: ArrayLike) -> np.ndarray:
         """Whether an end lies within the reach of each of ``cells``."""
         leftmost = np.asarray(cells) - self.reach
         rightmost = leftmost + 2 * self.reach
@@ -241,7 +241,7 @@ class StepSeries:
         No end of the lattice lies within its reach, and no cell that differs there or one further.
         """
         cells = np.asarray(cells, np.int64)
-        is_far = ~self._is_near_end(cells)
+        is_far = ~self.is_near_end(cells)
         if self.chain.variation is None:
             return is_far
         window = 2 * (self.reach + 1) + 1
@@ -256,7 +256,7 @@ class StepSeries:
         # Rows near an end are like no others; elsewhere equal coefficients near a cell make equal rows.
         near = self.reach + 1
         first: dict[bytes, int] = {}
-        for i in np.flatnonzero(~interior & ~self._is_near_end(cells)):
+        for i in np.flatnonzero(~interior & ~self.is_near_end(cells)):
             coefficients = self.chain.coefficients(cells[i] - near, cells[i] + near + 1)
             key = b"".join(array.tobytes() for array in coefficients)
             cells[i] = first.setdefault(key, int(cells[i]))
