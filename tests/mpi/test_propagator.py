@@ -47,6 +47,13 @@ def test_same_bits_with_dashpots(folder, disorder):
 
 
 @pytest.mark.parallel([2, 3])
+def test_same_bits_with_dashpots_far_from_contacts(folder):
+    """Ranks that no contact and no drive is within reach of take part in a run with dashpots, to the same bits."""
+    lattice = {"cells": 60, "damping": {"mass": 10.0, "stiffness": 5e-6}, "ends": "free"}
+    runs_alike(folder, small_case(lattice=lattice, time={"end": 0.02, "engine": "propagator"}))
+
+
+@pytest.mark.parallel([2, 3])
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
     """A run of another cell, driven near the border of two ranks, has the same bits on any number of ranks."""
     table = {

@@ -95,10 +95,10 @@ def _create_responses(dofs: np.ndarray, model: Model, dashpots: DashpotRows) -> 
     kinds = dashpots.kinds((first[:, None] + np.arange(count)).ravel()).reshape(len(dofs), count)
 
     # Where a dashpot reaches the DoF, its kind says which masses there are.
-    forms = dofs["form"].reshape(len(dofs), -1)
     inverse = np.array([1 / chain.coefficients(cell, cell + span).masses for cell in dofs["cell"].tolist()])
     velocities = dofs["form"] * inverse.reshape(dofs["form"].shape)
-    keys = np.hstack([kinds, velocities.reshape(forms.shape)])
+    # The number of columns is given: a rank far from contacts and drives has no rows, from which it could be found.
+    keys = np.hstack([kinds, velocities.reshape(len(dofs), span * chain.cell.dofs)])
     _, examples, table = np.unique(keys, axis=0, return_index=True, return_inverse=True)
 
     # On a short ring a dashpot is reached from both sides: it is one.
