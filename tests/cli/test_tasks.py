@@ -333,10 +333,12 @@ def test_a_frequency_response(typed, put, tmp_path):
     }
     for rows in curves.values():
         amplitude = np.array([float(row["amplitude"]) for row in rows])
+        largest = np.array([float(row["largest/100 (m)"]) for row in rows])
         touching = np.array([float(row["episodes"]) for row in rows]) > 0
         # Waves of a smaller amplitude than the clearance need not touch; the curve folds where contact begins.
         assert not touching[0]
         assert amplitude[~touching].max() == pytest.approx(1.0, abs=0.01)
+        assert largest[~touching].max() == pytest.approx(1.8e-3, rel=0.01)
         assert amplitude[touching].min() < 0.98
     assert curves["1"] != curves["0.7"]
 
