@@ -1,14 +1,15 @@
 """Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.drive import first_built
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.case.measured import Measured
+from vipetsc.case.measured import Measured, SensorTable
 from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.identification.coefficient_slopes import CoefficientSlopes, ParameterSlope, values_at
 from vipetsc.identification.initial_state import WIDTH, InitialState, initial_state, state_of
@@ -46,6 +47,18 @@ Job = Callable[[], np.ndarray]
 def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
     """The values of all ``jobs``, arrays (...) each, which this rank computes alone."""
     return [job() for job in jobs]
+
+
+class SensorSignal(NamedTuple):
+    """What a sensor of the model reads: ``values`` (sample,) in SI units, ``rate`` (sample,) their change in a second.
+
+    ``slopes`` are derivatives (sample,) by the number of the coordinate; those that are not there are 0, but for
+    offsets, whose derivatives follow from the rate.
+    """
+
+    values: np.ndarray
+    rate: np.ndarray
+    slopes: Mapping[int, np.ndarray]
 
 
 class Misfit:
@@ -230,40 +243,59 @@ class Misfit:
         MotionError.
         """
         if active:
-            response = self.respond(z, number, end, active, tolerances=tolerances)
+            motion = self.respond(z, number, end, active, tolerances=tolerances).motion
         else:
-            response = self.motion(z, number, end, tolerances)
-        table = self.plan.options.records[number]
-        motion = response.motion
-        inner, estimated = self.columns(number, active)
-        column_of = {p: 1 + column for column, p in enumerate(inner + estimated)}
+            motion = self.motion(z, number, end, tolerances).motion
 
         values = np.zeros(motion.shape[:2])
         slopes = np.zeros((*values.shape, len(active)))
-        for k, sensor in enumerate(table.sensors):
+        for k, sensor in enumerate(self.plan.options.records[number].sensors):
             if sensor.quantity == "force":
-                values[:, k], rate = self._force(z, number, end, (sensor.drive or 1) - 1)
+                signal = self._force_signal(z, number, end, sensor, active)
             else:
-                row = ROWS[sensor.quantity]
-                values[:, k] = motion[:, k, row, 0]
-                rate = motion[:, k, row + 1, 0]
-
-            # The amplitude that is sought is the first drive's, unless the record has one of its own. No other
-            # parameter changes a drive's force, which is proportional to its amplitude.
-            is_of_amplitude = sensor.drive in (None, 1) and "amplitude" not in table.drive
+                signal = self._motion_signal(motion[:, k], number, sensor, active)
+            values[:, k] = signal.values
             for column, p in enumerate(active):
                 if self._is_of(p, "offset"):
-                    # A later beginning of the drive shifts the whole motion to later times.
-                    parameter = self.plan.parameters[p]
-                    is_own = parameter.members == (number,)
-                    slopes[:, k, column] = -rate * parameter.slope(z[p]) * is_own
-                elif sensor.quantity != "force":
-                    if p in column_of:
-                        slopes[:, k, column] = motion[:, k, ROWS[sensor.quantity], column_of[p]]
-                elif self._is_of(p, "amplitude") and is_of_amplitude:
-                    parameter = self.plan.parameters[p]
-                    slopes[:, k, column] = values[:, k] / parameter.from_coordinate(z[p]) * parameter.slope(z[p])
+                    slopes[:, k, column] = self._offset_slope(z, number, p, signal.rate)
+                elif p in signal.slopes:
+                    slopes[:, k, column] = signal.slopes[p]
         return values, slopes
+
+    def _motion_signal(
+        self, motion: np.ndarray, number: int, sensor: SensorTable, active: Sequence[int]
+    ) -> SensorSignal:
+        """What a ``sensor`` of motion reads; ``motion`` (sample, row, 1 + column) is that of its mass."""
+        row = ROWS[sensor.quantity]
+        inner, estimated = self.columns(number, active)
+        # Column 0 is the motion itself, the others are its derivatives.
+        slopes = {p: motion[:, row, 1 + column] for column, p in enumerate(inner + estimated)}
+        return SensorSignal(values=motion[:, row, 0], rate=motion[:, row + 1, 0], slopes=slopes)
+
+    def _force_signal(
+        self, z: np.ndarray, number: int, end: float, sensor: SensorTable, active: Sequence[int]
+    ) -> SensorSignal:
+        """What a ``sensor`` of a drive's force reads, at ``z`` (coordinate,), up to the record's time ``end`` in s."""
+        force, rate = self._force(z, number, end, (sensor.drive or 1) - 1)
+
+        # The amplitude that is sought is the first drive's, unless the record has one of its own. No other parameter
+        # changes a drive's force, which is proportional to its amplitude.
+        slopes = {}
+        if sensor.drive in (None, 1) and "amplitude" not in self.plan.options.records[number].drive:
+            for p in active:
+                if self._is_of(p, "amplitude"):
+                    parameter = self.plan.parameters[p]
+                    slopes[p] = force / parameter.from_coordinate(z[p]) * parameter.slope(z[p])
+        return SensorSignal(values=force, rate=rate, slopes=slopes)
+
+    def _offset_slope(self, z: np.ndarray, number: int, p: int, rate: np.ndarray) -> np.ndarray:
+        """Derivative (sample,) of a signal with this ``rate`` (sample,) by coordinate ``p``, which is an offset.
+
+        A later beginning of the drive shifts the whole motion of record ``number`` to later times.
+        """
+        parameter = self.plan.parameters[p]
+        is_own = parameter.members == (number,)
+        return np.asarray(-rate * parameter.slope(z[p]) * is_own)
 
     def _is_of(self, p: int, quantity: str) -> bool:
         """Whether coordinate ``p`` is that of a parameter of this ``quantity``."""
