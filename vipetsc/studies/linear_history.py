@@ -1,7 +1,8 @@
 """Histories of linear runs, from which the members of a sweep begin that differ in amplitude and contacts alone.
 
 Whether members begin so depends on the sweep's case, not on which members are missing nor on the number of ranks: a
-member has the same bits in every sweep that has it, after an interruption, and where it is repeated alone.
+member has the same bits in every call of the sweep, after an interruption, and where it is repeated alone. In a sweep
+with fewer than ``FEWEST_MEMBERS`` of its linear run it begins by itself, and its run differs by rounding.
 """
 
 from functools import cached_property
