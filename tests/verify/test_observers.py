@@ -217,6 +217,6 @@ def test_a_run_killed_at_its_end_keeps_its_statistics(folder, monkeypatch):
     monkeypatch.undo()
     resumed = simulate(case, folder / "killed", resume=True)
 
-    for name in ("samples", "end", "work", "dissipated", "ledger_error", "episodes"):
+    for name in ("samples", "end", "work", "dissipated", "ledger_error", "episodes", "deepest_indentation"):
         assert resumed.statistics[name] == straight.statistics[name], name
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "killed" / "run.h5"))
