@@ -8,6 +8,7 @@ import xarray as xr
 
 from vipetsc.io.netcdf import Variables, variable
 
+# The median, the quartiles, and at both ends those between which nine of ten samples lie: figures shade this band.
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
