@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.conftest import assert_same_bits, datasets, with_sections
+from tests.conftest import assert_same_bits, datasets, small_case, with_sections
 from vipetsc import spectra
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
@@ -157,6 +157,16 @@ def test_members_begin_from_a_linear_run_that_several_have_in_common(sweep, sect
     """Members begin linearly if at least three of them differ only in what leaves the linear run as it is."""
     plan = Sweep.from_table(with_sections(TABLE, sections) | {"sweep": sweep})
     assert begins_linearly(plan, plan.case(0)) == begins
+
+
+def test_the_bytes_of_a_history_are_those_of_its_fields():
+    """What is counted against the limit of memory is the size of the displacements and velocities of a run."""
+    case = small_case(time={"end": 0.002})
+    memory = RunMemory()
+    simulate(case, memory)
+    run = memory.dataset
+    assert history_bytes(case) == run["displacement"].nbytes + run["velocity"].nbytes
+    assert history_bytes(case, fields=1) == run["velocity"].nbytes
 
 
 @pytest.mark.parametrize(("room", "simulated"), [(3, 3), (2, 6)])
