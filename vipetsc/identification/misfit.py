@@ -30,6 +30,7 @@ from vipetsc.identification.precision import EXACT, Tolerances
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 # Residual of a motion that cannot be computed, in units of the noise: a step that leads there is rejected. It is at
 # least so many times the size of the data, which motions that can be computed do not reach however small the noise is.
+# Of the two the second is the larger one where the noise is below 1e-5 of the data.
 REJECTED = 1e8
 REJECTED_SIZE = 1e3
 # Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not

@@ -14,7 +14,8 @@ from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.uncertainty import Uncertainty, errors_with_sensor
 
-# Masses at most, evenly over the lattice, at which a sensor is tried.
+# Masses at most, evenly over the lattice, at which a sensor is tried. With so many the motion of a thousand samples and
+# its derivatives by ten parameters are just below ``MOST_NUMBERS``; with more of them samples would be left out.
 MOST_CANDIDATES = 400
 # Numbers of the motion of these masses and its derivatives that are kept in memory, at most: 160 MB.
 MOST_NUMBERS = 20_000_000

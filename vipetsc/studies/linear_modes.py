@@ -25,7 +25,9 @@ from vipetsc.lattice import Band, Chain, wave_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
 
-END = 0.1  # part of the cells that counts as one end
+# Part of the cells that counts as one end. A mode has its place there if it has half of its energy at the ends, where
+# one that is spread evenly has a fifth.
+END = 0.1
 TIE = 1e-9  # two numbers whose relative difference is smaller may be equal but for rounding
 LAYOUT = {
     "mode": ("mode", "1", "mode, lowest first"),
