@@ -20,7 +20,7 @@ from vipetsc.modes.continuation.special import locate
 from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 
-# Seconds between two writings of a growing branch.
+# Seconds between two writings of a growing branch: what a kill may lose.
 SAVE_EVERY = 10.0
 
 Listener = Callable[[Branch[Any], Any], None]

@@ -33,7 +33,8 @@ from vipetsc.parallel import StopRequest
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
-# Energy in J of the first point where the mode touches no contact, and its fraction of the energy that touches.
+# Energy in J of the first point where the mode touches no contact, and what divides the energy at which it touches.
+# Below that the motion of linear springs is linear: the numbers decide where a branch begins, not its course.
 ANY_ENERGY = 1e-3
 BELOW_TOUCH = 100
 # How far above the lowest energy asked for a branch begins at least.

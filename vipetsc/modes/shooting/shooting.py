@@ -24,7 +24,8 @@ LEAST_CROSSING = 1e-6
 # If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
 # and the tangent is not unique.
 DEGENERATE = 1e-12
-# Samples of an arc in which contacts that graze are looked for (``grazing.TOUCH``).
+# Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
+# than ``grazing.TOUCH``.
 SAMPLES = 2000
 
 
