@@ -71,8 +71,12 @@ class Growth:
         continuation = Continuation(problem, start, rule, direction, step=branch.next_step or None, points_before=done)
         monitor = self.method.monitor(problem)
         # The monitor compares each point with all earlier ones, to see whether the branch retraces itself or returns to
-        # the linear mode. A resumed branch must be judged as one that was not interrupted.
-        for point in regular:
+        # the linear mode. A resumed branch must be judged as one that was not interrupted: that one began without
+        # points, so that its monitor has not seen the start. Of a branch in two parts the start is not the first point.
+        earlier = regular
+        if regular and regular[0].index == 0:
+            earlier = regular[1:]
+        for point in earlier:
             monitor(point)
         if not branch.points:
             branch.points = [self.method.assess(problem, continuation.point)]

@@ -1,0 +1,60 @@
+"""Branches that go on after a stop or a failure: they end as others do, with the same findings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.case import NnmCase
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.growth import Listener
+from vipetsc.parallel import StopRequest
+
+# A step along a branch of these two masses, one on a cubic spring, takes milliseconds.
+TWO_MASSES = {
+    "masses": [1.0, 1.0],
+    "springs": [
+        {"start": 0, "end": 1, "stiffness": 1.0},
+        {"start": 1, "end": 2, "stiffness": 1.0},
+        {"start": 0, "end": 2, "stiffness": 1.0},
+    ],
+    "smooth": [{"start": 0, "end": 1, "cubic": 0.5}],
+}
+
+
+def follow(folder: Path, listener: Listener | None = None, stop: StopRequest | None = None, **nnm: Any) -> Branch[Any]:
+    """The out-of-phase branch of the two masses in ``folder``, begun or continued; ``nnm`` updates its table [nnm]."""
+    folder.mkdir(exist_ok=True)
+    nnm = {"modes": [2], "start_energy": 1.0, "energy": [0.5, 20.0], "first_step": 0.05} | nnm
+    case = NnmCase.from_table({"name": "x", "nnm": {"system": "own", "own": TWO_MASSES} | nnm})
+    (branch,) = follow_all(case, folder, MPI.COMM_SELF, resume=True, listener=listener, stop=stop)
+    return branch
+
+
+def stopped_at(folder: Path, index: int, **nnm: Any) -> Branch[Any]:
+    """The branch that was stopped at its point ``index``."""
+    stop = StopRequest()
+
+    def listener(branch: Branch[Any], point: Any) -> None:
+        stop.requested = point.index == index
+
+    branch = follow(folder, listener, stop, **nnm)
+    assert branch.ending == f"stopped on request after point {index}; continue with --resume"
+    return branch
+
+
+def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
+    """A branch whose check compares its latest six points ends where one does that was not stopped at its third."""
+    # Any six points are one point by this measure.
+    nnm = {"guards": {"standstill": 6, "advance": 100.0}}
+    whole = follow(tmp_path / "whole", **nnm)
+    assert whole.points[-1].index == 7
+
+    stopped_at(tmp_path / "parts", 3, **nnm)
+    resumed = follow(tmp_path / "parts", **nnm)
+
+    assert (resumed.ending, resumed.findings) == (whole.ending, whole.findings)
+    assert len(resumed.points) == len(whole.points)
