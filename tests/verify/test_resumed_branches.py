@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
+import pytest
+
 from vipetsc.case import NnmCase
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.growth import Listener
+from vipetsc.modes.branches.orbits import ShootingMethod
+from vipetsc.modes.problem import FlowError
 from vipetsc.parallel import StopRequest
 
 # A step along a branch of these two masses, one on a cubic spring, takes milliseconds.
@@ -46,6 +52,11 @@ def stopped_at(folder: Path, index: int, **nnm: Any) -> Branch[Any]:
     return branch
 
 
+def file_of(folder: Path) -> Branch[Any]:
+    """The branch in the file of ``folder``."""
+    return read_branch(folder / "branch-out-of-phase.h5")
+
+
 def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
     """A branch whose check compares its latest six points ends where one does that was not stopped at its third."""
     # Any six points are one point by this measure.
@@ -58,3 +69,59 @@ def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
 
     assert (resumed.ending, resumed.findings) == (whole.ending, whole.findings)
     assert len(resumed.points) == len(whole.points)
+
+
+def test_a_branch_that_goes_on_has_the_orbits_that_it_lacked(tmp_path):
+    """A branch of few points, continued, says of each energy once that it is missing, and only of those that are."""
+    nnm = {"orbits_at": [10.0, 100.0], "locate": False}
+    first = follow(tmp_path, points=3, **nnm)
+    assert first.findings == ["the branch has no orbit of 10 J", "the branch has no orbit of 100 J"]
+
+    follow(tmp_path, **nnm)
+
+    assert file_of(tmp_path).findings == ["the branch has no orbit of 100 J"]
+
+
+@pytest.fixture
+def marked(monkeypatch):
+    """Each step has a special point that is not located, and the step from point 1 to point 2 is a jump."""
+
+    def locate(problem, left, right, missed, **options):
+        missed.append(f"a special point after {left.describe()}")
+        return []
+
+    def jumps(self, problem, points):
+        for left, right in pairwise(points):
+            if {left.index, right.index} == {1, 2}:
+                yield f"jump between {left.describe()} and {right.describe()}"
+
+    monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
+    monkeypatch.setattr(ShootingMethod, "jumps", jumps)
+
+
+def test_findings_of_a_stopped_branch_have_the_order_of_one_that_was_not(tmp_path, marked):
+    """Jumps found before a stop stand behind what is found after it, as without the stop."""
+    whole = follow(tmp_path / "whole")
+    assert "jump" in whole.findings[-1]
+
+    stopped_at(tmp_path / "parts", 4)
+    follow(tmp_path / "parts")
+
+    assert file_of(tmp_path / "parts").findings == whole.findings
+
+
+def test_findings_below_the_start_stay_before_those_above_it(tmp_path, marked):
+    """A part below the start that failed and goes on has its findings where they are without the failure."""
+    both = {"direction": "both", "energy": [0.2, 20.0]}
+    whole = follow(tmp_path / "whole", **both)
+
+    def fail_below(branch: Branch[Any], point: Any) -> None:
+        if branch.name.endswith("-down") and point.index == 3:
+            raise FlowError("the flow ends there")
+
+    failed = follow(tmp_path / "parts", fail_below, **both)
+    assert failed.ending == "failed: below the start: the flow ends there"
+    resumed = follow(tmp_path / "parts", **both)
+
+    assert resumed.complete
+    assert file_of(tmp_path / "parts").findings == whole.findings

@@ -236,10 +236,13 @@ class Follower:
         # There are files of the part only if a command was killed before it could remove them. They have all points of
         # the part that the branch has, or more.
         below = self._stored_or_new(_name_below(branch))
+        # The findings of the part below come first, and the failure is the last of them (``_put_below``).
+        end = branch.findings.index(before.finding)
         if not below.points:
             below.points = [_reversed(p) for p in reversed(branch.points[: first + 1])]
             below.next_step = before.next_step
-        branch.findings = [finding for finding in branch.findings if finding != before.finding]
+            below.findings = branch.findings[:end]
+        branch.findings = branch.findings[end + 1 :]
         try:
             after = self._grow_below(below, problem, below.points[0], points_above)
         except StoppedError:
@@ -341,10 +344,11 @@ def _put_below(branch: Branch[Any], below: Branch[Any], above: list[Any]) -> Non
     """Give a ``branch`` the points and findings of the part ``below`` its start, and then the points ``above`` it.
 
     The start is the first point of the part below, which was followed away from it. In the file's order, from the far
-    end on, its tangents are reversed.
+    end on, its tangents are reversed. Findings of the part below, the last of which is its failure, come before those
+    that the branch has.
     """
     branch.points = [_reversed(p) for p in reversed(below.points)] + above
-    new_findings = list(below.findings)
+    of_below = list(below.findings)
     if branch.failure_below is not None:
-        new_findings.append(branch.failure_below.finding)
-    branch.findings += [finding for finding in new_findings if finding not in branch.findings]
+        of_below.append(branch.failure_below.finding)
+    branch.findings = of_below + branch.findings

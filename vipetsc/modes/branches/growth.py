@@ -85,9 +85,10 @@ class Growth:
             why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
         finally:
             # Jumps are pairs of neighbouring points so different that the continuation may have changed to another
-            # branch. They are recorded also if the branch fails or is stopped. When it is resumed they are found again.
-            jumps = self.method.jumps(problem, branch.regular())
-            branch.findings += [jump for jump in jumps if jump not in branch.findings]
+            # branch. They are recorded also if the branch fails or is stopped. When it is resumed they are found again,
+            # and stay behind the other findings, as in a branch that was not interrupted.
+            jumps = list(self.method.jumps(problem, branch.regular()))
+            branch.findings = [finding for finding in branch.findings if finding not in jumps] + jumps
         branch.ending = why_ended or continuation.ending
         branch.complete = why_ended is not None or continuation.finished
 

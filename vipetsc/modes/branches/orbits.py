@@ -39,6 +39,9 @@ ANY_ENERGY = 1e-3
 BELOW_TOUCH = 100
 # How far above the lowest energy asked for a branch begins at least.
 ABOVE_LOWEST = 1.001
+# Beginnings of the findings about orbits that were asked for.
+NOT_PASSED = "the branch has no orbit of"
+NOT_FOUND = "the orbit of"
 
 
 class NnmMethod(Method[Point]):
@@ -68,7 +71,12 @@ class NnmMethod(Method[Point]):
         return self.options.direction == "both"
 
     def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
-        """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one."""
+        """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one.
+
+        Findings of the ``branch`` say which are missing.
+        """
+        # A branch that was stopped or had used up its points has such findings already, which may no longer be true.
+        branch.findings = [finding for finding in branch.findings if not finding.startswith((NOT_PASSED, NOT_FOUND))]
         for energy in self.options.orbits_at:
             passed = False
             for left, right in itertools.pairwise(branch.regular()):
@@ -79,9 +87,9 @@ class NnmMethod(Method[Point]):
                     yield at_energy(problem, left, right, energy, self.options.chart)
                 # The branch itself is complete; what it lacks stands in its file as a finding.
                 except ArithmeticError as error:
-                    branch.findings.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
+                    branch.findings.append(f"{NOT_FOUND} {energy:g} J after point {left.index} is not found: {error}")
             if not passed:
-                branch.findings.append(f"the branch has no orbit of {energy:g} J")
+                branch.findings.append(f"{NOT_PASSED} {energy:g} J")
 
 
 def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:
