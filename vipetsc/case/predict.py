@@ -13,7 +13,8 @@ from vipetsc.case.warnings import end_warnings, length_warnings, wave_warnings
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice.packet import narrow_fraction
 
-MOST = 10_000  # amplitudes
+# Amplitudes. By default each is simulated, too: with 0.3 s for a run, as of the built-in case, so many take an hour.
+MOST = 10_000
 # A scattering law has one frequency. Of a pulse that is no burst, at least the fraction NARROW of the energy must be in
 # one band and within the fraction WIDTH of its main frequency. Predictions for such Gaussian pulses and chirps differ
 # from runs by .044 to .122 decades (rms), and those for a burst by .056.

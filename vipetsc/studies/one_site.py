@@ -53,7 +53,9 @@ from vipetsc.studies.scattering_law import BACKWARD, DAMPED, FORWARD, LAYOUT, NE
 from vipetsc.studies.site_waves import SiteWaves
 
 LINEAR = 0.0  # the z of the run without a site
-STEP = np.sqrt(2.0)  # ratio of neighbouring points to begin with: two an octave
+# Ratio of neighbouring points to begin with: two an octave. What is added between them decides: with ratios of 2 and 4
+# a law up to z = 16 has 35 and 33 points in place of 39, and the same errors; with 2^(1/4) 79, and half the errors.
+STEP = np.sqrt(2.0)
 REFINED = ("transmitted", "reflected", "upper", "dissipated")  # what is to lie near the line between two points
 
 

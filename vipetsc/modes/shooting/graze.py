@@ -20,7 +20,8 @@ from vipetsc.modes.shooting.flow import Arc
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.orbit import ShotOrbits
 
-# Newton steps at most. Where they are not enough, the caller brackets the touch instead.
+# Newton steps at most; on the branches of the paper's model and of three cells touches take three. Where they are not
+# enough, the caller brackets the touch instead.
 MOST_STEPS = 10
 # A longer Newton step, in unknowns of order one, counts as divergence.
 FURTHEST = 0.5
