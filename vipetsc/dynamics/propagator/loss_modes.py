@@ -14,7 +14,8 @@ from numpy.polynomial.legendre import legvander
 
 from vipetsc.dynamics.propagator.nodes import gauss
 
-# Coefficients below this fraction of the largest loss are left out.
+# Coefficients below this fraction of the largest loss are left out. With 1e-9 the error of the energy balance of the
+# example ``damped`` is 4e-13 of the work in place of 3e-13, with 1e-15 it is the same.
 SMALLEST_MODE = 1e-13
 
 
