@@ -104,6 +104,13 @@ def test_ranks_without_cells_take_part(folder, writer):
     runs_alike(folder, case)
 
 
+@pytest.mark.parallel(3)
+def test_ranks_without_cells_have_no_dashpots(folder):
+    """A damped lattice of fewer cells than ranks, with dashpots to its walls, has the bits of one rank."""
+    lattice = {"cells": 2, "damping": {"mass": 10.0, "stiffness": 1e-6}}
+    runs_alike(folder, small_case(lattice=lattice, contacts={"sites": [1, 2], "clearance": 5e-5}, time={"end": 0.02}))
+
+
 @needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_parallel_writing_gives_the_gathered_file(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -16,6 +17,7 @@ from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, FREE
 from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.springs import damping_powers
 from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs, register
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
 from vipetsc.lattice.chain import Pair
@@ -287,6 +289,23 @@ def test_a_rank_writes_only_to_what_it_owns():
     expected[(d + 1) * n + SITES[1] + 1] += forces[1] / CELL.masses[1]
     expected[layout.dissipated + 3] = np.nan
     np.testing.assert_allclose(rates, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_a_rank_without_cells_writes_no_power_of_dashpots(ends):
+    """Of more ranks than cells the last has no first and no last cell, and so no dashpots to walls."""
+    model = lattice(ends)
+    last = SimpleNamespace(rank=CELLS, size=CELLS + 1)
+    layout = Layout(model, last, dashpots=True)
+    record = create_record(model, layout)
+    assert layout.owned == 0
+    assert record.damping.any()
+
+    # Empty views, whose surroundings show what is read and written beyond them.
+    motion = np.ones(3)
+    powers = np.zeros(3)
+    damping_powers(motion[1:1], record, powers[1:1])
+    assert powers.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_an_engine_that_keeps_no_ledger_of_dashpots_has_the_components_of_drives_and_sites_alone():

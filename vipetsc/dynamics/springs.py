@@ -279,6 +279,10 @@ def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) ->
     """
     n = lattice.shape.cells
     d = lattice.shape.dofs
+    # A rank without cells has no first and no last one, to which ``add_squares`` would add dashpots to walls.
+    if n == 0:
+        return
+
     # c (v_other - v)^2 of the dashpots parallel to springs, then c v^2 of those to the ground.
     powers[:] = 0.0
     add_squares(y, lattice, 0, d, lattice.damping, powers)
