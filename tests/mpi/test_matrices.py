@@ -126,6 +126,31 @@ def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
     matrices.destroy()
 
 
+@pytest.mark.parallel([2, 3])
+def test_modes_of_one_frequency_span_the_same_motions_on_any_number_of_ranks():
+    """On a ring, waves in both directions have one frequency: their modes span the motions that those of one rank do.
+
+    The modes themselves are any two such motions, and may differ.
+    """
+    chain = Chain(four_band("calibrated"), 12, "periodic")
+    found = []
+    for comm in (COMM, MPI.COMM_SELF):
+        matrices = LatticeMatrices(chain, comm)
+        # The motion of the ring as a whole, and two pairs of waves.
+        modes = modes_near(matrices, 5, 0.0)
+        found.append((modes.frequency, np.concatenate(comm.allgather(modes.shapes), axis=1).reshape(5, -1)))
+        matrices.destroy()
+
+    (frequency, shapes), (frequency_alone, shapes_alone) = found
+    assert frequency == pytest.approx(frequency_alone, rel=1e-9, abs=1e-3)
+    for first in (1, 3):
+        pair = slice(first, first + 2)
+        assert np.ptp(frequency[pair]) < 1e-6 * frequency[first]
+        projector = shapes[pair].T @ shapes[pair]
+        projector_alone = shapes_alone[pair].T @ shapes_alone[pair]
+        assert projector == pytest.approx(projector_alone, abs=1e-6 * np.abs(projector_alone).max())
+
+
 @pytest.mark.parallel([1, 2])
 def test_the_edge_modes_of_the_lattice_and_their_file(folder):
     """The file of modes tells two edge modes of one frequency, in a gap, from a bulk mode of the closed form."""
