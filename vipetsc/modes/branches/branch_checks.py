@@ -24,7 +24,9 @@ REPETITIONS_EVERY = 50
 # each exceeds twice the bounds; none of them has jumped.
 SUSPICIOUS = 2
 # A step is followed again in this many steps at least, and MOST_POINTS at most. The guarded branch has met the right
-# point if it passes it at a distance of MET times the step.
+# point if it passes it at a distance of MET times the step. Of eight steps in the tests six are no jumps: they pass it
+# at 0.0012 of the step at most, after 6 to 60 points. Two jumps miss it by twice the step. With half and twice FINER
+# the same is found.
 MET = 0.02
 MOST_POINTS = 400
 FINER = 4
