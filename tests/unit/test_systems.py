@@ -9,6 +9,7 @@ from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, diatomic
+from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
@@ -121,6 +122,19 @@ def test_a_chain_has_the_modes_and_sites_of_its_cells():
     assert [pair.host // 4 for pair in system.contacts] == [0, 2]
     with pytest.raises(CaseError, match="12 modes"):
         NnmCase.from_table(table | {"nnm": {"system": "chain", "modes": [13]}})
+
+
+def test_a_contact_that_symmetry_keeps_at_rest_is_never_touched():
+    """Where all cells of a ring move alike no contact between cells moves, but for rounding."""
+    springs = (Spring(0, 0, 1e4, next_cell=True), Spring(0, 1, 5e3))
+    cell = UnitCell((4e-3, 2e-3), springs, host=0, resonator=1)
+    chain = Chain(cell, 12, "periodic", sites=(5, 7), pairs=(Pair(0, 0, next_cell=True),) * 2)
+    system = System.from_chain(chain, [Stops.both(Contact("hertz", 1e7), 1e-4)] * 2)
+
+    # The modes of cells that move alike: the ring as a whole, and resonators against hosts, the lowest of their band.
+    energies = [system.grazing_energy(mode) for mode in range(system.dofs)]
+    assert [mode for mode, energy in enumerate(energies) if energy == np.inf] == [0, 12]
+    assert max(energy for energy in energies if energy < np.inf) < 1.0
 
 
 @pytest.mark.parametrize(("ends", "springs", "held"), [("fixed", 4, 1.0), ("free", 2, 0.0), ("periodic", 3, 0.0)])

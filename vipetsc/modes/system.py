@@ -13,6 +13,10 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, nonlinear_places
 from vipetsc.modes.balance.stops import Stops
 
+# A contact does not move in a mode if its relative displacement is below this fraction of the mode's largest one: a
+# symmetry that keeps it at rest holds to rounding only.
+LEAST_REACH = 1e-10
+
 
 @dataclass(frozen=True)
 class ContactPair:
@@ -287,9 +291,11 @@ class System:
     def grazing_energy(self, mode: int) -> float:
         """Energy in J at which linear mode ``mode`` (0-based) first closes or opens a contact; inf if it never does."""
         omega, shapes = self.linear_modes()
-        reach = np.abs(self.contact_rows @ shapes[:, mode])
+        shape = shapes[:, mode]
+        reach = np.abs(self.contact_rows @ shape)
+        moves = reach > LEAST_REACH * np.abs(shape).max()
         nearest = np.abs(self.clearances.min(axis=1))
-        amplitude = (nearest[reach > 0] / reach[reach > 0]).min(initial=np.inf)
+        amplitude = (nearest[moves] / reach[moves]).min(initial=np.inf)
         if not np.isfinite(amplitude):  # times omega = 0 of a rigid-body motion it would be no number
             return np.inf
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
