@@ -328,3 +328,29 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
     assert ensemble["work"].values.tolist() == [1, 4, 1]
     assert ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
     assert np.isnan(ensemble["entropy/history"].values[1]).all()
+
+
+def test_an_ensemble_with_an_index_is_complete(tmp_path, monkeypatch):
+    """An ensemble whose records could not be merged has no index, not even that of an earlier call."""
+    sweep = Sweep.from_table(SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0]}}})
+    one, two = sweep.ids()
+    linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures={5: {}})
+    file = RecordFile(tmp_path / "members-0.jsonl")
+    file.append(linear.record("wave"))
+    file.append(scaled_record(one, site=5, work=1.0, warnings=[]))
+    conclude(Results(sweep, tmp_path))
+    index = tmp_path / "index.json"
+    assert json.loads(index.read_text())["members"]["missing"] == 1
+
+    def fill_the_disk(results: Results) -> None:
+        raise OSError("No space left on device")
+
+    file.append(scaled_record(two, site=5, work=4.0, warnings=[]))
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(Results, "merge_files", fill_the_disk)
+        conclude(Results(sweep, tmp_path), afresh=True)
+    assert (tmp_path / "ensemble.h5").exists()
+    assert not index.exists()
+
+    conclude(Results(sweep, tmp_path))
+    assert json.loads(index.read_text())["members"]["missing"] == 0

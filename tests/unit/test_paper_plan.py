@@ -102,6 +102,11 @@ def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
         assert step.failures(root) == len(failing)
         assert set(plan.left(root)) == ({TRANSFER} if failing else set())
 
+    # As after a kill behind the ensemble: the sweep has to be called again, which writes the index.
+    assert step.state(root) == DONE
+    (step.folder(root) / "index.json").unlink()
+    assert step.state(root) == BEGUN
+
 
 def test_times_of_files_make_nothing_stale(searched):
     """Newer times of files change neither the state of a step nor the inputs of figures and claims."""

@@ -181,15 +181,15 @@ class PaperStep:
         return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8", errors="replace"))
 
     def _is_complete(self, path: Path) -> bool:
-        """Whether the file ``path`` is a finished result of this step.
+        """Whether the file ``path`` is a finished result of this step, and of its case.
 
-        A branch is finished if it has ended, also in a failure that it names; other files are written when they are
-        complete, and must be of this case.
+        A branch is finished when it has ended, also in a failure that it names; a sweep when it has an index as well.
         """
         with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
             if "ending" in file.attrs:
                 return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
-            return self._is_same_case(file.attrs["case"])
+            is_indexed = not isinstance(self.case, Sweep) or path.with_name("index.json").exists()
+            return is_indexed and self._is_same_case(file.attrs["case"])
         return False
 
     def _is_same_case(self, text: str) -> bool:

@@ -355,16 +355,18 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
 
     path = folder / "index.json"
     text = json.dumps(index, indent=1, default=int) + "\n"
-    current = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    # The index is written after the ensemble: where it is the current one, and no member was simulated since, the
-    # ensemble is complete and of these members.
+    is_current = not afresh and path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
+    # The index is written last, and the one before is removed first: an ensemble with an index is complete, and of its
+    # members.
+    if not is_current:
+        path.unlink(missing_ok=True)
     if not count[STATUS[MISSING]]:
         lost: list[str] = []
-        if afresh or not current or not is_whole(folder / "ensemble.h5", lost):
+        if not is_current or not is_whole(folder / "ensemble.h5", lost):
             assemble(results, warnings)
         warnings += lost
         results.merge_files()
-    if not current:
+    if not is_current:
         write_text(path, text)
     return status, warnings
 
