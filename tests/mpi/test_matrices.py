@@ -232,9 +232,10 @@ def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
         with pytest.raises(CaseError, match=key):
             find_modes(case, count, near, folder, COMM)
 
-    touching = small_case(contacts={"side": "plus", "clearance": 0.0, "restitution": 1.0})
-    with pytest.raises(CaseError, match="no motion about it is linear"):
-        find_modes(touching, 2, 1.0, folder, COMM)
+    # The first site has a clearance, the second one none.
+    contacts = {"sites": [5, 9], "side": "plus", "clearance": [1e-4, 0.0], "restitution": 1.0}
+    with pytest.raises(CaseError, match=r"clearance = \[0.0001, 0.0\]: site 2 touches .* no motion about it is linear"):
+        find_modes(small_case(contacts=contacts), 2, 1.0, folder, COMM)
 
     monkeypatch.setattr(eigen, "RESTARTS", 1)
     long = LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM)

@@ -88,14 +88,18 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
 
 def check_modes(case: Case, count: int, near: float) -> None:
     """Raise CaseError if ``count`` modes near ``near`` cannot be found."""
-    chain = case.model().chain
-    gaps = case.model().gaps
+    model = case.model()
+    chain = model.chain
     masses = chain.cells * chain.cell.dofs
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
-    if gaps and np.any(np.min(gaps, axis=1) == 0):
-        remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
-        raise CaseError([Problem("contacts.clearance", 0.0, remedy)])
+    for number, stops in enumerate(model.gaps, start=1):
+        if min(stops) == 0:
+            remedy = (
+                f"site {number} touches its stop at rest, which resists on one side only: no motion about it is linear,"
+                " however small"
+            )
+            raise CaseError([Problem("contacts.clearance", case.contacts.clearance, remedy)], case.name)
     # The comparison is false for NaN too; far below 1e50 squares of frequencies do not overflow.
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
