@@ -25,7 +25,7 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
 
     A value that may be of several types (a number, a list, a table) is tried as each, and has the errors of all. The
     nearest type is the one with the lowest cost: an error within the value, such as an item of a list, costs 1, a value
-    that is not of the type at all ``MISTYPED``. Of a value that is of none of them the error names all.
+    that is not of the type at all ``MISTYPED``. The error of a value that is of no type names all types.
     """
     costs: dict[Location, dict[str, int]] = {}
     expected: dict[Location, dict[str, None]] = {}  # a dictionary, since the order counts
@@ -43,7 +43,7 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
                 name = _expected_type(error)
             expected.setdefault(value, {})[name] = None
 
-    # Among types of equal cost this is the one that the section lists first.
+    # This is the one that the section lists first among types of equal cost.
     nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
     kept_errors = []
     for error in errors:

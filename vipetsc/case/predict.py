@@ -15,9 +15,9 @@ from vipetsc.lattice.packet import narrow_fraction
 
 # Amplitudes. By default each is simulated, too: with 0.3 s for a run, as of the built-in case, so many take an hour.
 MOST = 10_000
-# A scattering law has one frequency. Of a pulse that is no burst, at least the fraction NARROW of the energy must be in
-# one band and within the fraction WIDTH of its main frequency. Predictions for such Gaussian pulses and chirps differ
-# from runs by .044 to .122 decades (rms), and those for a burst by .056.
+# A scattering law has one frequency. If a pulse is no burst, at least the fraction NARROW of its energy must be in one
+# band and within the fraction WIDTH of its main frequency. Predictions for such Gaussian pulses and chirps differ from
+# runs by .044 to .122 decades (rms), and those for a burst by .056.
 WIDTH = 0.3
 NARROW = 0.95
 

@@ -2,7 +2,7 @@
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
 mass 2, ...), velocities likewise, then its ledger components (what the dashpots of each owned cell have dissipated, if
-there are any; work of each drive whose cell it owns; dissipated energy of each owned site). Behind them lie the ghosts:
+there are any; work of each drive whose cell it owns; dissipated energy of each owned site). The ghosts follow them:
 displacements of the neighbouring cell on the left, with velocities where there are dashpots to integrate or contacts
 with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
 """

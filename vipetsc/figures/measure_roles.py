@@ -44,11 +44,11 @@ class Roles(NamedTuple):
     def of(cls, axes: Sequence[SweptAxis]) -> Self:
         """Return the roles of ``axes``, of which there is at least one; ``y`` is None for curves.
 
-        Of the axes with numbers, or of all if none has, the longest is ``x``; the next one with numbers is ``y`` if
-        both have ``LEAST_ON_A_MAP`` values. Of the others the last ones become curves, unless there is a map, those
-        before them panels, and the first ones pages.
+        The longest axis with numbers, or of all axes if none has, is ``x``; the next one with numbers is ``y`` if both
+        have ``LEAST_ON_A_MAP`` values. The last of the other axes become curves, unless there is a map, those before
+        them panels, and the first ones pages.
         """
-        # Of axes of one length the first one in the case comes first: the sort is stable.
+        # Axes of equal length stay in the order of the case: the sort is stable.
         longest_first = sorted(axes, key=lambda axis: -axis.size)
         numbers = [axis for axis in longest_first if axis.is_number]
         map_axes = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]

@@ -171,7 +171,7 @@ def figure_names(
     valid = [*measures, *specified]
     for name in names:
         if name not in valid:
-            # Even a name far from all gets a guess, which shows what names look like.
+            # A name far from all valid ones gets a guess too, which shows what names look like.
             (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
             holder = source
             if source != BRANCHES:

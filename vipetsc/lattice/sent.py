@@ -1,11 +1,11 @@
 r"""The energy that a drive sends to the ends of a lattice, by frequency, and what of it comes back from them.
 
-In an infinite lattice a force exp(i omega t) makes waves j of amplitude a_j to each side. To an end come those of its
-side, and those of the other side once the other end has sent them back. Where the other end is near, both add with
-their phases, so that a wall may cancel waves. Where it is far, their energies add, since phases turn fast with the
-frequency. With flux_j the mean power of wave j of amplitude 1, a force F(t) of transform F(omega) sends
-2/pi |F(omega)|^2 flux_j |a_j|^2 at the frequency omega > 0, in J s/rad: by Parseval its work is the integral of
-Re(F* V)/pi over omega > 0, V being the velocity's transform, and flux is half of such a product.
+In an infinite lattice a force exp(i omega t) makes waves j of amplitude a_j to each side. An end receives the
+waves of its own side, and those of the other side once the other end has sent them back. If that one is near, both add
+with their phases, so that a wall may cancel waves. If it is far, their energies add, since phases turn fast with the
+frequency. With flux_j the mean power of wave j of amplitude 1, a force F(t) of transform F(omega) sends 2/pi
+|F(omega)|^2 flux_j |a_j|^2 at the frequency omega > 0, in J s/rad: by Parseval its work is the integral of Re(F* V)/pi
+over omega > 0, V being the velocity's transform, and flux is half of such a product.
 
 At the edges of bands waves stand, and absorbing ends send them back. How much a drive sends there decides what comes
 back: densities are integrated adaptively, from edge to edge, over every wave that propagates.
@@ -61,7 +61,7 @@ class Source:
 
     def energies(self, sections: Sequence[EndSection]) -> np.ndarray:
         """Energies (2,) in J that arrive at the ``sections`` and that come back from them."""
-        # With sections at both ends neither is a wall that sends waves back to the other.
+        # With sections at both ends, no end is a wall that sends waves back to the other.
         absorbs = len(sections) == 2
 
         def densities(omegas: np.ndarray) -> np.ndarray:

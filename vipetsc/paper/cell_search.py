@@ -86,7 +86,7 @@ def _make_search(case: DesignCase, path: Path) -> None:
         with open_netcdf(path, "search", BEST):
             return
     except (OSError, ValueError) as error:
-        # Usually there is no file yet; of one that cannot be read the user is told.
+        # Usually there is no file yet; the user is warned of one that cannot be read.
         if path.exists():
             logger.warning("vipetsc: warning: %s; computed again", error)
 

@@ -80,7 +80,7 @@ class PaperFigure:
                     yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
 
             finished = [folders[step] for step in part.steps if step in folders]
-            # Without its steps a figure has no pictures; with some of them it shows what there is.
+            # A figure has no pictures without its steps; with some of them it shows what there is.
             if finished:
                 for drawing in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
                     stem = drawing.stem

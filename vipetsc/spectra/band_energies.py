@@ -187,8 +187,8 @@ def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
     """The values (energy, sample) of ``energies`` of one column each at ``last`` + 1 even times, from 0 on."""
     amplitudes = np.zeros((last + 1, len(energies)))
     for column, energy in enumerate(energies):
-        # At the samples a cosine has the values of all others whose half waves differ from its own, or from minus its
-        # own, by a multiple of twice ``last``. Of these one has ``last`` half waves at most.
+        # At the samples, cosines have equal values if their numbers of half waves, or those numbers with the opposite
+        # sign, differ by a multiple of twice ``last``. One of these cosines has ``last`` half waves at most.
         aliases = last - np.abs(energy.wave % (2 * last) - last)
         amplitudes[:, column] = np.bincount(aliases, energy.amplitude[:, 0], last + 1)
     amplitudes[1:-1] *= 0.5

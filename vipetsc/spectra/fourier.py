@@ -121,7 +121,7 @@ def dispersions(
     ``velocity`` (t, cell, dof) is in m/s every ``interval`` s, ``masses`` (dof) in kg, ones for a plain velocity
     spectrum; energies are added over the masses. Cosine flanks cover the fraction ``in_time`` of the record, half of it
     at either end. ``lengths`` (time, space) are those to which records are padded with zeros, by default the next that
-    have fast transforms. Of the frequencies up to ``highest`` (rad/s) those ``rows`` are returned. No more than
+    have fast transforms. ``rows`` says which of the frequencies up to ``highest`` (rad/s) are returned. No more than
     ``memory`` bytes of the velocity are read at once.
 
     Returns the energies on kappa in (-pi, pi] and omega >= 0, where those of omega and -omega are added up.

@@ -52,7 +52,7 @@ def further_sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: U
     candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
     inner, estimated = misfit.columns(record, range(misfit.size))
     # Of long records of large lattices every n-th sample, which stands for n of them, is enough.
-    # Behind the rows of what sensors measure a motion has one of the acceleration's rate.
+    # A motion has a further row, the acceleration's rate, behind those of what sensors measure.
     rows = len(ROWS) + 1
     numbers = len(misfit.records[record].times) * len(candidates) * rows * (1 + len(inner + estimated))
     stride = -(-numbers // MOST_NUMBERS)

@@ -316,7 +316,7 @@ class Hill:
             zeros = self._beyond(series, growth)
             if zeros:
                 return max(zeros, key=lambda mu: mu.real)
-        # To the right of the last line lies all that grows, whether the lines before it were decided or not.
+        # All that grows lies to the right of the last line, whether the lines before it were decided or not.
         if zeros is None:
             return None
         return 0j
