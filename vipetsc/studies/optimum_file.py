@@ -23,7 +23,7 @@ from vipetsc.studies.sampler import front
 
 # Designs are compared at CURVE_POINTS amplitudes, log-spaced from the smallest one at which they are measured over
 # CURVE_SPREAD to the largest times CURVE_SPREAD: for a single amplitude over 24 dB, in steps of 2.4 dB. Two designs are
-# compared, four of a front: 22 or 44 runs, beside the hundred designs of the default budget.
+# compared, four of a front: 22 or 44 runs, besides the hundred designs of the default budget.
 CURVE_POINTS = 11
 CURVE_SPREAD = 4.0
 # Shown for every design with any objective: a large transfer may come with a large loss.
