@@ -25,8 +25,8 @@ BLOCK = 16  # wavenumbers whose matrices are held at once: with 8 a seventh slow
 # a speed by far less than a tenth: 0.8 and 0.95 find the same.
 NEARLY_FASTEST = 0.9
 FLAT = 1e-12  # a band whose frequencies differ by less than this fraction is flat to rounding
-# Part of the highest frequency of a cell's modes below which one is 0: rounding of its square, 1e-16 of the highest,
-# makes it 1e-8.
+# A mode of a cell is at rest if its frequency is below this fraction of the highest one: its square, which is 0, has an
+# error of 1e-16 of the highest square by rounding, so that the frequency has one of 1e-8.
 STILL = 1e-7
 # Smallest wavenumber at which group velocities are computed. The limit at 0 changes by 9e-8 of itself with half of it,
 # by 4e-7 with twice: at smaller ones rounding of omega^2 counts, at larger ones the curvature of the band.
@@ -187,7 +187,7 @@ def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
 def wave_bands(cell: UnitCell) -> tuple[Band, ...]:
     """Pass bands as of ``pass_bands``; () where contacts alone join the cells, so that no linear wave travels.
 
-    What ``pass_bands`` then has are frequencies of a single cell's modes, between its two equal edges.
+    ``pass_bands`` then has the frequencies of a single cell's modes, each as a band with two equal edges.
     """
     if not cell.joins_cells:
         return ()
@@ -197,7 +197,7 @@ def wave_bands(cell: UnitCell) -> tuple[Band, ...]:
 def modes_of_a_cell(cell: UnitCell) -> np.ndarray:
     """Frequencies (dof,) in rad/s of the modes of a ``cell`` that contacts alone join to others, lowest first.
 
-    Those of a cell that moves as a whole are 0.
+    A motion of the cell as a whole has the frequency 0.
     """
     frequency = bloch(cell, 0.0).frequency
     return np.where(frequency > STILL * frequency.max(), frequency, 0.0)

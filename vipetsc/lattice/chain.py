@@ -31,7 +31,7 @@ class Pair(NamedTuple):
 class Entries(NamedTuple):
     """Entries of a matrix over all masses, in their order: ``rows``, ``columns``, ``values`` (entry,).
 
-    Several of one place add.
+    Entries at one place add up.
     """
 
     rows: np.ndarray

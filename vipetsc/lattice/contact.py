@@ -128,7 +128,7 @@ class Contact:
     def onset_exponent(self) -> float:
         """The power of the indentation with which the force begins.
 
-        Raises KeyError for a law that there is not, ValueError for the law ``power`` without an ``exponent``.
+        Raises KeyError for a law that does not exist, ValueError for the law ``power`` without an ``exponent``.
         """
         registered = registered_law(self.law)
         if registered:

@@ -20,8 +20,8 @@ from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.waves import NEUTRAL
 
 # Wavenumbers at which the loss of bands is fitted. With 30 the bands' mean losses change by 4 to 8 % of those asked,
-# with 120 by 2 to 5 %: in the lowest band a dashpot to ground has a loss as 1/omega near kappa = 0, which the smallest
-# wavenumber weighs. The fit decides which dashpots a case has: with another number here it has slightly other ones.
+# with 120 by 2 to 5 %: in the lowest band the loss of a dashpot to ground grows as 1/omega near kappa = 0, so that the
+# smallest wavenumber counts much. The fit decides which dashpots a case has: another number here changes them slightly.
 KAPPAS = np.pi * (np.arange(60) + 0.5) / 60
 # |lambda| below this, or above its inverse: a wave that does not reach the next cell. Those of a singular coupling are
 # 0 and infinity to rounding, 1e-15: half and twice as much select the same waves.

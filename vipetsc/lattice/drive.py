@@ -52,7 +52,7 @@ class ToneBurst:
 
     @property
     def duration(self) -> float:
-        """Length of the burst in s; 0 of none."""
+        """Length of the burst in s; 0 for the amplitude 0."""
         if not self.amplitude:
             return 0.0
         return 2 * np.pi * self.cycles / self.frequency
@@ -229,9 +229,10 @@ class Pieces:
         return not np.isfinite(self.duration) and bool(last["frequency"] or last["rate"])
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s, by quadrature: of F(t) exp(-i w t).
+        """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t).
 
-        What is held at the end for ever has the transform of a step. Raises ValueError for a sine that does not end.
+        The integral is taken by quadrature; a value that is held for ever adds the transform of a step. Raises
+        ValueError for a sine that does not end.
         """
         if self.repeats:
             raise ValueError("a waveform without an end has no spectrum; give a duration")
@@ -260,8 +261,9 @@ class Pieces:
             later = half * (1 + nodes)
             weighted = self.force(begins[:, None] + later) * weights * half
 
-            # Of exp(i w (stop - s)) all panels have the factor of the nodes in common, which is computed once; that of
-            # a panel's beginning follows for a few panels at a time, since frequencies may be many.
+            # exp(i w (stop - s)) is a factor of the panel's beginning times one of the nodes. All panels have that of
+            # the nodes in common; that of the beginnings is computed for a few panels at a time, since frequencies may
+            # be many.
             at_nodes = np.exp(-1j * np.multiply.outer(frequency, later))
             for first in range(0, panels, PANELS_AT_ONCE):
                 some = slice(first, first + PANELS_AT_ONCE)

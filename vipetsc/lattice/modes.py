@@ -102,8 +102,8 @@ class Modes:
 def linear_modes(chain: Chain) -> Modes:
     """The modes of ``chain`` with linear springs alone, without its sites and dashpots, computed once.
 
-    1200 DoFs take about a second and 12 MB.
-    Raises ValueError for more than ``MOST_DOFS`` of a lattice whose cells differ: no wave is a mode of that.
+    1200 DoFs take about a second and 12 MB. Raises ValueError for a lattice of more than ``MOST_DOFS`` whose cells
+    differ: its modes are no waves.
     """
     return _modes(replace(chain.linearised(), sites=(), clearances=()))
 

@@ -10,7 +10,7 @@ from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Waveform
 
-# Half as many change the speeds of a packet by 1e-5, twice as many by 1e-6.
+# Wavenumbers over which energies are summed: half as many change the speeds of a packet by 1e-5, twice as many by 1e-6.
 WAVENUMBERS = np.linspace(0, np.pi, 8001)[1:-1]
 # Of these, one in so many is enough for a sum: with 4 a fraction changes by 2e-4, with 16 by 4e-4.
 COARSE = 8

@@ -29,8 +29,9 @@ from vipetsc.lattice.waves import NEUTRAL
 # the density then oscillates.
 NEAR = 32
 OTHER_END: dict[End, End] = {"left": "right", "right": "left"}
-# Detunings, in widths of a waveform's spectrum, between which it is smooth: so that the first panels do not miss it.
-# For the bursts of the paper the edges of bands do that already, and the middle alone gives the same to 1e-8.
+# Detunings, in widths of a waveform's spectrum, at which panels of the quadrature end as well, so that the first panels
+# do not miss the spectrum. For the bursts of the paper the edges of bands do, and the middle alone gives the same to
+# 1e-8.
 LOBES = (-8, -2, 0, 2, 8)
 # Quadrature: nodes of a panel, error of an integral, and halvings of a panel at most. What comes back is asked to
 # a percent; for a burst in a band four nodes err by 2e-6, and a hundredth of the error allowed changes 4e-9. Six
