@@ -43,8 +43,8 @@ class ContactPair:
 class SmoothSpring(NamedTuple):
     """A nonlinear spring between two masses (0-based), of elongation z = u_end - u_start; ``start`` None is the ground.
 
-    The ``law`` is a spring of a cell, whose own ``start`` and ``end`` have no meaning here. The part k z belongs into
-    the stiffness matrix.
+    The ``law`` is a spring of a cell, whose own ``start`` and ``end`` have no meaning here. The part k z belongs to the
+    stiffness matrix of the system.
     """
 
     start: int | None
@@ -305,7 +305,7 @@ class System:
 
         Each contact must have stops on both sides.
         """
-        # Where |w| is much larger than the clearance, it does not count: the contact is a spring of its stiffness.
+        # Where |w| is much larger than the clearance, the clearance does not count: the contact is a spring.
         stiffness = self.stiffness.copy()
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             stiffness += pair.law.stiffness * np.outer(row, row)

@@ -40,9 +40,9 @@ FAR = 100.0
 
 
 class KeptOrders(NamedTuple):
-    """The ``orders`` that are kept, and their J with what the others do, ``jacobian`` (order pair, order pair).
+    """The ``orders`` that are kept, and ``jacobian`` (order pair, order pair), their J with the effect of the others.
 
-    It is None where forces dissipate: J depends on lambda there, and all orders are kept.
+    ``jacobian`` is None where forces dissipate: J depends on lambda there, and all orders are kept.
     """
 
     orders: np.ndarray

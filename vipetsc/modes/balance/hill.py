@@ -93,7 +93,7 @@ class ContourLine(NamedTuple):
         turned = -float(self.logs[-1].imag) / np.pi
         # With all orders D is real at both ends, and it has turned by a whole number of half circles. A number that is
         # far from whole, or below 0, says that orders are left out that matter, and NaN that D is not finite or 0 at a
-        # position. (Whether a turn was missed it cannot say: ``_follow_line`` sees to that.)
+        # position. It cannot say whether a turn was missed: ``_follow_line`` makes sure that none is.
         count = np.round(turned)
         is_whole = abs(turned - count) < 0.25
         if is_whole and count >= 0:
@@ -115,7 +115,7 @@ class Perturbations(NamedTuple):
 class _Determinants(NamedTuple):
     """D at some exponents: ``values`` (exponents,), and the ``logs`` (block, exponents) of |D| in each block of orders.
 
-    Of a block in which |D| is too large a value has the phase alone.
+    Where |D| of a block is too large, a value has the right phase, and a modulus that is cut off.
     """
 
     values: np.ndarray
@@ -219,8 +219,8 @@ class Hill:
     def _acting(self, series: ForceSeries) -> np.ndarray:
         """Numbers of the pairs of which the determinant is taken.
 
-        Of a pair that no force acts on the row of J is zero, and it leaves the determinant as it is. Of ``FEW_PAIRS``
-        all are taken, which costs little, where a force acts on one of them.
+        A pair on which no force acts has a row of J that is zero, and leaves the determinant as it is. Up to
+        ``FEW_PAIRS`` pairs are all taken, which costs little, unless no force acts on any of them.
         """
         acting = series.acting
         pairs = len(series.potential)
@@ -252,8 +252,8 @@ class Hill:
     def _follow_line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.
 
-        Nor does log|D| change by more than ``STEEP`` there.
-        Where a zero is so near to the line that the finest interval does not resolve it, it is counted on either side.
+        Nor does log|D| change by more than ``STEEP`` there. Where a zero is so near to the line that the finest
+        interval does not resolve it, it is counted on either side.
         """
         # D varies over the distance from the line to the poles, which are those of the modes of a finite system.
         intervals = COARSE

@@ -42,7 +42,7 @@ from vipetsc.modes.system import elongation_rows
 NODES = 24
 LONGEST = 2.0
 # Times of a period at which the state of a whole lattice is looked at: FEWEST at least, and no more than BETWEEN
-# radians of the fastest motion apart: v^T C v has twice that frequency, of which a period then has six.
+# radians of the fastest motion apart. v^T C v has twice the frequency of that motion, and six samples in its period.
 FEWEST = 512
 BETWEEN = 0.5
 # A substep that ends within this fraction of the arc's duration from its end is the last one.

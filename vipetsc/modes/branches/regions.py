@@ -62,10 +62,10 @@ def assign_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, 
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
     until the local exponent d ln(df/dE)/d ln E changes by less than ``SETTLED`` per e-fold of energy and is above
-    ``STEEP``. III: vibro-impact. IV: smooth limit, from where a contact is closed for 95 % of the time on. A
-    branch on which the slope keeps changing sign (internal resonances) has its peak after its last energy fold.
-    Without an exponent that settles, II lasts. ``energy`` in J, ``slope`` in Hz/J, ``episodes`` contact episodes of the
-    arc, ``closed`` the fraction of the time with a contact closed.
+    ``STEEP``. III: vibro-impact. IV: smooth limit, from the first point at which a contact is closed for the fraction
+    ``SMOOTH_LIMIT`` of the time. A branch on which the slope keeps changing sign (internal resonances) has its peak
+    after its last energy fold. Without an exponent that settles, II lasts. ``energy`` in J, ``slope`` in Hz/J,
+    ``episodes`` contact episodes of the arc, ``closed`` the fraction of the time with a contact closed.
     """
     region = np.ones(len(energy), np.int8)
     touched = np.nonzero(episodes > 0)[0]

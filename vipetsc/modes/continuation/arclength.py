@@ -1,8 +1,8 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop.
 
 A method (``modes.problem.PeriodicProblem``) has n equations H = 0 in n + 1 unknowns, whose solutions form a curve, a
-branch. About the last point it gives a *frame*: the unknowns ``xi`` (n + 1,), scaled to order one by a *chart*, those
-of the point itself, and the unit tangent t of the branch there. A step of the arclength s predicts xi + s t, and
+branch. At the last point it gives a *frame*: a *chart*, which scales the unknowns to order one, the unknowns ``xi``
+(n + 1,) of that point, and the unit tangent t of the branch there. A step of the arclength s predicts xi + s t, and
 Newton's method corrects the prediction to the solution xi_new of
 
     H(xi_new) = 0,    t . (xi_new - xi) = s,

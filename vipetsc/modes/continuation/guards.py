@@ -25,7 +25,7 @@ GUARDED = {
     "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
     "truncation": ("the neglected harmonics are too large", "nnm.harmonics or nnm.truncation"),
 }
-# A change of these within its bound is no reason for a shorter step: they do not shrink with it.
+# A change of these within its bound is no reason for a shorter step: such changes do not shrink with the step.
 ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
 
 

@@ -123,7 +123,7 @@ class Segment(Generic[S]):
             return []
         if a * b < 0:
             return [self.root(kind, before)]
-        # The first point of a branch has no step, and a special point none from the point before.
+        # The first point of a branch has no step, and neither have points of files of earlier versions.
         if before is None or not self.left.step:
             return []
 

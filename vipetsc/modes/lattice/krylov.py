@@ -1,6 +1,6 @@
 """Shooting for whole lattices: Newton's method with GMRES, whose products come from the linearised flow.
 
-The equations and maps are those of ``shooting``; every rank has all initial values and residuals, the flow and the
+The equations and maps are those of ``shooting``. Every rank has all initial values and residuals; the flow and the
 vectors of Krylov's spaces are distributed. Without contact the quarter map is cos(Omega T/4) on the modes of the
 lattice, whose size is bounded from below for a breather between the bands, and contacts change it by a matrix of low
 rank: GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
@@ -72,7 +72,7 @@ class KrylovEquations(Equations, Protocol):
     """Equations that give the products of their derivative with vectors, and not its matrix."""
 
     def product(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The derivative of the residual at ``xi`` times a ``change`` of the unknowns (n,)."""
+        """The product (n,) of the residual's derivative at ``xi`` with a ``change`` (n + 1,) of the unknowns."""
 
 
 class KrylovNewton(BorderedNewton[KrylovEquations]):
@@ -137,7 +137,7 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
     chart: Diagonal
 
     def product(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The derivative of the residual at ``xi`` times a ``change`` of the unknowns (n,)."""
+        """The product (n,) of the residual's derivative at ``xi`` with a ``change`` (n + 1,) of the unknowns."""
         problem = self.problem
         arc = self.arc(xi)
         step = self.chart.to_changes(xi, change)

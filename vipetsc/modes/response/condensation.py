@@ -8,12 +8,12 @@ multiple omega of the drive's frequency the harmonics of z and f obey
     z = w - G(omega) f,    G(omega) = b^T (K + i omega C - omega^2 M)^-1 b,
 
 G is the compliance in m/N, and w the motion without f: b^T (K + i omega C - omega^2 M)^-1 p, or that by the incident
-wave. The equations of steady states (``steady``) are these, f being that of z: the motions of all other masses are
-eliminated, and z alone is unknown.
+wave. These are the equations of steady states (``steady``), in which f follows from z: the motions of all other masses
+are eliminated, and z alone is unknown.
 
-**Contacts as springs.** A mean force f moves masses without bound that no wall holds and no spring joins: G(0) is then
-infinite. If contacts hold them that are pressed at rest (``NfrcCase.are_contacts_springs``), these are springs of the
-linear lattice, with the slope s of their law at rest:
+**Contacts as springs.** A mean force f moves masses without bound if no wall holds them and no spring joins them: G(0)
+is then infinite. If contacts that are pressed at rest hold them (``NfrcCase.are_contacts_springs``), these contacts are
+springs of the linear lattice, with the slope s of their law at rest:
 
     z = w_s - G_s (f - s z),    G_s = b^T (K + b s b^T + i omega C - omega^2 M)^-1 b,    w_s likewise.
 

@@ -31,7 +31,8 @@ from vipetsc.modes.response.state import Response
 
 # Relative step of the central difference in frequency. Its relative error is (SLOPE/d)^2 at the relative distance d
 # from a pole of A w, and 1e-16/SLOPE by rounding. A mode that hardly moves the pairs makes A w large close to its pole
-# alone. Such errors slow Newton's method by as little; the solutions do not depend on them.
+# alone. Such an error makes Newton's method converge linearly, with a factor of its size; the solutions do not depend
+# on it.
 SLOPE = 1e-8
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.

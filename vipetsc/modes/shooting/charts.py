@@ -63,7 +63,7 @@ class DenseChart(Chart):
 
     @abstractmethod
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
+        """The matrix d(x, period)/d xi (n + 1, n + 1) at the unknowns ``xi`` (n + 1,)."""
 
     def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""

@@ -133,7 +133,7 @@ def _advance(stepper: Stepper, h: float) -> None:
 
 @kernel
 def _tried(stepper: Stepper, h: float) -> float:
-    """The scaled error of a step of length ``h``, which is made."""
+    """Make a step of length ``h``, and return its scaled error."""
     _advance(stepper, h)
     return _scaled_error(stepper, h)
 
@@ -153,7 +153,8 @@ def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) 
     """Repeat the step of length ``h`` at time ``t`` so that it ends on a ``change``.
 
     Returns the new length, and whether there is a change at its end; otherwise the gap has a largest value there, not
-    above zero. The ``orbit``, a stepper without variations, makes the attempts; the variations are taken along at last.
+    above zero. The ``orbit``, a stepper without variations, makes the attempts. The ``stepper`` makes one step, of the
+    length that is found, with the variations.
     """
     step = orbit.step
     _take_orbit(orbit, stepper)
@@ -264,7 +265,7 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray)
         if np.any(step.side):
             closed += h
         t += h
-        # Exactly, not by a sum of steps that is rounded.
+        # The end is set exactly: a sum of steps is rounded.
         if last and smooth:
             t = duration
         h = grown

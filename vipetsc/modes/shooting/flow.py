@@ -81,7 +81,7 @@ def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: i
 def _add(rows: np.ndarray, c: int, law: tuple[float, float], y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
     """Add the pull of a spring with the elongations z = ``rows[c]`` u by its ``law``, force f and slope f' there.
 
-    On the orbit acts -rows^T f, on a variation du its derivative -rows^T f' rows du.
+    The force on the orbit is -rows^T f, and that on a variation du is its derivative, -rows^T f' rows du.
     """
     force, slope = law
     first, n, columns = shape
@@ -97,8 +97,9 @@ def _add(rows: np.ndarray, c: int, law: tuple[float, float], y: np.ndarray, pull
 def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
     """Forces in N that pull back the orbit, column 0 of ``y`` (n or more, 1 + m), and its variations.
 
-    ``shape``, their first row in ``pull``, n and 1 + m, may be constants, so that the compiler knows all loops.
-    ``rates`` puts them where the velocities' rates are, and then divides by the masses.
+    ``shape`` has the first row of ``pull`` that is filled, n and 1 + m; a caller may give constants, so that the
+    compiler knows the lengths of all loops. ``rates`` has the rows of the velocities' rates filled, and then divides
+    them by the masses.
     """
     first, n, columns = shape
     # The static load, which acts on the orbit alone, and the springs: -K times each column.
@@ -231,7 +232,7 @@ class Arc:
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
     ``episodes`` counts how often contacts close, or open if they are pressed at rest, within the arc: one that goes on
     at the start counts as one that begins there. ``closed`` are the seconds with one or more contacts closed.
-    ``away_at_start`` (contact) says of which an episode goes on at the start.
+    ``away_at_start`` (contacts,) says of each contact whether an episode goes on at the start.
     """
 
     duration: float

@@ -29,8 +29,8 @@ FURTHEST = 0.5
 CLOSE = 1e-9
 # On the way the time may pass the end of the arc, in whose last instant a contact may touch, by this factor.
 LATEST = 1.1
-# The flow would look for the touch as a change of contact. It is therefore followed to this fraction of the time before
-# the touch, and a parabola, whose error is rounding, leads on to it.
+# At the touch itself the flow would search for a change of contact. The orbit is therefore integrated until this
+# fraction of the time is left, and a parabola, whose error is rounding, leads on to the touch.
 SHORT = 1e-6
 
 

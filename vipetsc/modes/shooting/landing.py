@@ -2,10 +2,11 @@
 
 A contact changes when its gap rises through zero: sigma w - D while it is open, D - sigma w while it is closed. A
 step's quintic Hermite interpolant of the gap is cut into its monotone pieces by ``contact.search``, so that no pair
-of changes is missed, however short. A largest value within the interpolant's error of zero is left to the flow.
+of changes is missed, however short. Where the largest value of a gap is zero to within the interpolant's error, the
+flow decides whether there is a change.
 
-The roots are bisected in monomial form on the quarters of the step. Another method might end on a neighbouring float:
-by the number of Newton steps of a later orbit even this would change the points of a branch.
+The roots are bisected in monomial form on the quarters of the step. A method that ends on a neighbouring float could
+change the points of a branch: a later orbit might need another number of Newton steps, on which the next step depends.
 """
 
 from typing import NamedTuple

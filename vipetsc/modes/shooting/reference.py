@@ -139,7 +139,7 @@ class Tsrk(Flow):
 
 @allocating
 def _forces(system: CompiledSystem, u: np.ndarray, tangent: np.ndarray, a: np.ndarray) -> None:
-    """Put the ``tangent`` stiffness (n, n) in N/m and the accelerations ``a`` (n,) at displacements ``u`` (n,) there.
+    """Fill the ``tangent`` stiffness (n, n) in N/m and the accelerations ``a`` (n,) at displacements ``u`` (n,).
 
     Here and below are loops, which are compiled in a quarter of the time that expressions of arrays take.
     """
