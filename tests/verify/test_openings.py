@@ -21,6 +21,7 @@ from vipetsc.spectra import entropies
 from vipetsc.studies import linear_history
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.linear_history import LinearHistory, MemberHistory, begins_linearly, history_bytes
+from vipetsc.studies.linear_run import LinearRun
 from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.sweep import run_sweep
 
@@ -131,6 +132,40 @@ def test_a_run_that_may_touch_at_once_begins_at_rest():
     assert history.opening(case_of({})) is not None
     assert history.opening(case_of({"drive": {"amplitude": 3e3}, "contacts": {"sites": [3, 26]}})) is None
     assert history.opening(case_of({"contacts": {"clearance": 0.0, "restitution": 1.0, "side": "plus"}})) is None
+
+
+@pytest.fixture(scope="module")
+def between_samples() -> dict:
+    """Changes of the table after which the linear wave passes the clearance of a site between two samples alone."""
+    clear = {"contacts": {"sites": [9], "clearance": 1.0}, "drive": {"cycles": 1}, "time": {"sample_interval": 8e-4}}
+    case = case_of(clear)
+    history = LinearHistory.of(case, MPI.COMM_SELF, StopRequest())
+    in_samples = LinearRun.of(history.run, history.statistics, sites=(), names=()).reached(case).max()
+
+    # In a run with finer samples, which has no contact at a clearance of 1 m.
+    run, _, _ = run_of(case_of(clear | {"time": {"sample_interval": 5e-5}}), begins=False)
+    cell = case.model().chain.cell
+    u = run["displacement"].values[:, 8]
+    between = np.abs(u[:, cell.resonator] - u[:, cell.host]).max()
+    assert between > 1.01 * in_samples
+    return clear | {"contacts": {"sites": [9], "clearance": float(np.sqrt(in_samples * between))}}
+
+
+def test_a_run_begins_before_a_contact_that_no_sample_shows(between_samples, monkeypatch):
+    """A run that begins linearly has the contact that its linear wave makes between two samples."""
+    monkeypatch.setattr(linear_history, "STATES_EVERY", 8)
+    case = case_of(between_samples)
+    whole, _, _ = run_of(case, begins=False)
+    begun, _, samples = run_of(case, begins=True)
+    assert samples > 0
+    assert begun.sizes["episode"] == whole.sizes["episode"] > 0
+
+
+def test_a_member_with_a_contact_that_no_sample_shows_is_simulated(between_samples):
+    """A member whose linear wave passes its clearance between two samples has its contact: it is not scaled."""
+    table = with_sections(TABLE, between_samples)
+    result = run_sweep(Sweep.from_table(table | {"sweep": {"drive": {"amplitude": [30.0]}, "measures": ["transfer"]}}))
+    assert result.dataset["contact_episodes"].item() > 0
 
 
 @pytest.mark.parametrize(

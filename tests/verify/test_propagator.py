@@ -294,6 +294,16 @@ def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, cont
         assert resumed.statistics[name] == straight.statistics[name], name
 
 
+def test_a_run_with_its_last_sample_is_not_stopped(folder):
+    """A request to stop that comes in the last block of samples is too late: the run is complete and has its files."""
+    case = small_case(time={"end": 0.01, "engine": "propagator"})
+    result = simulate(case, folder / "run", stop=StopAt(0))
+
+    assert result.complete
+    assert not result.resumable
+    assert len(datasets(folder / "run" / "run.h5")["time"]) == case.model().samples
+
+
 @settings(max_examples=60)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=12), st.floats(0.1, 1.0), st.floats(0.05, 2.0))
 def test_no_onset_is_missed(coefficients, length, clearance):

@@ -48,8 +48,11 @@ def test_contacts_that_cannot_be_followed_end_the_run():
     engine.destroy()
 
 
-def test_the_last_sample_before_a_stall_has_its_own_energies():
-    """The energies of the last sample before a stall balance: they leave out the work of forces in the stalled step."""
+def test_a_run_that_stalls_ends_with_its_last_sample_and_the_contact_of_the_stall():
+    """The energies of the last sample before a stall balance: they leave out the work of forces in the stalled step.
+
+    The log has the contact that begins in that step.
+    """
     case = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}, time={"engine": "propagator"})
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
@@ -62,6 +65,11 @@ def test_the_last_sample_before_a_stall_has_its_own_energies():
     held = sum(run[f"energy/{name}"].values for name in ("kinetic", "spring", "contact", "dissipated"))
     assert work[-1] > 0
     assert np.abs(work - held).max() < 1e-9 * np.abs(work).max()
+
+    # The contact that cannot be followed begins in the stalled step, after the last sample: it is recorded.
+    last = run["time"].values[-1]
+    assert run["impacts/site"].values.tolist() == [1]
+    assert last < run["impacts/onset"].values[0] < last + case.model().sample_interval
 
 
 @pytest.mark.slow
