@@ -12,6 +12,7 @@ from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, UnitCell
+from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -23,16 +24,18 @@ STOP = 20.0
 DEPTH = 0.1
 
 
-def held(contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
+def held(
+    contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None = None, frequency: float = 1.0, **nfrc: Any
+) -> NfrcCase:
     """Two masses of 1 kg joined by a spring, without walls; the first is pressed against a stop of the ground.
 
-    ``contacts``, ``lattice`` and ``nfrc`` update the tables of these names.
+    ``contacts``, ``lattice`` and ``nfrc`` update the tables of these names; ``frequency`` in rad/s is the drive's.
     """
     spring = {"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}
     table: dict[str, Any] = {
         "lattice": {"cells": 2, "ends": "free", "damping": {"mass": DASHPOT}},
         "contacts": {"law": "hertz", "stiffness": STOP, "restitution": 1.0, "sites": [1], "pair": [0, 1]},
-        "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0, "cell": 2},
+        "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": frequency, "cell": 2},
         "time": {"end": 10.0, "sample_interval": 0.1},
         "output": {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}], "forces": True},
         "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 3.0], "fixed": [0.2], "harmonics": 23},
@@ -55,6 +58,23 @@ def test_a_weak_force_moves_it_as_a_lattice_with_a_spring_to_the_ground():
     np.testing.assert_allclose(outputs["first_displacement"], np.abs(u), rtol=1e-5)
     np.testing.assert_allclose(outputs["first_force"], slope * np.abs(u[:1]), rtol=1e-5)
     np.testing.assert_allclose(outputs["largest_force"], STOP * DEPTH**1.5 + slope * np.abs(u[:1]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("over", "values"), [("stiffness", [12.0, 30.0, 19.0]), ("precompression", [0.06, 0.2, 0.1])])
+def test_along_a_curve_over_its_law_a_contact_that_holds_the_lattice_has_the_spring_of_each_value(over, values):
+    """Under a weak force the pressed contact is a spring of the slope that its own law has at each value of a key."""
+    omega = 1.7
+    case = held(frequency=omega, over=f"contacts.{over}", range=[min(values), max(values)], fixed=[1e-4])
+    keyed = KeyedCase(case, restitution=1.0, amplitude=1e-4)
+    for value in values:
+        states = keyed.at(value)
+        law = {"stiffness": STOP, "precompression": DEPTH} | {over: value}
+        slope = 1.5 * law["stiffness"] * law["precompression"] ** 0.5
+        stiffness = np.array([[SPRING + slope, -SPRING], [-SPRING, SPRING]])
+        u = np.linalg.solve(stiffness + (1j * omega * DASHPOT - omega**2) * np.eye(2), [0.0, 1e-4])
+
+        outputs = states.measured(first_state(states).xi).outputs
+        np.testing.assert_allclose(outputs["first_displacement"], np.abs(u), rtol=1e-5)
 
 
 @pytest.mark.parametrize("side", ["plus", "minus"])

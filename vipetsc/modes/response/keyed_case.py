@@ -7,15 +7,18 @@ from dataclasses import replace
 
 from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import Chain
 from vipetsc.modes.problem import FlowError
+from vipetsc.modes.response.condensation import contact_springs
 from vipetsc.modes.response.steady import SteadyStates
 
 
 class KeyedCase:
     """The lattices of a ``case`` over its key ``nfrc.over``, with a ``restitution`` and an ``amplitude``.
 
-    Keys of ``[contacts]`` leave the linear lattice as it is, and what is computed of it serves all their values.
-    ``amplitude`` is in the unit of the drive (``NfrcTable``).
+    Most keys of ``[contacts]`` leave the linear lattice as it is, and what is computed of it serves all their values.
+    It has springs in the place of contacts that alone hold it, whose stiffnesses follow from the law and the
+    precompression. ``amplitude`` is in the unit of the drive (``NfrcTable``).
     """
 
     def __init__(self, case: NfrcCase, restitution: float, amplitude: float) -> None:
@@ -37,12 +40,15 @@ class KeyedCase:
         if key == "contacts.restitution":
             restitution = value
         like = None
-        if self._last is not None and _without_clearances(self._last.case) == _without_clearances(case):
+        if self._last is not None and _linear_lattice(self._last.case) == _linear_lattice(case):
             like = self._last
         self._last = SteadyStates(case, restitution, case.nfrc.fixed[0], like=like)
         return self._last
 
 
-def _without_clearances(case: NfrcCase) -> object:
-    """The chain of a ``case`` without clearances, which do not belong to the linear lattice: two can be compared."""
-    return replace(case.model().chain, clearances=())
+def _linear_lattice(case: NfrcCase) -> tuple[Chain, tuple[float, ...]]:
+    """What makes up the linear lattice of a ``case``: its chain, and springs in N/m in the place of contacts.
+
+    Clearances, which do not belong to it, are left out, so that two can be compared.
+    """
+    return replace(case.model().chain, clearances=()), contact_springs(case)
