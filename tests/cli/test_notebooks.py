@@ -86,6 +86,11 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
         assert "returns to the site" in printed
         # The text describes the size of the fraction; other tests assert its digits.
         assert 0.2 < names["dissipated"] < 0.5
+        # The energies that it prints are those of the last sample, in which no contact is closed: they sum to all.
+        ends = {name: values.values[-1] for name, values in names["run"].items() if name.startswith("energy/")}
+        assert ends["energy/contact"] == 0
+        left = ends["energy/kinetic"] + ends["energy/spring"]
+        assert float(names["energy"][:, -1].sum()) == pytest.approx(left, rel=1e-6)
     elif path.stem == "sweep-heat-map":
         assert names["fraction"].shape == (5, 6)
         assert names["fraction"].max() > 0.1
