@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from vipetsc.case import Case, LawCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
+from vipetsc.dynamics.recorder import Recorder
 from vipetsc.lattice import Contact
 
 SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband-one-site", "packet", "chirp",
@@ -254,3 +257,22 @@ def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
 
     assert warned(302.5)
     assert not warned(301.5)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "nothing"),
+    [
+        ([1e-3], "nothing reached the site"),
+        ([1e-3, 1e-3], "nothing reached any of the 2 sites"),
+        ([0.0], "nothing pressed the site that touches its stop at rest"),
+        ([0.0, 1e-3, 1e-3], "nothing pressed the site that touches its stop at rest"),
+        ([0.0, 0.0, 1e-3], "nothing pressed any of the 2 sites that touch their stops at rest"),
+    ],
+)
+def test_a_run_without_contact(gaps, nothing):
+    """A run without contact says which sites were not reached; of sites that touch at rest, that none was pressed."""
+    chain = SimpleNamespace(sites=range(len(gaps)))
+    model = SimpleNamespace(chain=chain, gaps=[(gap, np.inf) for gap in gaps])
+    recorder = Recorder()
+    recorder.setup = SimpleNamespace(model=model, case=SimpleNamespace(contact_radius=None))
+    assert recorder.warnings() == [f"no contact: {nothing}"]

@@ -77,7 +77,7 @@ class Recorder(Observer):
         self._length = min(length, setup.model.samples + 1)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
-        # Of the fields, 1 for velocities, which engines take from the second half of the state.
+        # 1 for each field of velocities, which engines take from the second half of the state.
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
         self._first = 0
         if local.size:
@@ -211,7 +211,9 @@ class Recorder(Observer):
         comm = self.setup.layout.comm
         recording = self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
-        of_sites = [values[: self._held] for values in (self._losses, self._forces)][: len(self._of_sites)]
+        of_sites = [self._losses[: self._held]]
+        if FORCES in self._of_sites:
+            of_sites.append(self._forces[: self._held])
         rank_part = sites, np.array(of_sites), episodes, self._fields[:, : self._rows]
         gathered: list[Any] | None = [rank_part]
         if comm.size > 1 and not recording.together:
@@ -246,12 +248,12 @@ class Recorder(Observer):
         radius = self.setup.case.contact_radius
         if sites and not self.episodes:
             touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
-            # Of one site there is no choice to speak of.
             reached = "the site"
-            pressed = "the site that touches its stop"
             if sites > 1:
-                reached = f"one of the {sites} sites"
-                pressed = f"one of the {touching} sites that touch"
+                reached = f"any of the {sites} sites"
+            pressed = "the site that touches its stop"
+            if touching > 1:
+                pressed = f"any of the {touching} sites that touch their stops"
             if touching:
                 return [f"no contact: nothing pressed {pressed} at rest"]
             return [f"no contact: nothing reached {reached}"]
