@@ -86,11 +86,14 @@ def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
         largest = max(largest, part.values[inside].max(initial=-np.inf), *_at_ends(part, low, high))
 
         # Special points lie so near to others that a parabola through them would be that of their errors.
-        regular = part.is_regular & inside
+        regular = np.flatnonzero(part.is_regular)
         s = part.length[regular]
         y = part.values[regular]
-        if len(y) > 2:
-            middle = int(np.argmax(y[1:-1])) + 1
+        # Where the curve leaves the range and comes back, points of the range on either side are no neighbours.
+        is_inside = inside[regular]
+        middles = np.flatnonzero(is_inside[:-2] & is_inside[1:-1] & is_inside[2:]) + 1
+        if len(middles):
+            middle = int(middles[np.argmax(y[middles])])
             largest = max(largest, _vertex(s[middle - 1 : middle + 2], y[middle - 1 : middle + 2]))
     if not np.isfinite(largest):
         return np.nan
