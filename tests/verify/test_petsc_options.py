@@ -13,6 +13,7 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.schema import only_looks
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.ts.time_stepper import TimeStepper
 from vipetsc.io.folder import FolderError
 
 SHORT = {"time": {"end": 0.01}}
@@ -112,3 +113,24 @@ def test_a_case_with_options_is_stepped():
 
     assert result.statistics["engine"] == "ts"
     assert "PETSc options" in result.statistics["engine_note"]
+
+
+def test_no_fixed_step_is_longer_than_the_one_asked_for(petsc_options, monkeypatch):
+    """No fixed step is longer than asked for, also where one that is a little longer would reach the next sample."""
+    lengths = []
+    try_step = TimeStepper.try_step
+
+    def note_length(self, time, h, after_onset):
+        lengths.append(h)
+        return try_step(self, time, h, after_onset)
+
+    monkeypatch.setattr(TimeStepper, "try_step", note_length)
+    case = small_case(**SHORT, contacts={"sites": []})
+    interval = case.model().sample_interval
+    for step, count in ((interval / 1.05, 2), (interval / 3, 3)):
+        lengths.clear()
+        petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=step)
+        simulated(case)
+        # As few steps to each sample as the length allows, all equal; those at the beginning are shorter.
+        assert max(lengths) == pytest.approx(interval / count, rel=1e-6)
+        assert min(lengths[len(lengths) // 2 :]) == pytest.approx(interval / count, rel=1e-6)

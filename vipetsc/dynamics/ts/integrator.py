@@ -35,6 +35,8 @@ from vipetsc.parallel import StopRequest, smallest
 # step before a sample is saved now and then (1 % of all trials with the bilinear law, 0.1 % with Hertz's). From 1/0.9
 # on, a rejected step would be tried again at its own length, for ever.
 STRETCH = 1.08
+# Steps of a length that the user has fixed are stretched by no more than the rounding of times.
+FIXED_STRETCH = 1.0 + 1e-6
 # Steps and rejected trials for each site, before the next given time, beyond which a run counts as stalled: a thousand
 # times what any sample has taken.
 MOST_TRIALS = 10_000
@@ -64,8 +66,8 @@ class Integrator(Engine):
         Looked at after every step. A request on any rank ends ``advance`` on all, at the time to which it goes or where
         a drive has a kink before that.
 
-    PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
-    ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
+    PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step. With
+    ``-ts_adapt_type none -ts_dt H`` no step is longer than H; the first ones, and some to samples, are shorter.
     """
 
     name = "ts"
@@ -208,21 +210,21 @@ class Integrator(Engine):
 
     def _longest_step(self) -> float:
         """The longest step in s from here that the controller and the beginning of the drive allow."""
-        return min(STRETCH * self.step, self._first_step + STEP_PER_TIME * self.time)
+        stretch = FIXED_STRETCH if self._fixed_step else STRETCH
+        return min(stretch * self.step, self._first_step + STEP_PER_TIME * self.time)
 
     def _try_step(self, h: float) -> bool:
         """Try a step of ``h`` s and go on with the length that PETSc suggests; False if it was rejected, and undone."""
         trial = self._stepper.try_step(self.time, h, self._after_onset)
-        suggestion = trial.suggestion
         if not trial.accepted:
-            self.step = suggestion
+            self.step = trial.suggestion
             self.counts["rejected"] += 1
             return False
 
         self.counts["steps"] += 1
         # A step cut short to meet a sample says little about the longest one possible: only that it is no shorter.
-        if not self._fixed_step and (suggestion < CUT_SHORT * h or suggestion > self.step):
-            self.step = suggestion
+        if not self._fixed_step and (trial.suggestion < CUT_SHORT * h or trial.suggestion > self.step):
+            self.step = trial.suggestion
         return True
 
     def _first_change(self, h: float) -> ModeChange:
@@ -357,8 +359,6 @@ class Integrator(Engine):
         """Episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
         losses = self.layout.losses(self.state.array_r) - self.tracker.clipped_energies(self.tracker.start)
         episodes = self.tracker.take_episodes(losses, unfinished)
-        if not episodes.size:
-            return episodes
         return episodes[np.isin(episodes["site"], self.layout.sites)]
 
     def statistics(self) -> dict[str, Any]:
