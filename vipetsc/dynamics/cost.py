@@ -24,11 +24,12 @@ from vipetsc.lattice.chain import Pair
 EPISODE_STEPS = 60.0
 # Steps of ts where each sample must be the end of one, over those that its tolerance alone needs.
 SAMPLED_STEPS = 1.3
-# Exchanges of ghosts in a step of 8vr, one for each stage and one for the contact search, and seconds that ranks on one
-# machine take for one: by it two ranks are a little slower than one at 1200 masses, as was measured.
+# Exchanges of ghosts in a step of 8vr: one for each stage and one for the contact search.
 EXCHANGES = 14
+# Seconds that ranks on one machine take for an exchange. With this number two ranks are a little slower than one at
+# 1200 masses, as was measured.
 EXCHANGE = 6.5e-6
-# Of the propagator, in s: what it begins with, a linear step, a cell in it, an episode.
+# Times in s of the propagator: to begin, for a linear step, for a cell in it, for an episode.
 BEGIN = 0.06
 LINEAR_STEP = 2e-5
 CELL = 6.5e-8
@@ -37,7 +38,7 @@ EPISODE = 3.5e-4
 LINEAR_EXCHANGE = 1e-5
 # More ranks are worth their cores where they take less than this fraction of the time of one.
 WORTHWHILE = 0.95
-# Of cells with rows of their own, in s: a number of these in a step, what it takes to make one.
+# Times in s of cells with separate rows: for each number in these rows in a step, and to make one of these numbers.
 OWN_NUMBER = 4e-10
 MAKE_NUMBER = 7e-7
 
@@ -183,7 +184,7 @@ def expected_episodes(model: Model) -> float:
     if not (waves and drive.amplitude and chain.sites):
         return 0.0
 
-    # Of the waves at this frequency, the one that moves a pair most.
+    # The wave at this frequency that moves a pair most counts.
     pairs = chain.contact_pairs
     largest = {pair: max(_relative_amplitude(chain.cell, pair, wave) for wave in waves) for pair in set(pairs)}
     amplitudes = model.scale * np.array([largest[pair] for pair in pairs])

@@ -20,9 +20,9 @@ ON_SEVERAL = ("superlu_dist", "mumps")
 # Relative error of an eigenvalue 1/(Om^2 - s). With 1e-7 residuals of twelve modes of 300 and 3000 cells are 1e-11 in
 # place of 6e-15 at most, with 1e-13 they are as small; neither changes a frequency by more than rounding, or the time.
 TOLERANCE = 1e-11
-# Most restarts of a search, also of one for further copies of a mode, which ends as soon as one mode has converged,
-# mostly one farther away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies of ring
-# modes were missing.
+# Most restarts of a search. A search for further copies of a mode may take as many; it ends as soon as one mode has
+# converged, mostly one farther away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies
+# of ring modes were missing.
 RESTARTS = 60
 # The number s is less than the square of the frequency asked by this fraction of the largest Om^2 at most; in a long
 # lattice by the second fraction of the mean distance of its modes, so that those nearest to s are those nearest to the
@@ -99,7 +99,8 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
             remedy = f"only {len(pairs)} of {count} modes are found, the others lie too close; change --modes or --near"
             raise CaseError([Problem("--near", near, remedy)])
         # From then on one at a time, until none is nearer than those that there are.
-        wanted = int(before != len(pairs) < matrices.rows)
+        found_more = len(pairs) > before
+        wanted = int(found_more and len(pairs) < matrices.rows)
     eps.destroy()
 
     nearest = sorted(pairs, key=lambda pair: distance(pair[0]))[:count]

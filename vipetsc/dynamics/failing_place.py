@@ -20,7 +20,7 @@ def _fastest_cell(setup: Setup) -> str:
     local = (-1.0, layout.start)
     if layout.owned:
         local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())
-    # Of equal ones the first: it does not depend on where ranks divide the lattice.
+    # The first of equally fast cells is taken: it does not depend on where ranks divide the lattice.
     _, fastest = max(layout.comm.allgather(local), key=lambda of_rank: of_rank[0])
 
     cell = f"cell {fastest + 1}"

@@ -89,7 +89,7 @@ class LatticeMatrices:
         return csr_matrix((values, (rows, columns)), shape=(last - first, self.rows))
 
     def _check_indices(self) -> None:
-        """Raise CaseError on all ranks where PETSc's indices count neither all rows nor a rank's entries."""
+        """Raise CaseError on all ranks where PETSc's indices do not count all rows, or not the entries of a rank."""
         cell = self.chain.cell
         entries = len(cell.couplings()) * 2 * (self.stop - self.start)
         if self.comm.allreduce(max(self.rows, entries), MPI.MAX) > int(np.iinfo(PETSc.IntType).max):

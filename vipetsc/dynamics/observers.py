@@ -22,9 +22,9 @@ from vipetsc.progress import Progress
 
 # A run whose energy balance misses by this fraction of the largest work so far is no longer a solution.
 RUNAWAY = 0.1
-# ... as long as the lattice has more energy than this fraction of ``EnergyMeter.largest``, about 1e-8 of the run's
-# scale of energy. With less the error may be as large as the work: in the first samples of a burst of 30 cycles it is,
-# with either engine, and from this energy on below 1e-10 of the work.
+# The balance is judged only while the lattice has more energy than this fraction of ``EnergyMeter.largest``, about 1e-8
+# of the run's scale of energy. With less the error may be as large as the work: in the first samples of a burst of 30
+# cycles it is, with either engine, and from this energy on below 1e-10 of the work.
 NEGLIGIBLE = 1e-12
 # Error of the energy balance over the largest work above which a run warns: so many relative tolerances, 1e-8 at the
 # default tolerance of 1e-10; never less than the second number, nor more than the third. The built-in run has an error
@@ -58,8 +58,8 @@ class Observer:
     """Watches a run.
 
     Calls come on all ranks in the same order: ``begin``, perhaps ``restore``, then ``observe`` for every block of
-    samples; whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then
-    ``checkpoint`` of all; at the end ``finish`` and ``statistics``.
+    samples; whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then, where
+    the output keeps checkpoints, ``checkpoint`` of all; at the end ``finish`` and ``statistics``.
 
     A subclass has a ``name``, its prefix in checkpoints, and may want blocks of at most ``longest`` samples: with 1 it
     sees the state at every sample. It must not change the state, and what it raises it must raise on all ranks.
@@ -106,7 +106,11 @@ class Observer:
 
 
 class Guard(Observer):
-    """Raises RunawayError, on all ranks, for a state that is not finite, or has more energy than it received."""
+    """Raises RunawayError, on all ranks, for a state that is not finite, or whose energy balance does not close.
+
+    The balance may miss by the fraction ``RUNAWAY`` of the largest work so far. An energy from ``EnergyMeter.largest``
+    on counts as not finite.
+    """
 
     name = "guard"
     saved = ("most_work",)

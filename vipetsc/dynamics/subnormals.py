@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
-# Of the floating-point environment of C on Linux and x86-64 (``fenv_t``, 32 bytes) the last number is the processor's
-# control register MXCSR; its bits 15 and 6 make zeros of subnormal results and operands.
+# The last number of C's floating-point environment (``fenv_t``, 32 bytes on Linux, x86-64) is the processor's control
+# register MXCSR, whose bits 15 and 6 make zeros of subnormal results and operands.
 _NUMBERS = 8
 _CONTROL = 7
 _AS_ZERO = 1 << 15 | 1 << 6

@@ -60,7 +60,8 @@ def _elongations(setup: Setup, places: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Elongations (spring,) in m of this rank's springs at ``places`` (spring, 2), from its state ``y`` with ghosts."""
     layout = setup.layout
     cell = setup.model.chain.cell
-    # The displacements of the cell on the left, of a wall there, then of the owned cells and the next one or a wall.
+    # The displacements of a wall on the left, of the owned cells, and of the next cell or a wall. A spring that begins
+    # in the cell on the left belongs to that cell, and so to the rank that owns it, unless that is a wall.
     u = np.zeros((layout.owned + 2, layout.dofs))
     u[1:-1] = y[: layout.dofs * layout.owned].reshape(layout.dofs, layout.owned).T
     left, right = layout.neighbours()

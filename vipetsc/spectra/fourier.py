@@ -147,7 +147,7 @@ def dispersions(
             waves = fft.ifft(part * taper(part.shape[1], window.taper), nx, axis=1, norm="forward")
             energy += mass * (waves.real**2 + waves.imag**2)
 
-    # Of a real signal omega > 0 stands for -omega too; 0 and the highest of an even length have no opposite.
+    # A real signal has as much at -omega as at omega; 0 and the highest frequency of an even length have no opposite.
     has_opposite = [0 < row < (nt + 1) // 2 for row in taken]
     # From the transform's order of wavenumbers to ascending ones over (-pi, pi].
     order = np.roll(np.arange(nx), (nx - 1) // 2)

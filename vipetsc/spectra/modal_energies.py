@@ -59,9 +59,7 @@ class ModalParts:
             sums[:, :, t] = np.bincount(index, row, parts * BINS).reshape(parts, BINS)
         return sums
 
-    def energies(
-        self, displacement: Any, velocity: Any, rows: Sequence[int] | np.ndarray, memory: float = np.inf
-    ) -> np.ndarray:
+    def energies(self, displacement: Any, velocity: Any, rows: Rows, memory: float = np.inf) -> np.ndarray:
         """Energies (part, bin, row) in J at the samples ``rows`` of fields (t, cell, dof) in m and m/s.
 
         Fields may be datasets of a file; no more than ``memory`` bytes of both are read at once.
