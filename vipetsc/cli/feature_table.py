@@ -222,14 +222,14 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("loss by bands", _lattice(damping={"loss": {"1": 0.01}})),
     Feature(
-        "smooth springs",
+        "nonlinear springs",
         _lattice(cell=CUBIC_CELL),
         {"nnm": {"own": {"smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}}},
         # Each of these springs has unknown harmonics.
         scaled={"nfrc": SHORT_LATTICE, "condensed": FEW_SPRINGS},
     ),
     Feature(
-        "smooth springs in few cells",
+        "nonlinear springs in few cells",
         _lattice(profiles={"springs[2].cubic": {"cells": [6, 13], "value": 1e9}}),
         scaled={"nfrc": SHORT_LATTICE | IN_CELL_6, "chain": IN_CELL_6, "condensed": FEW_SPRINGS | IN_CELL_2},
     ),
