@@ -9,10 +9,12 @@ from scipy.optimize import least_squares
 from tests.unit.test_trial_cases import QUANTITIES, base_of, sought
 from vipetsc.case import CaseError
 from vipetsc.case.trial import TrialCases
+from vipetsc.identification import motion
 from vipetsc.identification.coefficient_slopes import CoefficientSlopes
 from vipetsc.identification.least_residuals import _Step, least_residuals
 from vipetsc.identification.motion import MotionCoefficients
 from vipetsc.identification.precision import EXACT, FINAL, GROWING, ROUGHEST, TOLERANCE, Precision
+from vipetsc.lattice import Chain
 
 TIMES = np.linspace(0, 1, 20)
 DATA = 2 * np.exp(-3 * TIMES) + 0.01 * np.random.default_rng(2).standard_normal(20)
@@ -140,3 +142,21 @@ def test_motions_are_as_exact_as_the_noise_needs():
     # For records without noise the estimate of the error is far smaller than any tolerance.
     assert GROWING.tolerances(1e-9).motion == EXACT.motion
     assert GROWING.tolerances(1e-5).motion == pytest.approx(1e-9)
+
+
+def test_the_matrices_of_equal_cells_are_computed_once(monkeypatch):
+    """Cases that differ in their contacts alone have one lattice, whose matrices are computed for the first of them."""
+    computed = []
+    compute = motion._matrices
+
+    def count(chain: Chain) -> motion.MatrixEntries:
+        computed.append(chain)
+        return compute(chain)
+
+    monkeypatch.setattr(motion, "_matrices", count)
+    motion._matrices_of_equal_cells.cache_clear()
+    base = base_of("preset")
+    for factor in (1.0, 1.1, 1.2):
+        clearance = [factor * value for value in base.contacts.clearance]
+        MotionCoefficients.of(base.varied(contacts={"clearance": clearance}).model())
+    assert len(computed) == 1

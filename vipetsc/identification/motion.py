@@ -55,9 +55,10 @@ class MotionCoefficients(NamedTuple):
         chain = model.chain
         # Trial cases differ in their contacts more often than in their cells: the matrices of equal cells are kept. A
         # lattice whose cells differ is described by arrays, which cannot be keys of a cache.
-        matrices = _matrices(chain)
         if chain.variation is None:
             matrices = _matrices_of_equal_cells(chain.cell, chain.cells, chain.ends)
+        else:
+            matrices = _matrices(chain)
         return cls(*matrices, sites=site_records(model, np.arange(len(chain.sites))), gains=gains_of(model))
 
 
