@@ -165,6 +165,21 @@ def test_transfer_is_compared_with_the_slope_of_the_branch(tmp_path, exponent, s
     assert measure("C16", tmp_path, "printed").verdict == UNMEASURED
 
 
+def test_curves_that_are_left_out_of_the_relation_are_reasons(tmp_path):
+    """A reading has the reasons why its own curves have no branch; one without any curve has those of all."""
+    put_backbone(tmp_path, exponent=-1.0, scatter=0.0)
+    of_calibrated = "calibrated-hertz-1-sites-5-cycles: no member without contact"
+    of_printed = "printed-hertz-5-sites-30-cycles: no branch of the law hertz"
+    with h5py.File(tmp_path / "interband" / "backbone.h5", "a") as file:
+        # As ``write_netcdf`` writes a list.
+        file.attrs["left_out"] = json.dumps([of_calibrated, of_printed])
+
+    assert measure("C16", tmp_path).reason == of_calibrated
+    missing = measure("C16", tmp_path, "printed")
+    assert missing.verdict == UNMEASURED
+    assert missing.reason == f"backbone.h5 holds no curve of the reading printed; {of_calibrated}; {of_printed}"
+
+
 def put_portraits(root: Path, linearity: float) -> None:
     """Write the motion of one site: out of phase at 2 N, then rough, then both masses together at 1e4 N.
 

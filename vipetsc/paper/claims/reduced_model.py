@@ -122,7 +122,7 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
     Raises MissingEvidence if there is no relation of the transfer to a branch in this reading.
     """
     relation = evidence.open(INTERBAND, "backbone.h5")
-    left_out = [str(text) for text in np.atleast_1d(relation.attrs.get("left_out", []))]
+    left_out: list[str] = json.loads(relation.attrs.get("left_out", "[]"))
     curves = sorted({str(name).partition("/")[0] for name in relation.variables if str(name).startswith(f"{reading}-")})
     if not any(name.startswith(f"{reading}-{law}-{MAIN}") for name in curves for law in LAWS):
         raise MissingEvidence("; ".join([f"backbone.h5 holds no curve of the reading {reading}", *left_out]))
