@@ -54,7 +54,7 @@ def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
 
     A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
     ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.
-    Raises OSError, or ValueError.
+    A member that failed in either has no differences and does not agree. Raises OSError, or ValueError.
     """
     all_members = open_ensemble(sweep)
     members = open_ensemble(sample)
@@ -84,5 +84,6 @@ def _compared(first: xr.Dataset, second: xr.Dataset) -> dict[str, Any]:
         "same": episodes[0] == episodes[1],
         "differences": differences,
         "largest": max(differences.values(), default=0.0),
-        "agrees": all(difference <= COMPARED[name] for name, difference in differences.items()),
+        # Without differences nothing was compared: one of the two has failed.
+        "agrees": bool(differences) and all(differences[name] <= COMPARED[name] for name in differences),
     }
