@@ -173,6 +173,17 @@ def test_a_power_law_is_fitted_from_the_largest_value_on():
     assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])
 
 
+def test_a_member_without_a_drive_is_no_point_of_a_power_law():
+    """A lattice that begins in motion may be swept from A = 0 on, where the largest value may lie: the law has none."""
+    amplitude = np.array([0.0, 1.0, 2.0, 4.0, 8.0])
+    curve = np.array([9.0, 3.0, 1.5, 0.75, 0.375])
+
+    fit = fit_curve(amplitude, curve, normalise=False)
+
+    assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (1.0, 3.0, 4)
+    assert fit["exponent"] == pytest.approx(-1.0)
+
+
 @pytest.mark.parametrize("unit", ["N", "m"])
 def test_a_fit_has_the_unit_of_the_amplitude(unit):
     """The amplitude of the peak and the factors of a fit are those of a force, or of a wall that moves by metres."""

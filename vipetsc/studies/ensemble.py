@@ -332,10 +332,11 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     """The entries of ``FIT`` for one ``curve`` (amplitude,) over the ``amplitude`` (amplitude,); NaN without a fit.
 
     From the curve's peak on y = factor A^exponent, A the amplitude's size, by a straight line of log y over log A and
-    by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first.
+    by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first. A member without a drive, in a
+    lattice that begins in motion, is none of the curve's points: a power law has no value at A = 0.
     """
     row = dict.fromkeys(FIT, np.nan)
-    valid = np.isfinite(curve)
+    valid = np.isfinite(curve) & (amplitude != 0)
     # The sign of the amplitude is a phase of the drive: the size orders the curve.
     order = np.argsort(np.abs(amplitude[valid]), kind="stable")
     x = np.abs(amplitude[valid])[order]
