@@ -12,13 +12,13 @@ import xarray as xr
 import vipetsc
 from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
-from vipetsc.io.netcdf import variable
+from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, _fits, fit_curve
-from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, read_linear
+from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, measured, read_linear
 from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {
@@ -182,6 +182,17 @@ def test_a_member_without_a_drive_is_no_point_of_a_power_law():
 
     assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (1.0, 3.0, 4)
     assert fit["exponent"] == pytest.approx(-1.0)
+
+
+def test_a_single_part_of_the_frequency_axis_has_one_name(tmp_path):
+    """A lattice without bands has one part, "above", whose name is the same from memory and from the file."""
+    energy = variable("bands/part", [1.0], "1", "fraction of a part", parts=["above"])
+    number = variable("bands/part", [1], "1", "part")
+    analysis = xr.Dataset({"bands/part": number, "bands/share": energy})
+    write_netcdf(tmp_path / "analysis.h5", analysis)
+
+    with open_netcdf(tmp_path / "analysis.h5", "analysis") as stored:
+        assert measured(stored)["parts"] == measured(analysis)["parts"] == ["above"]
 
 
 @pytest.mark.parametrize("unit", ["N", "m"])

@@ -185,7 +185,8 @@ def measured(analysis: xr.Dataset) -> Record:
 
     for name in taken:
         if name in row and row_of(name)[0] == PART:
-            row["parts"] = list(analysis[name].attrs["parts"])
+            # A file has a list of one text as that text.
+            row["parts"] = np.atleast_1d(analysis[name].attrs["parts"]).tolist()
     if "bands/modal_energy" in row:
         # Of a history the ensemble has the last value: what the run leaves.
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
