@@ -76,6 +76,20 @@ def test_designs_are_compared_at_amplitudes_of_any_sign(objectives, sign):
     assert np.abs(amplitudes).max() == pytest.approx(40.0 if sign > 0 else 20.0)
 
 
+def test_designs_are_compared_once_at_the_amplitude_of_the_case():
+    """The middle of a curve about the case's amplitude is that amplitude, which rounding must not make a second one."""
+    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": 24.33}}
+    table["optimise"] = BOUNDS | {"objective": [{"measure": "transmitted"}]}
+    search_plan = OptimiseCase.from_table(table)
+    design = SimpleNamespace(case=search_plan.base)
+    search = SimpleNamespace(plan=search_plan, compared=lambda: {"case": 0}, designs=[design])
+
+    amplitudes = [run.drive.amplitude for run in curves_of(search)["case"]]
+
+    assert len(amplitudes) == 11
+    assert amplitudes[5] == 24.33
+
+
 @pytest.mark.parametrize(("ends", "beyond"), [("fixed", 9.0), ("periodic", np.nan)])
 def test_nothing_lies_beyond_the_last_site_of_a_ring(ends, beyond):
     """The energy of masses that move beyond the last site is that of a lattice with ends; a ring has no such cells."""

@@ -26,6 +26,7 @@ from vipetsc.studies.sampler import front
 # compared, four of a front: 22 or 44 runs, besides the hundred designs of the default budget.
 CURVE_POINTS = 11
 CURVE_SPREAD = 4.0
+SAME = 1e-9  # relative difference up to which two amplitudes are one
 # Shown for every design with any objective: a large transfer may come with a large loss.
 SHOWN = ("upper_share_at_end", "dissipated")
 # What a search did, by the attribute that counts it.
@@ -43,8 +44,10 @@ def curves_of(search: OptimumSearch) -> dict[str, list[Case]]:
         sizes = np.abs(asked)
         curve = np.geomspace(sizes.min() / CURVE_SPREAD, sizes.max() * CURVE_SPREAD, CURVE_POINTS)
         amplitudes = np.copysign(curve, max(asked)).tolist()
-    # The case's own amplitude is always among them: the bars of energies are drawn there.
-    amplitudes = sorted({*amplitudes, case_amplitude})
+    # The case's own amplitude is always among them: the bars of energies are drawn there. It is in the middle of the
+    # curve of one amplitude, but for rounding, and would be simulated twice.
+    others = {amplitude for amplitude in amplitudes if not np.isclose(amplitude, case_amplitude, rtol=SAME, atol=0.0)}
+    amplitudes = sorted(others | {case_amplitude})
 
     curves: dict[str, list[Case]] = {}
     if not options.measures_runs:
