@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import tomli_w
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +19,8 @@ from vipetsc.case.disorder import Deviation
 from vipetsc.case.named_files import relative_names, with_absolute_names
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
+from vipetsc.figures.optimum import compared_curves
+from vipetsc.figures.style import rc_style
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
 from vipetsc.studies.optimum_file import curves_of
@@ -88,6 +91,30 @@ def test_designs_are_compared_once_at_the_amplitude_of_the_case():
 
     assert len(amplitudes) == 11
     assert amplitudes[5] == 24.33
+
+
+def test_curves_over_amplitudes_of_both_signs_are_drawn_by_size():
+    """A negative amplitude has its place on the logarithmic axis, and the bars of energies are those at it."""
+    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": -5.0}, "optimise": BOUNDS | {"budget": 12}}
+    table["optimise"]["objective"] = [{"measure": "transmitted", "amplitudes": [10.0]}]
+    search_plan = OptimiseCase.from_table(table)
+    amplitude = np.array([-5.0, 2.5, 10.0, 40.0])
+    data = {
+        "comparison/number": ("compared", [0]),
+        "curve/value": (("compared", "amplitude", "objective"), amplitude[None, :, None]),
+        "curve/bands": (("compared", "amplitude", "band"), np.abs(amplitude)[None, :, None] * np.ones(4)),
+        "curve/dissipated": (("compared", "amplitude"), np.zeros((1, 4))),
+    }
+    coords = {"compared": ["case"], "amplitude": amplitude, "band": [1, 2, 3, 4], "objective": ["1: transmitted"]}
+    optimum = xr.Dataset(data, coords=coords, attrs={"case": search_plan.to_toml()})
+
+    with rc_style():
+        curve, bars = compared_curves(optimum).axes
+
+    assert curve.lines[0].get_xdata().tolist() == [2.5, 5.0, 10.0, 40.0]
+    assert curve.lines[0].get_ydata().tolist() == [2.5, -5.0, 10.0, 40.0]
+    assert bars.get_title("left").endswith("At -5 N")
+    assert [bar.get_height() for bar in bars.patches] == [5.0] * 4 + [0.0]
 
 
 @pytest.mark.parametrize(("ends", "beyond"), [("fixed", 9.0), ("periodic", np.nan)])

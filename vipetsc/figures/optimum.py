@@ -233,18 +233,21 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
 
 
 def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:
-    """Draw what objective number ``index`` measures over the amplitude, and the amplitudes that were searched."""
+    """Draw what objective number ``index`` measures over the amplitude's size, and the sizes that were searched."""
     objectives = plan.options.objective
     objective = objectives[index]
+    # The sign of a drive's amplitude is a phase, for which a logarithmic axis has no place.
+    sizes = np.abs(optimum["amplitude"].values)
+    order = np.argsort(sizes, kind="stable")
     for design in _compared(optimum):
         values = optimum["curve/value"].sel(compared=design.name).values[:, index]
         look = {"color": COLOURS[design.name], "lw": 0.8, "ms": 3}
-        axes.plot(optimum["amplitude"].values, values, f"{MARKERS[design.name]}-", label=design.name, **look)
+        axes.plot(sizes[order], values[order], f"{MARKERS[design.name]}-", label=design.name, **look)
 
     searched = set()
     for other in objectives:
         if other.name == objective.name:
-            searched.update(other.amplitudes or [plan.amplitude])
+            searched.update(other.amplitudes or [abs(plan.amplitude)])
     for amplitude in searched:
         axes.axvline(amplitude, color=style.GREY, lw=0.5, ls=style.DOTTED)
     axes.set(
@@ -258,8 +261,8 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
 def _draw_energies(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase) -> None:
     """Draw bars of the energy in every band, and what was lost, of each design at the case's amplitude, or near it."""
     amplitudes = optimum["amplitude"].values
-    # Nearest by ratio: amplitudes of a curve are spaced in logarithms.
-    nearest = int(np.argmin(np.abs(np.log(amplitudes / plan.amplitude))))
+    # Nearest by the ratio of sizes, since amplitudes of a curve are spaced in logarithms, and may differ in sign.
+    nearest = int(np.argmin(np.abs(np.log(np.abs(amplitudes / plan.amplitude)))))
     labels = [*(f"band {band}" for band in optimum["band"].values), "lost"]
 
     designs = _compared(optimum)
