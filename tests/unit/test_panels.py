@@ -262,6 +262,25 @@ def test_windows_of_an_identification_have_whole_numbers(monkeypatch):
         assert np.array_equal(ticks, np.round(ticks))
 
 
+def test_starts_that_failed_are_counted(monkeypatch):
+    """A start that failed has no deviance, and so no point in its panel: the title says how many there are."""
+    monkeypatch.setattr("vipetsc.figures.identified.IdentifyCase.of", lambda data: SimpleNamespace(parameters=()))
+    identified = xr.Dataset(
+        {
+            "windows/misfit": ("window", [1.0]),
+            "windows/impacts": ("window", [3]),
+            "windows/value": (("window", "parameter"), np.zeros((1, 0))),
+            "starts/valley": ("start", [1, 0, 2, 0]),
+            "starts/deviance": ("start", [0.0, np.nan, 7.0, np.nan]),
+        },
+        coords={"window": [1]},
+    )
+    with style.rc_style():
+        starts = growing_windows(identified).axes[2]
+    assert starts.get_title("left").endswith("4 starts, 2 failed")
+    assert starts.get_xlabel() == "valley"
+
+
 def test_the_line_of_undetermined_parameters_is_that_of_the_fit():
     """The dashed line of the picture is at the error above which the fit takes a parameter for not determined."""
     assert DETERMINED == uncertainty.DETERMINED

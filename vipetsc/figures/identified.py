@@ -160,7 +160,7 @@ def growing_windows(identified: xr.Dataset) -> Figure:
 
     Parameters are drawn as coordinates, in which the fit takes its steps, from their last values. The deviance of a
     start is minus twice the logarithm of its likelihood, less that of the best; starts that end in one valley have one
-    number.
+    number. A start that failed has neither, and is counted in the title.
     """
     plan = IdentifyCase.of(identified)
     figure = style.new_figure(style.PAGE, 2.6)
@@ -191,7 +191,12 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     else:
         starts.plot(valley, identified["starts/deviance"].values, "o", color=style.VERMILION, ms=3)
         starts.set_yscale("symlog")
-        starts.set(xlabel="valley (0: failed)", ylabel="deviance - least", title=f"{len(valley)} starts")
+        title = f"{len(valley)} starts"
+        failed = int((valley == 0).sum())
+        if failed:
+            title += f", {failed} failed"
+        starts.set(xlabel="valley", ylabel="deviance - least", title=title)
+        starts.xaxis.set_major_locator(MaxNLocator(integer=True))
     panels.label_panels([misfit, course, starts])
     return figure
 
