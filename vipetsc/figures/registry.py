@@ -393,5 +393,5 @@ def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> I
     """Yield every figure of ``specs`` from the one file in ``folder`` that has its results."""
     for spec in specs:
         file = FILES[spec.source]
-        data = files.get(folder / file.name, partial(open_netcdf, kind="search", needs=file.needs))
+        data = files.get(folder / file.name, partial(open_netcdf, kind=spec.source, needs=file.needs))
         yield Drawing(spec.name, partial(spec.function, data))
