@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import registry, sources, sweep_members, transfer
+from vipetsc.figures import registry, sources, sweep_members, transfer, wavenumber_bins
 from vipetsc.figures.registry import FIGURES, specified_drawings
 from vipetsc.figures.style import Drawing, Shown, rc_style
 from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps, from_series
@@ -192,6 +192,30 @@ def series_of_three(*warnings: str) -> AmplitudeSeries:
         recorded = {"cell": [8, 9, 10], "sites/cell": ("site", [9])}
         runs.append(member._replace(run=xr.Dataset(recorded, attrs=about)))
     return AmplitudeSeries(suffix="", title="", runs=tuple(runs), wave=DrivenWave(0, np.nan, np.nan))
+
+
+def test_amplitudes_of_a_moved_wall_are_in_metres():
+    """Headings of panels, and energies over the square of the amplitude, have the unit of what drives the lattice."""
+    drive = {"cycles": 8, "band": 2, "at": "max-group-velocity", "end": "left"}
+    numbers = {"snapshot": [0.0, 0.1], "kinetic": [1.0, 2.0], "reconstructed": [1.0, 2.0], "error": [1e-3, 1e-3]}
+    numbers["cross_share"] = [0.1, 0.2]
+    analysis = xr.Dataset({f"partition/{name}": ("snapshot", values) for name, values in numbers.items()})
+    analysis["partition/energy"] = (("bin", "snapshot"), [[0.5, 1.0], [0.5, 1.0]])
+    runs = []
+    for amplitude in (1e-3, 2e-3, 4e-3):
+        table = {"lattice": {"cells": 20}, "contacts": {"sites": [9]}, "drive": drive | {"amplitude": amplitude}}
+        case = Case.from_table(table)
+        runs.append(MemberRun(Path(), case, case.model(), xr.Dataset(), analysis))
+    series = AmplitudeSeries(suffix="", title="", runs=tuple(runs), wave=DrivenWave(0, np.nan, np.nan))
+
+    figure = wavenumber_bins.reconstruction.__wrapped__(series)
+
+    assert [axes.get_title("left") for axes in figure.axes[:3]] == [
+        "(a.i) Low amplitude, 0.001 m",
+        "(b.i) Medium amplitude, 0.002 m",
+        "(c.i) High amplitude, 0.004 m",
+    ]
+    assert figure.axes[0].get_ylabel() == "Kinetic energy / A² (J/m²)"
 
 
 def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:

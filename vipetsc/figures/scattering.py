@@ -29,6 +29,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import panels, style
 from vipetsc.figures.sweep_members import AmplitudeSeries, MemberRun, from_series
 from vipetsc.io.read import field_time
@@ -64,10 +65,12 @@ MOMENTS = ("Before the first site", "At the first site", "Past the last site", "
 
 @from_series(*ROWS)
 def amplitudes(series: AmplitudeSeries) -> Figure:
-    """Draw space-time kinetic energy, wavenumber content and dispersion, a row each, in J/N^2; paper, Fig. 2.
+    """Draw space-time kinetic energy, wavenumber content and dispersion, a row each; paper, Fig. 2.
 
-    Energies are divided by the square of the amplitude A, so that one scale serves a row.
+    Energies are divided by the square of the amplitude A, so that one scale serves a row: they are in J/N^2, or J/m^2
+    where a wall is moved.
     """
+    unit = drive_unit(series.medium.case.drive)
     figure, grid = series.page(3, 6.4, sharey="row")
     for row, (name, label) in zip(grid, ROWS.items(), strict=True):
         fields = [member.analysis[name].load() / member.case.drive.amplitude**2 for member in series.runs]
@@ -85,7 +88,7 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
                 image = panels.dispersion_map(axes, field, norm, cell)
                 # From rad/s to krad/s.
                 axes.set_ylim(0, BEYOND_BANDS * 1e-3 * pass_bands(cell)[-1].high)
-        panels.colour_bar(image, row, f"{label} / A² (J/N²)")
+        panels.colour_bar(image, row, f"{label} / A² (J/{unit}²)")
 
     for axes in grid[:, 1:].flat:
         axes.set_ylabel("")
@@ -101,7 +104,10 @@ def _mark_driven(axes: Axes, series: AmplitudeSeries) -> None:
 
 
 class Magnitudes(NamedTuple):
-    """|X| of the host velocity over the amplitude, ``values`` (time, wavenumber, cell) in m/s/N, at ``time`` in s."""
+    """|X| of the host velocity over the amplitude, ``values`` (time, wavenumber, cell), at ``time`` in s.
+
+    They are in m/s/N, or in 1/s where a wall is moved.
+    """
 
     time: np.ndarray
     values: np.ndarray
@@ -109,7 +115,7 @@ class Magnitudes(NamedTuple):
 
 @from_series(needs_wave=True, needs_sites=True)
 def wavelets(series: AmplitudeSeries) -> Figure:
-    """Draw |X(kappa, x)| of the host velocity over the amplitude, in m/s/N, at four times for three amplitudes.
+    """Draw |X(kappa, x)| of the host velocity over the amplitude, at four times for three amplitudes.
 
     That is the paper's Fig. 3. A black line marks the driven wavenumber. The times are those of the linear wave
     (``AmplitudeSeries.snapshot_times``), the same for all three runs.
@@ -132,7 +138,8 @@ def wavelets(series: AmplitudeSeries) -> Figure:
         grid[row, 0].set(ylabel=f"{moment}\nκ (π rad/cell)", ylim=(0, 1))
 
     figure.supxlabel("Cell")
-    panels.colour_bar(image, grid, "Wavelet transform |X| / A (m/s/N)", aspect=50)
+    unit = drive_unit(series.medium.case.drive)
+    panels.colour_bar(image, grid, f"Wavelet transform |X| / A (m/s/{unit})", aspect=50)
     return figure
 
 

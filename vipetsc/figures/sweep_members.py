@@ -156,8 +156,8 @@ class AmplitudeSeries(NamedTuple):
     @property
     def headings(self) -> list[str]:
         """The texts above each amplitude's panels."""
-        levels = zip(LEVELS, self.runs, strict=True)
-        return [f"{level} amplitude, {run.case.drive.amplitude:g} N" for level, run in levels]
+        drives = zip(LEVELS, (run.case.drive for run in self.runs), strict=True)
+        return [f"{level} amplitude, {drive.amplitude:g} {drive_unit(drive)}" for level, drive in drives]
 
     def page(self, rows: int, height: float, **shared: Any) -> tuple[Figure, np.ndarray]:
         """Return a figure with a column of panels (row, column) for each amplitude, lettered and headed."""

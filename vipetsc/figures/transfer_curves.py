@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Sweep
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
 from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
@@ -333,6 +334,7 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
     motions.sort(key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case
     (site,) = sites_of(case)
+    unit = drive_unit(case.drive)
     columns = -(-len(motions) // 2)
     window = f"{PERIODS} periods of the drive about the largest $|w|$"
     heading = f"{phrase(labels.law, reading_of_case(case), labels.configuration, f'cell {site}')}; {window}"
@@ -348,11 +350,12 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
         transfer.plot(*point, "o", color=style.RED, ms=4, zorder=3)
         note(transfer, str(number), point, (4, 3), fontsize=7.5, color=style.RED)
         _draw_portrait(axes, motion)
-        axes.set(title=f"(b.{number}) {motion.case.drive.amplitude:.4g} N", box_aspect=1)
+        axes.set(title=f"(b.{number}) {motion.case.drive.amplitude:.4g} {unit}", box_aspect=1)
     for axes in panels[len(motions) :]:
         axes.set_axis_off()
 
-    transfer.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
+    transfer.set(xscale="log", yscale="log")
+    transfer.set(xlabel=f"Amplitude of the drive ({unit})", ylabel="Inter-band transfer (1)")
     transfer.margins(x=0.08, y=0.12)
     transfer.set_title("(a) Transfer to higher bands")
     right.supxlabel("Displacement $u$ (mm)\nblue: resonator, red and dashed: host")

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from scipy.ndimage import gaussian_filter
 
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import ROMAN
 from vipetsc.figures.scattering import MOMENTS
@@ -110,7 +111,8 @@ def partition(series: AmplitudeSeries) -> Figure:
     bins = shown_bins(series.wave.wavenumber, len(field))
     colours = bin_colours(len(field))
     norm = panels.log_norm(field[bins], decades=BINS_DECADES)
-    figure = style.new_figure(style.PAGE, 6.6, f"{series.title}; maps at {medium.case.drive.amplitude:g} N")
+    amplitude = f"{medium.case.drive.amplitude:g} {drive_unit(medium.case.drive)}"
+    figure = style.new_figure(style.PAGE, 6.6, f"{series.title}; maps at {amplitude}")
     upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
 
     # A panel for each bin that is shown, and the last one for the driven band.
@@ -191,6 +193,7 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
     at least where the nodes reach; the second row shows what is missing.) The analysis sums KE_b over the lattice's own
     cells alone, which makes them smaller still. In a single cell m v_b v_c has either sign.
     """
+    unit = drive_unit(series.medium.case.drive)
     figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
     for (energies, errors, crosses), member in zip(grid.T, series.runs, strict=True):
         analysis = member.analysis
@@ -213,7 +216,7 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
         crosses.set(ylim=(0, 1), xlabel="Time (s)", xlim=time[[0, -1]])
         crosses.locator_params(axis="x", nbins=5)
 
-    grid[0, 0].set(ylabel="Kinetic energy / A² (J/N²)", ylim=(0, None))
+    grid[0, 0].set(ylabel=f"Kinetic energy / A² (J/{unit}²)", ylim=(0, None))
     grid[0, 0].legend(loc="upper left")
     grid[1, 0].set(ylabel="Relative error")
     limit = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
@@ -274,7 +277,8 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     colours = bin_colours(len(field))
 
     # The halves are subfigures with a gap between them, which the arrows cross.
-    figure = style.new_figure(style.PAGE, 4.6, f"{series.title}; {member.case.drive.amplitude:g} N")
+    heading = f"{series.title}; {member.case.drive.amplitude:g} {drive_unit(member.case.drive)}"
+    figure = style.new_figure(style.PAGE, 4.6, heading)
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.8), wspace=0.1)
     above, below = left.subplots(2, 1, sharex=True)
     above.plot(cells, snapshot.velocity, color=style.BLACK, lw=0.4)
