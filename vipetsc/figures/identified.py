@@ -23,7 +23,7 @@ LARGEST_ERROR = 1e6  # drawn for a direction in the parameters' space that the r
 def record_and_model(identified: xr.Dataset) -> Figure:
     """Draw every channel: measured values with the model over them, and next to these the residuals.
 
-    Grey is one standard deviation of the noise; p is the probability that white noise has residuals so much correlated.
+    Grey is one standard deviation of the noise; p is the probability that white noise is that much correlated.
     """
     count = min(identified.sizes["channel"], MOST_CHANNELS)
     figure = style.new_figure(style.PAGE, 1.9 * count)

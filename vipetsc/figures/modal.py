@@ -26,7 +26,7 @@ SEVERAL = "several"  # the label of the row for clusters with episodes of severa
 
 
 class MovedEnergies(NamedTuple):
-    """``energy`` (row, part + 1) in J that each site transferred to the parts of the spectrum; the last column is lost.
+    """``energy`` (row, part + 1) in J that each site transferred to the parts of the spectrum, and lost (last column).
 
     ``labels`` (row) are the cells of the sites, or ``SEVERAL`` for clusters that cannot be separated by site.
     """

@@ -195,9 +195,9 @@ def from_series(
 ) -> Callable[..., Any]:
     """Return a decorator of a function that draws an `AmplitudeSeries`: the result offers a picture for each series.
 
-    Series whose analyses lack a variable of ``needs`` have no such picture, which is no error; if it ``needs_wave``
-    neither those that do not drive a pass band, if it ``needs_sites`` those that did not record contact sites and other
-    cells. A picture of the run at ``medium_alone`` has no warnings of the others.
+    A series has no picture, which is no error, if its analyses lack a variable of ``needs``; if the picture
+    ``needs_wave`` and the series drives no pass band; or if it ``needs_sites`` and the series has not recorded contact
+    sites and other cells. A picture of the medium amplitude alone (``medium_alone``) has no warnings of the others.
     """
 
     def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:

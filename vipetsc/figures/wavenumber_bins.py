@@ -325,7 +325,7 @@ def _arrow(domain: Axes, height: float, trace: Axes, colour: np.ndarray) -> Conn
 
 def _draw_domain(axes: Axes, cells: np.ndarray, snapshot: Snapshot, bounds: np.ndarray) -> None:
     """Draw |X| over cells and wavenumber with the ``bounds`` of the bins, each named on the right edge."""
-    # Nodes above pi belong to the last bin, but their wavenumber is none of the lattice's.
+    # Nodes above pi belong to the last bin, but the lattice has no such wavenumbers.
     inside = snapshot.nodes.kappa <= np.pi
     kappa = snapshot.nodes.kappa[inside] / np.pi
     magnitude = np.abs(snapshot.transformed[inside])
