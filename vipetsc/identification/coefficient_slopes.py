@@ -19,7 +19,7 @@ from vipetsc.identification.initial_state import state_of
 from vipetsc.identification.motion import MotionCoefficients, scaled_slopes, slopes_between
 from vipetsc.identification.motion_rates import Slopes
 
-# Half the distance h of the coordinates between which differences of coefficients are taken. The error of the central
+# Differences of coefficients are taken between coordinates that are 2 h apart; this is h. The error of the central
 # difference, h^2/6 of the third derivative, and that of rounding, 1e-16/h, are then both about 1e-11.
 HALF_WIDTH = 1e-5
 AFFINE = ("clearance", "clearance_minus", "stiffness", "mass", "spring", "quadratic", "cubic", "dashpot", "grounding")

@@ -54,8 +54,8 @@ def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
 class SensorSignal(NamedTuple):
     """What a sensor of the model reads: ``values`` (sample,) in SI units, ``rate`` (sample,) their change in a second.
 
-    ``slopes`` are derivatives (sample,) by the number of the coordinate; those that are not there are 0, but for
-    offsets, whose derivatives follow from the rate.
+    ``slopes`` are derivatives (sample,) by the number of the coordinate. Offsets are not among them: their derivatives
+    follow from the rate. By all other coordinates that are missing the derivative is 0.
     """
 
     values: np.ndarray

@@ -8,7 +8,7 @@ from vipetsc.contact.law import CLIPPED, FREE, elastic_energy, elastic_force, ga
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.identification.motion_rates import Lattice, MotionState, difference
 
-# Half the distance h of the exponents between which a difference of the elastic energy is taken. Over the energy, the
+# A difference of the elastic energy is taken between exponents that are 2 h apart; this is h. Over the energy, the
 # error of the formula is about h^2, 1e-12, and that of rounding 1e-16/h, 1e-10: both less than a fit sees.
 SHORT = 1e-6
 
