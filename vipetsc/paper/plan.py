@@ -73,9 +73,8 @@ class PaperStep:
     """A step of the paper, a case that is computed in ``root/<name>``: a sweep, branches, a search or a prediction.
 
     ``kind`` is the class of the case in ``file``, ``changes`` are made in it (``section.key=value``). ``cost`` is the
-    CPU time in s of a part, of a sweep's member, or of the whole step if it has neither, on a core of the 2020s; it is
-    used until a rate is measured. A step with ``checks``, the name of another step, simulates ``sample`` members of
-    that sweep by the engine ``ts``.
+    CPU time in s of a part, of a sweep's member, or of the whole step if it has neither, on a core of the 2020s. A step
+    with ``checks``, the name of another step, simulates ``sample`` members of that sweep by the engine ``ts``.
     """
 
     name: str
