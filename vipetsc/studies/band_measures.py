@@ -36,7 +36,10 @@ BANDS = {
 
 
 class AveragingSpan(NamedTuple):
-    """The samples over which means of the energies are taken, from ``first`` to before ``last``; when they begin."""
+    """The samples over which means of the energies are taken, from ``first`` to before ``last``.
+
+    ``starts_when`` says in words what happens at the first one.
+    """
 
     first: int
     last: int

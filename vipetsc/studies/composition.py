@@ -97,9 +97,10 @@ class Network:
     sender, and ``radiated`` (site, 1) in m/N is i g'' at ``om``; it is a number where all sites have the same.
 
     About three times ``om``, if there is a wave ``third``: ``response3`` (site, site, offset) is G, ``g3`` (site,
-    offset) is g and ``centre`` (site, 1) its middle; ``received3`` and ``between3`` (site, site, offset) are G/g -
-    delta with the g of the receiver and of the sender. ``power`` and ``power3`` (site, 1) are the powers in W/m^2 of
-    travelling waves at ``om`` and three times it over the |w|^2 of each site's pair.
+    offset) is g, and ``centre`` (site, 1), or a number as ``radiated``, its value at three times ``om``; ``received3``
+    and ``between3`` (site, site, offset) are G/g - delta with the g of the receiver and of the sender. ``power`` and
+    ``power3`` (site, 1) are the powers in W/m^2 of travelling waves at ``om`` and three times it over the |w|^2 of each
+    site's pair.
     """
 
     def __init__(self, model: Model) -> None:

@@ -154,7 +154,7 @@ def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) 
         errors = np.sqrt(np.einsum("ij,jk,ik->i", state.matrix, inside, state.matrix))
         masses = np.arange(len(displacement))
 
-        # All other coordinates come first: the rest is what the data determine of this state while these are free.
+        # With the state's coordinates first, the marginal Jacobian is theirs while all others are left free.
         others = [p for p in range(misfit.size) if p not in state.indices]
         ordered = jacobian[:data_rows][:, [*state.indices, *others]]
         singular = np.linalg.svd(marginal_jacobian(ordered, len(state.matrix)), compute_uv=False)

@@ -62,7 +62,7 @@ LAYOUT = {
     "initial/singular": (
         "state_direction",
         "1",
-        "singular value of the Jacobian by the state, over the noise; modes as lively as the sensors are of order one",
+        "singular value of the Jacobian by the state's coordinates (1: a mode has the energy measured), over the noise",
     ),
     "place": ("place", "1", "number of a value of a profile"),
     "profile/value": ("parameter place", "1", "value at which a parameter is held"),

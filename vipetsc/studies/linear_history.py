@@ -94,7 +94,7 @@ class LinearHistory(NamedTuple):
         return Opening(self.run, self.checkpoints[before_contact - 1], signed_factor(case))
 
     def opening_entropies(self, samples: int, factor: float) -> OpeningEntropies:
-        """The entropies of the first ``samples``, of a run that has them times a ``factor``; on the first rank."""
+        """The entropies of the first ``samples`` of a run that is this one times a ``factor``; on the first rank."""
         return OpeningEntropies(self.run["velocity"].values, self.entropies, samples, factor)
 
 
@@ -170,7 +170,7 @@ class LinearHistories:
         return self._histories.get(name)
 
     def keep(self, name: str, history: LinearHistory, size: int) -> None:
-        """Keep the ``history`` of ``size`` bytes on the first rank; the oldest ones go for it.
+        """Keep the ``history``, which has ``size`` bytes on the first rank; the oldest ones are dropped to make room.
 
         The size is the same on all ranks: they drop the same histories, which they simulate together.
         """

@@ -45,7 +45,7 @@ class LinearRun(NamedTuple):
 
     ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
     drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
-    at the first site. ``statistics`` are the run's, ``measures`` by first site (cell) what ``measured`` gives.
+    at the first site. ``statistics`` are the run's; ``measures`` has what ``measured`` gives, by first site (cell).
     """
 
     envelope: np.ndarray

@@ -105,7 +105,7 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
 
     at_bounds = by_part.T[np.searchsorted(rows, clusters.bounds)]
     transfer = np.diff(at_bounds, axis=1)[:, 0]
-    # While a drive acts, what it gives between the bounds is none of the contacts' transfer.
+    # While a drive acts, the energy that it gives between the bounds is not transferred by contacts.
     drives_end = max(drive.waveform.duration for drive in record.model.drives)
     for c in np.flatnonzero(time[clusters.bounds[:, 0]] < drives_end):
         begin = clusters.bounds[c, :1]

@@ -254,7 +254,7 @@ class ScatteringRuns:
         """Fractions and times of one run by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
         fraction = (np.array(record["energy"]) - self.reference) / self.arrived
-        # The reference holds the whole wave: against it nothing is left where nothing is touched, and T = 1 there.
+        # The reference holds the whole transmitted wave: where nothing is touched the difference is 0, and T is 1.
         fraction[band, FORWARD] += 1
         return {
             "share": fraction,

@@ -81,7 +81,7 @@ def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
 
 
 def site_points(case: PredictCase, largest: float) -> list[float]:
-    """z of the runs of one site, up to the largest that is needed, which ``largest`` is ``BEYOND`` times."""
+    """The z of the runs of one site, up to the largest that is needed; ``largest`` is ``BEYOND`` times that one."""
     # Above the onset the response changes with the logarithm of z.
     high = np.geomspace(HIGH, largest / BEYOND, case.predict.points - len(NEAR_ONSET))
     return [1 + z for z in NEAR_ONSET] + np.unique(high).tolist()

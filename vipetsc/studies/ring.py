@@ -1,8 +1,8 @@
 """Runs on a ring that acts as an infinite lattice with one site: the geometry of the law and of the prediction.
 
 The lattice is a ring of N cells, driven at one, with the site d cells on. The burst lasts T_b. The speed v is that of
-its slow waves, than which all but 1e-3 of the energy in its band is faster; V is the largest group velocity of all
-bands. ``LawCase.one_site`` chooses N, d and the end t_e of a run by three conditions:
+its slow waves: all but 1e-3 of the energy in its band is faster. V is the largest group velocity of all bands.
+``LawCase.one_site`` chooses N, d and the end t_e of a run by three conditions:
 
 - t_e = d/v + s T_b with s = ``law.settle``: at d/v + T_b the last slow waves have passed the site, and contacts die
   away in the time that is left.
@@ -12,8 +12,8 @@ bands. ``LawCase.one_site`` chooses N, d and the end t_e of a run by three condi
   it does without a site.
 
 A ring has no wall. Where the case moves one, a force on the mass next to it sends the wave instead; at a site this has
-the form of the wall's wave if the burst is narrow in frequency. By how much the wall has to move for it follows from a
-run of a lattice with that wall (``Ring.wall_peak``).
+the form of the wall's wave if the burst is narrow in frequency. How far the wall has to move for such a wave follows
+from a run of a lattice with that wall (``Ring.wall_peak``).
 """
 
 from collections.abc import Mapping

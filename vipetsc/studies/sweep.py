@@ -1,6 +1,6 @@
 """Sweeps: all members are simulated on all ranks, and their measures are collected in ``ensemble.h5``.
 
-The linear runs come first, which members without contact are scaled from, then the members, those that take longest
+The linear runs come first, since members without contact are scaled from them. Then come the members, the longest
 first. A sweep goes on after members that fail, and can be resumed after an interruption.
 """
 
@@ -336,7 +336,7 @@ def is_whole(path: Path, lost: list[str]) -> bool:
 def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:
     """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns ``status`` (member,) and warnings.
 
-    Files that are there stay where they are of the same results, unless ``afresh``.
+    Files of the same results stay as they are, unless ``afresh``.
     """
     plan = results.plan
     folder = results.folder
