@@ -25,7 +25,9 @@ from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.response.free_motions import resonance
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import sample_orbit
+from vipetsc.modes.shooting.shooting import Shooting
 
 OF_MASS = 0.2
 OF_STIFFNESS = 1e-7
@@ -223,6 +225,38 @@ def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(meth
         assert of_own.energy == pytest.approx(of_lattice.energy, rel=1e-9)
         assert of_own.loss == pytest.approx(of_lattice.loss, rel=1e-9)
         assert of_own.force == pytest.approx(of_lattice.force, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["half", "whole", "half-centre"])
+def test_losses_are_those_of_the_orbit_whichever_part_of_it_is_shot(name):
+    """An orbit that a map of another branch shoots, from rest or from the centre, has the same loss and force."""
+    own = {
+        "masses": [1.0, 1.5],
+        "springs": [{"start": start, "end": end, "stiffness": 1.0} for start, end in ((0, 1), (1, 2), (0, 2))],
+        "dashpots": [{"start": 0, "end": 1, "damping": 2e-3}, {"start": 1, "end": 2, "damping": 1e-3}],
+        "contacts": [{"host": 1, "resonator": 2, "clearance": 0.5}],
+    }
+    contacts = {"law": "bilinear", "stiffness": 2.0, "restitution": 0.99}
+    nnm = {"system": "own", "own": own, "forced": [1], "max_newton": 20}
+    method = ShootingMethod(NnmCase.from_table({"name": "own", "contacts": contacts, "nnm": nnm}), MPI.COMM_SELF)
+    quarter = method.shooting
+    frame = quarter.relative_frame(np.array([-0.6, 0.5]), 2 * np.pi / 1.8)
+    row = np.append(frame.xi[:-1], 0.0)
+    point = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
+    assert quarter.map.quarter
+    assert point.residual < 1e-12
+    assert point.episodes == 1
+
+    other = Shooting(quarter.flow, MAPS[name])
+    moved = point
+    if other.map.start == "centre":
+        # The orbit passes the centre a quarter of a period after its rest.
+        moved = replace(point, x=quarter.arc(point.x, point.period).end[2:])
+    expected = method.assess(quarter, point)
+    found = method.assess(other, moved)
+
+    assert found.loss == pytest.approx(expected.loss, rel=1e-9)
+    assert found.force == pytest.approx(expected.force, rel=1e-9)
 
 
 @pytest.mark.slow

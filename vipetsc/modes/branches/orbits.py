@@ -159,7 +159,9 @@ class ShootingMethod(NnmMethod):
         """The point with its loss, if anything dissipates."""
         if not self.dissipation.acts:
             return point
-        return with_loss(self.shooting, self.dissipation, point)
+        # A branch that crosses another one may have another map, and with it other initial values.
+        assert isinstance(problem, Shooting)
+        return with_loss(problem, self.dissipation, point)
 
     def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""
