@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,31 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     dofs = problem.system.dofs
     vanishing = quarter[:dofs] if problem.map.start == "rest" else quarter[dofs:]
     assert np.abs(vanishing).max() > 1e-4 * np.abs(quarter).max()
+
+
+@pytest.mark.parametrize("faster", [2.0**40, 2.0**-40])
+@pytest.mark.parametrize("kind", ["symmetry-breaking", "period-doubling"])
+def test_a_crossing_branch_is_the_same_in_any_unit_of_time(kind, faster, kerschen_in_phase):
+    """A system whose time runs faster or more slowly has the same crossing branch, with orbits so much faster."""
+    slow = kerschen_in_phase.problem
+    system = kerschen_system()
+    springs = tuple(
+        spring._replace(law=replace(spring.law, cubic=spring.law.cubic * faster**2)) for spring in system.springs
+    )
+    system = replace(system, stiffness=system.stiffness * faster**2, springs=springs)
+    fast = Shooting(Dop853Flow(system), slow.map, slow.tolerance, slow.newton.max_newton)
+    point = kerschen_in_phase.of_kind(kind)[0]
+    tangent = np.append(point.tangent[:-1], point.tangent[-1] / faster)
+    moved = replace(point, period=point.period / faster, energy=point.energy * faster**2, tangent=tangent)
+
+    slow_problem, expected = switch(slow, point)
+    fast_problem, found = switch(fast, moved)
+
+    assert fast_problem.map is slow_problem.map
+    assert fast_problem.tolerance == slow_problem.tolerance
+    unit = 1.0 if fast_problem.map.starts_at_rest else faster
+    assert found.x.tolist() == (expected.x * unit).tolist()
+    assert found.period == expected.period / faster
 
 
 def test_a_crossing_branch_has_the_newton_steps_that_were_asked_for(kerschen_in_phase):
