@@ -118,11 +118,11 @@ def with_loss(problem: Shooting, dissipation: Dissipation, point: Point) -> Poin
     force = np.nan
     if dissipation.forced is not None:
         omega = 2 * np.pi / point.period
-        # About a rest displacements are even, about the centre odd.
-        wave = np.sin
+        # About a rest displacements are even, a sum of cosines; about the centre odd, a sum of sines.
+        lag = np.pi / 2
         if problem.map.starts_at_rest:
-            wave = np.cos
-        harmonic = sum(m.weight * m.u[dissipation.forced] * wave(omega * m.time) for m in moments)
+            lag = 0.0
+        harmonic = sum(m.weight * m.u[dissipation.forced] * np.cos(omega * m.time - lag) for m in moments)
         force = force_for(loss, 2 * images / point.period * float(harmonic))
     return replace(point, loss=loss, force=force)
 
