@@ -336,9 +336,12 @@ class StopRequest:
             if self._ends_at_once:
                 self._leave()
 
-        # A signal that nohup has set to be ignored stays ignored.
-        taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-        earlier = {number: signal.signal(number, receive) for number in taken}
+        # All handlers are known before the first one is replaced: a signal may come between two replacements, and
+        # ``receive`` needs them. A signal that nohup has set to be ignored stays ignored.
+        handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+        earlier = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
+        for number in earlier:
+            signal.signal(number, receive)
         try:
             yield self
         finally:

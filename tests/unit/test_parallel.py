@@ -152,3 +152,18 @@ def test_a_signal_that_nohup_ignores_stays_ignored():
     with StopRequest().listening() as stop:
         signal.raise_signal(signal.SIGHUP)
         assert not stop.requested
+
+
+def test_a_signal_while_handlers_are_replaced_is_a_request(monkeypatch):
+    """A signal that comes after the first handler is replaced, and before the others are, is a request as any other."""
+    replace = signal.signal
+
+    def replace_and_signal(number, handler):
+        before = replace(number, handler)
+        monkeypatch.undo()
+        signal.raise_signal(number)
+        return before
+
+    monkeypatch.setattr(signal, "signal", replace_and_signal)
+    with StopRequest().listening() as stop:
+        assert stop.requested
