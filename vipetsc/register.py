@@ -13,6 +13,7 @@ Each part records the module that registers it and the SHA-256 of its source fil
 
 import hashlib
 import inspect
+import marshal
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -241,9 +242,10 @@ def waveform(
 def measure(name: str, *, unit: str, text: str, power: float | None = None) -> Callable[[Function], Function]:
     """Register the decorated function as a measure of runs, which ``run``, ``sweep``, ``optimise`` and ``export`` take.
 
-    It takes a ``vipetsc.spectra.measures.RunRecord`` and returns a number in ``unit``, None where the run has no such
-    thing, NaN where it has but no value; ``text`` describes it. Without contact it is proportional to the amplitude to
-    the ``power``: sweeps then scale a linear run for members without contact. Raises ValueError if the name is taken.
+    It takes a ``vipetsc.spectra.measures.RunRecord`` and returns a number in ``unit``: None where the run cannot have
+    that number, NaN where it could have it but has no value. ``text`` describes the measure. Without contact it is
+    proportional to the amplitude to the ``power``: sweeps then scale a linear run for members without contact. Raises
+    ValueError if the name is taken.
     """
 
     def add(function: Function) -> Function:
@@ -289,10 +291,20 @@ def file_digest(file: str) -> str:
 
 def _origin(name: str, function: Callable[..., Any]) -> dict[str, Any]:
     """The fields of the part ``name`` that say where its ``function`` comes from; raises ValueError if it is none."""
-    file = str(_plain(function).__code__.co_filename)
+    plain = _plain(function)
+    file = str(plain.__code__.co_filename)
     # Code that is typed in has no file: the hash is that of the function's own text.
-    digest = file_digest(file) or hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
+    digest = file_digest(file) or hashlib.sha256(_text_of(plain)).hexdigest()
     return {"name": name, "modules": {function.__module__}, "file": file, "sha256": digest}
+
+
+def _text_of(function: FunctionType) -> bytes:
+    """The text of a ``function``, or its compiled code where Python keeps no text: at its prompt, and with ``-c``."""
+    try:
+        return inspect.getsource(function).encode()
+    except OSError:
+        # Versions of this format above 2 also store how often objects are referred to, which differs between processes.
+        return marshal.dumps(function.__code__, 2)
 
 
 def _plain(function: Callable[..., Any]) -> FunctionType:

@@ -8,11 +8,12 @@ import h5py
 import numpy as np
 import pytest
 
+from vipetsc import register
 from vipetsc.case.registered import check_factors, check_law
 from vipetsc.case.waveforms import OneDrive, waveform_record
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.sources import FILES
-from vipetsc.register import DISSIPATION, FIGURE, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
+from vipetsc.register import DISSIPATION, FIGURE, MEASURE, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -71,6 +72,18 @@ def test_a_factor_that_fails_is_named_with_its_file(monkeypatch):
     assert list(check_factors("contacts.damping", ["inverse"], [0.5])) == []
     with pytest.raises(PartError, match=r"the dissipation 'inverse' of .* fails: ZeroDivisionError"):
         list(check_factors("contacts.damping", ["inverse"], [0.0]))
+
+
+def test_a_part_that_is_typed_in_where_no_text_is_kept_has_a_hash(monkeypatch):
+    """At Python's own prompt a part has the hash of its compiled code: equal for equal code, another one for other."""
+    hashes = []
+    for value in ("1.0", "1.0", "2.0"):
+        monkeypatch.delitem(PARTS[MEASURE], "typed", raising=False)
+        text = f"@register.measure('typed', unit='1', text='')\ndef typed(record):\n    return {value}\n"
+        exec(compile(text, "<stdin>", "exec"), {"register": register, "__name__": "typed"})
+        hashes.append(PARTS[MEASURE].pop("typed").sha256)
+    assert len(hashes[0]) == 64
+    assert hashes[0] == hashes[1] != hashes[2]
 
 
 @pytest.mark.parametrize("frequency", [None, "fast", 0.0, np.nan])
