@@ -66,7 +66,7 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
 
 @kernel
 def drive_force(drives: Drives, i: int, t: float) -> float:
-    """Force in N of drive ``i`` at time t in s: of the burst by Eq. (3), else of the piece that is on."""
+    """Force in N of drive ``i`` at time t in s: a burst's by the paper's Eq. (3), else that of the piece that is on."""
     drive = drives.rows[i]
     if drive.first >= drive.last:
         if t <= 0.0 or t >= drive.duration:
@@ -121,9 +121,10 @@ def select_pieces(drives: Drives, t: float) -> None:
 
 @kernel
 def drive_end(drives: Drives, i: int, begin: float, interval: float, position: float) -> float:
-    """Position in the step of ``interval`` s from ``begin`` on up to which drive ``i`` is smooth; -1 if it is over.
+    """Position in the step of ``interval`` s from ``begin`` on up to which drive ``i`` is smooth.
 
-    The piece that begins at the ``position``, to rounding, is turned on. A burst's end stays its end.
+    For a drive that is over at the ``position`` it is a number below that. The piece that begins at the ``position``,
+    to rounding, is turned on. A burst's end stays its end.
     """
     drive = drives.rows[i]
     if drive.first >= drive.last:

@@ -43,8 +43,8 @@ class Samples(NamedTuple):
     watched: np.ndarray
 
     def rows(self, samples: int) -> int:
-        """Number of the first so many ``samples`` whose fields are recorded."""
-        # Of the numbers below n the stride divides ceil(n/stride).
+        """How many of the first ``samples`` samples have recorded fields."""
+        # The stride divides ceil(n/stride) of the numbers below n.
         return -(-(self.number + samples) // self.stride) + -self.number // self.stride
 
 

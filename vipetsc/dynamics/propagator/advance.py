@@ -137,8 +137,8 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
         if not begins_linearly(sites[i].elastic) and abs(sites[i].mode) == CLOSED:
             age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
             if age * cluster.interval <= NEW * cluster.history[i].duration:
-                # These nodes suit this contact at any length. Of another one that is young as well only the error of
-                # the substep is a bound.
+                # These nodes suit this contact at any length. Another contact that is young as well limits the length
+                # by the error of the substep alone.
                 return Substep(ONSET, longest)
             length = min(length, MOST_AGES * age)
     return Substep(PLAIN, length)
@@ -227,7 +227,7 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     if change.position > 1.0:
         return substep, False, -1
 
-    # Of the switching functions of a closed site number 0 is that of separation (``contact.changes``).
+    # The switching function 0 of a closed site is that of separation (``contact.changes``).
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:

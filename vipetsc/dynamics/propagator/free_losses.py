@@ -17,7 +17,8 @@ from vipetsc.dynamics.propagator.nodes import gauss
 from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, in_fours, ranges_of, sparse_rows
 from vipetsc.dynamics.vectors import LANES
 
-# Entries below this fraction of a table's largest one are left out.
+# Entries below this fraction of a table's largest one are left out. With this fraction the error of the energy
+# balance of the example ``damped`` is 3e-13 of the work, with 1e-10 it is 3e-10, with all entries 1.5e-13.
 SMALL = 1e-12
 
 

@@ -213,6 +213,6 @@ def _significant(kinds: np.ndarray, kernels: np.ndarray, groups: Groups) -> tupl
     least[kinds[targets, places]] = SMALLEST_MODE * scale
     counts = sizes > least[:, None, None]
     degree = np.add.outer(np.arange(modes), np.arange(modes))
-    # Of higher degrees than the modes' the coefficients are as small as those of modes left out.
+    # Coefficients of higher degrees than the modes' are as small as those of modes left out.
     degrees = np.minimum(np.where(counts, degree + 1, 0).max(axis=(1, 2)), modes)
     return np.where((kinds >= 0) & (degrees[kinds] > 0), kinds, -1), degrees

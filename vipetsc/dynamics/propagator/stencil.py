@@ -188,8 +188,8 @@ class SparseRows(NamedTuple):
 
 def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
     """Rows in blocks of four, from ``entries`` (2 dof, 2 dof, cell) of an interior cell, counted from ``-reach`` on."""
-    # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Of an odd
-    # number of masses the last one is there twice.
+    # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Where the
+    # number of masses is odd, the last one is there twice.
     dofs = layout.dofs
     masses = np.minimum(np.arange(dofs + dofs % 2), dofs - 1)
     blocks = np.column_stack([masses, masses + dofs]).reshape(-1, 4)

@@ -63,7 +63,8 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
     code.
     """
     handles = array_at(vectors, count, np.int64)
-    # Of the vectors, then of y, then its size.
+    # Addresses of the vectors, then of y, then the size of y. ``get_write`` gives the array with y's numbers in it, as
+    # PETSc does for all vectors in the memory of this process.
     addresses = np.zeros(count + 2, np.int64)
     at = addresses.ctypes.data
     error = native.local_size(y, at + 8 * (count + 1)) or native.get_write(y, at + 8 * count)

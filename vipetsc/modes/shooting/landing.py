@@ -18,7 +18,8 @@ from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
 NONE, CROSSING, EXTREMUM = range(3)
-# Largest number of attempts at one extremum, and of one landing in all. Bisection of a step to rounding takes about 54.
+# Largest number of attempts at one extremum, and of one landing in all. Bisection of a step to rounding takes about 54:
+# that to the root before an extremum has room after all attempts at the extremum.
 EXTREMUM_ATTEMPTS = 40
 MOST_ATTEMPTS = 120
 # Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.

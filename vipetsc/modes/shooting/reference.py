@@ -23,7 +23,7 @@ from vipetsc.modes.system import System
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.
 RTOL = 1e-13
 RTOL_SENSITIVITY = 1e-10
-# Steps a period of Newmark's rule.
+# Steps a period of Newmark's rule: as many as the paper takes.
 STEPS = 2000
 
 
