@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from tests.conftest import assert_same_bits, datasets, run_of
 from tests.models import THREE_MASS_CELL
@@ -23,7 +24,7 @@ from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, upper_fraction, wave_energies
 from vipetsc.studies.one_site import ScatteringRuns, make_law
-from vipetsc.studies.pair_motion import largest_between
+from vipetsc.studies.pair_motion import ContactSpan, largest_between
 from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
 
 
@@ -103,6 +104,23 @@ def test_the_largest_value_between_samples():
     t = np.linspace(0, 1, 41)
 
     assert largest_between(t, np.sin(20 * t), 20 * np.cos(20 * t)) == pytest.approx(1, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("onset", "separation", "expected"),
+    [
+        ([], [], [np.nan, np.nan]),
+        ([0.2, 0.1], [0.3, 0.15], [0.1, 0.3]),
+        ([0.1, 0.2], [0.15, np.nan], [0.1, 1.0]),
+        ([0.1], [np.nan], [0.1, 1.0]),
+    ],
+)
+def test_a_contact_that_does_not_end_lasts_to_the_end_of_the_run(onset, separation, expected):
+    """The log has no separation for a contact that is closed at the last sample, which an earlier one must not give."""
+    run = xr.Dataset(
+        {"impacts/onset": ("episode", onset), "impacts/separation": ("episode", separation), "time": [0.0, 0.5, 1.0]}
+    )
+    np.testing.assert_array_equal(ContactSpan.of(run), expected)
 
 
 @pytest.mark.parametrize("lattice", LATTICES)

@@ -46,7 +46,7 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
-from vipetsc.studies.pair_motion import PairMotion
+from vipetsc.studies.pair_motion import ContactSpan, PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.ring import Ring
 from vipetsc.studies.scattering_law import BACKWARD, DAMPED, FORWARD, LAYOUT, NEAR, POINT_LAYOUT, ScatteringLaw
@@ -207,20 +207,15 @@ class ScatteringRuns:
     def _contact(self, run: xr.Dataset, amplitude: float) -> Record:
         """Times, forces and losses of the contact in a ``run`` under ``amplitude`` in N; energies over its square."""
         square = amplitude**2
-        first_contact = np.nan
-        last_contact = np.nan
-        onset = run["impacts/onset"].values
-        if len(onset):
-            first_contact = float(onset.min())
-            last_contact = float(np.nanmax(run["impacts/separation"].values))
+        span = ContactSpan.of(run)
         linear = self.records[LINEAR]
-        release = np.interp(last_contact, linear["time"], linear["envelope"]) * amplitude / self.setting.clearance
+        release = np.interp(span.last, linear["time"], linear["envelope"]) * amplitude / self.setting.clearance
         return {
             "dissipated": float(run["energy/dissipated"][-1]) / square,
             "contact": float(run["energy/contact"][-1]) / square,
-            "episodes": len(onset),
-            "onset": first_contact,
-            "separation": last_contact,
+            "episodes": run.sizes["episode"],
+            "onset": span.first,
+            "separation": span.last,
             "release": float(release),
         }
 

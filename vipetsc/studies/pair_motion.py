@@ -1,4 +1,4 @@
-"""The relative motion w = u_resonator - u_host of contact pairs in a recorded run, and the largest of it."""
+"""The relative motion w = u_resonator - u_host of contact pairs in a recorded run, its maximum, and its contacts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -85,3 +85,23 @@ def largest_between(
     values = curve(candidates)
     plus, minus = gaps
     return float(max(values.max() / plus, -values.min() / minus, 0.0))
+
+
+class ContactSpan(NamedTuple):
+    """The times in s between which the contacts of a run act: ``first`` begins one, ``last`` ends one; NaN without any.
+
+    A contact that is closed when the run ends lasts until then.
+    """
+
+    first: float
+    last: float
+
+    @classmethod
+    def of(cls, run: xr.Dataset) -> Self:
+        """The span of all contacts in the log of a ``run``."""
+        onset = run["impacts/onset"].values
+        if not len(onset):
+            return cls(first=np.nan, last=np.nan)
+        # The log has NaN for the separation of a contact that is still closed.
+        separation = np.nan_to_num(run["impacts/separation"].values, nan=float(run["time"][-1]))
+        return cls(first=float(onset.min()), last=float(separation.max()))

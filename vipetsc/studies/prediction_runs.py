@@ -19,7 +19,7 @@ from vipetsc.io.records import Record
 from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import ModalParts
-from vipetsc.studies.pair_motion import PairMotion
+from vipetsc.studies.pair_motion import ContactSpan, PairMotion
 from vipetsc.studies.rays import BINS
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import Burst, SiteRun
@@ -151,23 +151,17 @@ class PredictionRuns:
         run = ring.run_at_site(amplitude, with_site=True)
         motion = ring.motion(run)
 
-        # The times between which the contact's force acts; NaN without a contact.
-        first_contact = np.nan
-        last_contact = np.nan
-        separation = run["impacts/separation"].values
-        if len(separation):
-            first_contact = float(run["impacts/onset"].min())
-            last_contact = float(np.nanmax(separation))
+        span = ContactSpan.of(run)
         touched = SiteRun(
             amplitude=amplitude,
             clearance=clearance,
             displacement=motion.displacement[:, 0],
             dissipated=run["energy/dissipated"].values,
-            last_contact=last_contact,
+            last_contact=span.last,
         )
         record = {"z": z, "amplitude": amplitude, "largest": largest} | linear.burst.sums(touched, largest)
         if linear.waves:
-            force = linear.waves.force(motion, amplitude * linear.displacement, first_contact, last_contact)
+            force = linear.waves.force(motion, amplitude * linear.displacement, span.first, span.last)
             record["spectrum"] = linear.waves.sent_by_bins(force, BINS).tolist()
         return record
 

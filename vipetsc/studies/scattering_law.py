@@ -69,7 +69,8 @@ class ScatteringOutcome(NamedTuple):
     still closed holds at the end, and what the ``dashpots`` at the site take, the whole ``share`` adds up to 1.
 
     ``onset`` and ``separation`` are the times in s at which the first contact begins and the last one ends, NaN without
-    any. ``release`` is the linear envelope over the clearance at ``separation``.
+    any; a contact that is closed at the end of a run lasts until then. ``release`` is the linear envelope over the
+    clearance at ``separation``.
     """
 
     share: np.ndarray
