@@ -42,7 +42,7 @@ def remove_abandoned(folder: Path) -> None:
 
     It is for commands that hold no lock on the folder: other commands may be writing there at the same time.
     """
-    # To its end: the name of another host may begin with that of this one and a number.
+    # The pattern covers the whole name: that of another host may begin with that of this one, a dash and a number.
     of_this_host = re.compile(rf"\..*\.{re.escape(platform.node())}-(\d+)-[0-9a-f]+\.part", re.DOTALL)
     for path in folder.glob(".*.part"):
         named = of_this_host.fullmatch(path.name)

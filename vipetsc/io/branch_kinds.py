@@ -1,7 +1,7 @@
 """The kinds of branch files: orbits, condensed motions, responses; the attribute ``branch_kind`` of a file names it.
 
-All readers use `branch_kind`; ``vipetsc.modes.branches``, which has the format of the files, writes the attribute. This
-module is not there but here because figures, which read branches, do not load PETSc.
+All readers use `branch_kind`; ``vipetsc.modes.branches``, which has the format of the files, writes the attribute. The
+readers are in this room because figures, which read branches, do not load PETSc.
 """
 
 from collections.abc import Sequence

@@ -276,8 +276,8 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
     ready = path / READY
     moving = path / MOVING
     old = path / OLD
-    # Earlier results go first. Only when all are gone does ``ready`` become ``moving``: a kill before leaves them to be
-    # moved, and a kill after it leaves new results, which are not to be moved with them.
+    # Earlier results are moved first, and ``ready`` becomes ``moving`` when all of them are gone. A kill before that
+    # leaves earlier results in ``path``, which are still to be moved; a kill after it leaves new ones, which must stay.
     if ready.is_dir():
         old.mkdir(exist_ok=True)
         for pattern in (kind.marker, *kind.results, *kind.companions):

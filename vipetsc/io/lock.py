@@ -145,7 +145,7 @@ def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
             # The last word in the file is the token of the process that has the lock.
             holder, _, token = os.read(descriptor, 1000).decode().strip().rpartition(" ")
             os.close(descriptor)
-            # Another error than that the file is locked: the file system has no locks, and work goes on without one.
+            # If the error is not that the file is locked, the file system has no locks, and work goes on without one.
             if token == TOKEN or not isinstance(error, BlockingIOError):
                 return None, None
             return None, holder or "another process"

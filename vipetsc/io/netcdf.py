@@ -252,7 +252,7 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
     attributes: dict[str, Any] = {}
     with files.acquire_context() as file:
         nodes = dict(_nodes("", h5py.h5g.open(file.id, b"/")))
-        # By their addresses: to ask HDF5 for the name of an object takes a search of the whole file.
+        # Objects are recognised by their addresses: for the name of an object HDF5 would search the whole file.
         paths = {h5py.h5o.get_info(node).addr: path for path, node in nodes.items()}
 
         for path, node in nodes.items():

@@ -28,9 +28,9 @@ class State(NamedTuple):
     def read(cls, path: str | Path, time: float | None = None, orbit: int | None = None) -> Self:
         """Read a state from a file: a sample of a run, an orbit of a branch, or the only state that there is.
 
-        Of a run it is the sample nearest to ``time`` (s), of a branch the one with the number ``orbit``, by default the
-        last; a key that the file has no use for is ignored. Raises OSError if the file cannot be opened, ValueError if
-        it holds no state, not that one, or numbers that are not finite.
+        The state of a run is the sample nearest to ``time`` (s), that of a branch is the orbit with the number
+        ``orbit``; the last one is the default. A key that the file has no use for is ignored. Raises OSError if the
+        file cannot be opened, ValueError if it holds no state, not that one, or numbers that are not finite.
         """
         with open_netcdf(path, "state") as file:
             # A branch has its states in a group of their own.

@@ -139,8 +139,8 @@ class RunFolder:
 
         def replace_oldest() -> None:
             save_arrays(path, state)
-            # Of two checkpoints the older one goes. The one before this stays: until all ranks have written this one,
-            # it is the last that is complete.
+            # Two checkpoints are kept: until all ranks have written this one, the one before it is the last that is
+            # complete.
             if self.comm.rank == 0:
                 for old in self._parts.glob(f"state-{number - 2:06d}-*"):
                     old.unlink()
@@ -317,7 +317,7 @@ class RunMemory:
         # Checkpoints are the same on any number of ranks: what continues from one has the same bits then.
         self.chunk_length = states_every
         if states_every is None and comm.size == 1:
-            # One rank's fields are not copied, for which chunks would have to be small.
+            # The fields of one rank are not copied, so that chunks need not be small.
             self.chunk_length = sys.maxsize
         self.states: list[list[Arrays]] = []
         self.count = 0
@@ -356,7 +356,7 @@ class RunMemory:
         arrays = dict(chunk or {})
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
-        # On one rank the engine has written them there, into the ``room`` that it asked for.
+        # On one rank the engine has written the fields there already, into the ``room`` that it asked for.
         if self.comm.size > 1 and fields:
             self._fields[:, rows] = fields
         self._rows = rows.stop
