@@ -75,7 +75,7 @@ def describe_ends(case: Case) -> str:
 def describe_losses(case: Case) -> str:
     """The least, largest and mean loss of each band over its wavenumbers, as text; empty if no loss is prescribed.
 
-    The loss is twice the damping ratio. The loss that the case requests of a band, if it does, follows in brackets.
+    The loss is twice the damping ratio. If the case requests a loss of the band, it follows in brackets.
     """
     sentences = []
     for band, (requested, least, mean, most) in enumerate(losses(case.lattice), 1):

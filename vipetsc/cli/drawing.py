@@ -38,7 +38,7 @@ class Helper(Protocol):
 
     @property
     def requests(self) -> Sequence[DrawRequest]:
-        """What was asked for and `drawn` has not waited for: this process can draw pictures that are left of it."""
+        """The requests for which `drawn` has not waited: this process can draw pictures that are left of them."""
 
     def ask(self, source: str, folders: Sequence[Path], **options: Any) -> None:
         """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once."""
@@ -178,7 +178,7 @@ def report(pictures: Pictures, comm: MPI.Comm, sentences: Sequence[str]) -> None
         if pictures.source == SWEEP_FIGURES:
             echo(comm, f"vipetsc: {sentence}", sys.stderr)
         else:
-            # A lattice without sites has no impacts: no matter to warn of.
+            # No warning: a lattice without sites, for example, has no picture of impacts.
             echo(comm, f"  {sentence}")
 
 

@@ -132,7 +132,7 @@ def _modes_refusal(case: Case) -> str:
 
 QUIET: Table = {"output": {"figures": False}}
 NNM = {"modes": [1], "points": 2, "energy": [0.0, 1.0]}
-# By the default bound on the harmonics that are left out, hundreds would be taken along.
+# With the default bound on what is left out, a motion would have hundreds of harmonics.
 FEW_HARMONICS = {"harmonics": 41, "truncation": 1e-3}
 TWELVE_CELLS: Table = {"lattice": {"cells": 12}, "contacts": {"sites": [6, 8]}}
 BREATHER = {"start_frequency": [4500.0], "start_sites": [1]}

@@ -61,7 +61,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
         on_root(comm, lambda: streams.append(_open_log(options.log)))
         handlers += [_log_handler(stream) for stream in streams[1:]]
 
-    # Without propagation: the handler that `__main__` gives the root logger would print everything again.
+    # Messages do not go on to the root logger: the handler that `__main__` gives it would print everything again.
     is_verbose = options.verbose and comm.rank == 0
     level = logger.level
     logger.propagate = False
@@ -76,7 +76,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     try:
         yield streams
     except Exception as error:
-        # Into the file alone: on stderr the exception hook of the process reports the error.
+        # The error goes into the file alone: on stderr the exception hook of the process reports it.
         for handler in handlers:
             if handler.stream in streams[1:]:
                 handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))

@@ -93,7 +93,7 @@ def check_standard_streams() -> None:
 def report_unwritten(streams: Iterable[Any]) -> int:
     """Report on stderr which of the ``streams`` lost output; returns an exit code, 0 if none did.
 
-    Of a closed pipe the code is that of a program that SIGPIPE has ended, without a message; else it is 1.
+    For a closed pipe the code is that of a program that SIGPIPE has ended, and there is no message; else it is 1.
     """
     errors = {stream.title: stream.error for stream in streams if isinstance(stream, CheckedStream) and stream.error}
     # A reader that closes the pipe, as `head` does, needs no message.

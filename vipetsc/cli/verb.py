@@ -141,7 +141,7 @@ class StudyVerb(Verb):
 
     def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         """Compute, draw and report; returns the exit code."""
-        # Before anything is written: a case that is refused leaves no folder behind.
+        # The case is read before anything is written: one that is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
         # One rank has read the case, and has imported the modules that it names; the others do now.
         on_every_rank(comm, case.import_plugins)

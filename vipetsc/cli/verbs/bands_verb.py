@@ -52,7 +52,7 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
 
     cell = case.lattice.unit_cell()
     numbers = bands_table(cell) | damping_table(cell, case.wave_frequency or 0.0)
-    # With the communicator of this rank, the only one here: on another the lock would wait for all ranks.
+    # The lock has the communicator of this rank, the only one here: with another it would wait for all ranks.
     with locked(MPI.COMM_SELF, folder):
         picture: dict[str, str] = {}
         if cell.joins_cells:

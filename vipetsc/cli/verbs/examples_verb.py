@@ -115,7 +115,7 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
     others = [path for path, content in contents.items() if path.exists() and not _holds(path, content)]
     if others and not force:
         raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
-    # With the communicator of this rank, the only one here: on another the lock would wait for all ranks.
+    # The lock has the communicator of this rank, the only one here: with another it would wait for all ranks.
     with locked(MPI.COMM_SELF, *{path.parent for path in contents}):
         for path, content in contents.items():
             with atomic_write(path) as aside:

@@ -100,7 +100,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     """
     from vipetsc.cli.verbs.verb_list import study_verbs
 
-    # By the source, since verbs that leave the same kind of folder have their pictures in common.
+    # Pictures are listed by their source, since verbs that leave the same kind of folder have them in common.
     by_source = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
     files = {pictures.file for pictures in by_source.values()}
     folders = list(paths)

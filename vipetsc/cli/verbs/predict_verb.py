@@ -60,7 +60,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
 
 def prediction_table(data: xr.Dataset) -> str:
     """Predicted and simulated fractions of the energy at every amplitude, and their differences."""
-    # Without ``predict.simulate`` there is nothing simulated, without dashpots no column of theirs.
+    # Simulated columns need ``predict.simulate``, and the columns of dashpots need a lattice that has some.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     quantities = [name for name in ("upper", "other", "dissipated", "dashpots") if f"predicted/{name}" in data]
     columns = [(kind, quantity) for quantity in quantities for kind in kinds]

@@ -45,7 +45,7 @@ def load(options: argparse.Namespace) -> Case:
 
 def _sweep_of(options: argparse.Namespace) -> Sweep:
     """The sweep whose file or folder is given as CASE; raises CaseError."""
-    # Without CASE, a name that no file has: the message about it says what is missing.
+    # Without CASE the path is a text that names no file: the message about that file then says what is missing.
     path = Path(options.case or "the case of a sweep")
     if path.is_dir():
         path = path / "case.toml"
