@@ -141,8 +141,8 @@ def _first_end(
 ) -> TriedEnd:
     """The first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
     sources = sources_of(drives, cell, ends, cells)
-    # From the shortest end on, which costs fewest cells; of one length from the weakest on, whose gradient reflects
-    # least.
+    # Ends are tried from the shortest on, which costs fewest cells, and those of one length from the weakest on, whose
+    # gradient reflects least.
     best = np.inf
     for length in lengths_tried(table, cells):
         # The dashpots leave exp(-loss) of a wave's energy, the integral of strength x^3 through the end and back.

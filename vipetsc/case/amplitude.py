@@ -61,7 +61,7 @@ def amplitude_changes(case: Case, amplitude: float) -> Changes:
         return {"initial": {"amplitude": float(amplitude)}}
 
     assert initial.velocity is not None and initial.amplitude is not None
-    # By the magnitude of the velocity, whose sign is a direction: amplitudes are positive.
+    # The magnitude of the velocity counts, since its sign is a direction: amplitudes are positive.
     factor = float(amplitude) / abs(initial.velocity)
     changes: dict[str, Any] = {"velocity": factor * initial.velocity, "amplitude": factor * initial.amplitude}
     if initial.more:

@@ -378,8 +378,8 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
     """The problem of samples at an ``interval`` in s that is not below the top band's Nyquist interval.
 
-    Of cells that contacts alone join it is that of a cell's highest mode. ``key`` is the key by which the case asks for
-    samples, and ``value`` its value.
+    For cells that contacts alone join it is that of a cell's highest mode. ``key`` is the key by which the case asks
+    for samples, and ``value`` its value.
     """
     top = pass_bands(cell)[-1].high
     # Without springs nothing oscillates between contacts.

@@ -213,7 +213,7 @@ def _zigzag(begin: Point, end: Point) -> str:
 def _stops(host: Point, resonator: Point) -> str:
     """The clearance between the masses of a contact pair: two stops that face each other, next to their spring."""
     start, along, across = _directions(host, resonator)
-    # From inside the circles, which are drawn over them.
+    # The stops begin inside the circles, which are drawn over them.
     aside = 0.7 * RADIUS
     parts = []
     for near, far in ((0.0, 0.45), (1.0, 0.55)):

@@ -206,7 +206,7 @@ def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: S
         yield Problem("lattice.absorbing", None, remedy)
     if lattice.ends == "periodic":
         yield Problem("lattice.absorbing", None, 'a ring has no end; use ends = "fixed" or "free"')
-    # Without a length it is chosen later, and checked then.
+    # A length that is not given is chosen later, and checked then.
     n = absorbing.cells or 0
     if 2 * n >= lattice.cells:
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")

@@ -175,9 +175,9 @@ class InitialTable(Section):
 class Beginning(NamedTuple):
     """The resolved ``section``, the ``frequency`` in rad/s of the motion, and its ``cell`` (1-based).
 
-    That is the middle of a packet, the cell of the fastest mass that is struck, or of the largest displacement of a
-    state; of a mode, which is everywhere, the first one. ``moving`` are the cells (1-based) of a state that was read
-    from a file in which some mass moves or is displaced; it is None where the section alone says what is at rest.
+    The cell is the middle of a packet, that of the fastest mass that is struck, or that of the largest displacement of
+    a state; for a mode, which is everywhere, it is the first one. ``moving`` are the cells (1-based) of a state from a
+    file in which some mass moves or is displaced; it is None where the section alone says what is at rest.
     """
 
     section: InitialTable
@@ -250,7 +250,7 @@ def beginning_of(
     ``frequency`` in rad/s is that of the case's drive, if it has one. If no springs hold a mass that is struck, its
     frequency is that of a contact, which ``touching`` gives for a speed in m/s.
     """
-    # Without contacts, and with equal cells: modes and packets are those of the linear, uniform lattice.
+    # The chain has equal cells and no contacts: modes and packets are those of the linear, uniform lattice.
     chain = Chain(lattice.unit_cell(), lattice.cells, lattice.ends)
     frequency = frequency or initial.frequency
     try:

@@ -84,7 +84,7 @@ def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: in
         # The stiffness of the site is that of its own material.
         of_site |= dict.fromkeys(("modulus", "radius", "poisson"))
 
-    # Without the parameters of other laws, which the lists may have for other sites.
+    # Parameters of other laws, which the lists may have for other sites, are removed.
     law = kind.law.law
     of_site |= {key: None for key, parameter in PARAMETERS.items() if parameter.law != law}
     if law in LAWS:

@@ -130,7 +130,7 @@ def read_measured(record: RecordTable) -> Measured:
         [columns[f"sensors[{number}].column"] * sensor.factor for number, sensor in enumerate(record.sensors, 1)]
     )
     _check_count("file", record.file, len(values))
-    # Cut only after the times were found even: the interval of a short part would be less exact.
+    # The record is cut only after its times were found even: the interval of a short part would be less exact.
     times = _times(record, columns.get("time"), len(values))
     for key, sign in (("begin", -1.0), ("end", 1.0)):
         limit = getattr(record, key)
@@ -209,7 +209,7 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
 
     if not rows:
         raise MeasuredError("file", record.file, "has no line of numbers")
-    # Before the conversion to numbers, whose error would not say that a line lacks a field.
+    # Fields are counted before the conversion to numbers, whose error would not say that a line lacks one.
     widths = {len(row) for row in rows}
     if len(widths) != 1:
         raise MeasuredError("file", record.file, f"its lines have {' or '.join(map(str, sorted(widths)))} fields")

@@ -26,7 +26,7 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
         if not low < high:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
-    # Downwards the energy may tend to 0, which no number of steps in its logarithm reaches.
+    # On the way down the energy may tend to 0, which no number of steps in its logarithm reaches.
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
 

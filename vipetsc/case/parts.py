@@ -211,7 +211,7 @@ def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str,
 
 def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
     """Kind, name and record of the parts of the module ``name`` in ``plugins.parts``."""
-    # By the last part of the path: the file may have been recorded in another folder.
+    # Only the last part of the path counts: the file may have been recorded in another folder.
     return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
 
 

@@ -173,7 +173,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         return None, problems
 
     cell = lattice.unit_cell()
-    # Of cells that contacts join the section of contacts decides: see ``check_pairs``.
+    # The section of contacts decides about cells that contacts join: see ``check_pairs``.
     if not cell.joins_cells:
         return cell, problems
 

@@ -84,7 +84,7 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
             values = file[str(dataset)]
             if not isinstance(values, h5py.Dataset):
                 raise ValueError(f"{dataset} is not a dataset")
-            # Before it is read: a file may hold more than the memory.
+            # The shape is checked before the data are read: a file may hold more than the memory.
             _check_shape(values.shape)
             rows = np.asarray(values, float)
     else:

@@ -126,7 +126,7 @@ def values_of(case: Case, quantity: str) -> list[float]:
     if quantity == "clearance":
         return list(model.chain.clearances)
     if quantity == "clearance_minus":
-        # As the case gives them: a site without a stop on that side has a number too, without effect.
+        # These are the numbers of the case: a site without a stop on that side has one too, without effect.
         given = values_of_sites(case.contacts, quantity, len(model.chain.sites))
         both = model.chain.clearances
         return [both[site] if value is None else value for site, value in enumerate(given)]
@@ -225,7 +225,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
     cell = base.lattice.undamped_cell()
     changed_cell = cell
 
-    # By quantity, since a section has the values of all members together, also of those that are not sought.
+    # All numbers of a quantity are changed at once: a section lists every member, also those that are not sought.
     for quantity, numbers in numbers_of(base, parameters, values).items():
         if quantity == "amplitude":
             drive["amplitude"] = numbers[0]
@@ -238,7 +238,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
         else:
             each = contacts.get("each") or (base.contacts.each or Section()).model_dump(exclude_none=True)
             contacts["each"] = each | {quantity: numbers}
-            # Not for all sites, too, where the list has it for each.
+            # The list has a value for each site: one for all sites would contradict it.
             contacts[quantity] = None
 
     changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}

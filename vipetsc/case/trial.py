@@ -112,7 +112,7 @@ def _with_cell_numbers(lattice: LatticeTable, quantity: str, numbers: list[float
         key = OF_SPRINGS[quantity]
         springs = []
         for spring, number in zip(cell.springs, numbers, strict=True):
-            # As ``with_cell`` writes a spring: without a parameter that is 0.
+            # A parameter that is 0 is left out, as ``with_cell`` does it.
             value: float | None = number
             if number == 0 and key != "stiffness":
                 value = None

@@ -29,7 +29,7 @@ def short_names(keys: Sequence[str]) -> dict[str, str]:
 def leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
     """Pairs of a key's path, as "a.b.c", and its value in the table ``tree``; a range is one value."""
     for key, value in tree.items():
-        # Of the seed, { count = n } alone is a range too, and no table.
+        # For the seed { count = n } alone is a range too, and no table.
         if isinstance(value, dict) and not value.keys() & RANGES and path + key != SEED:
             yield from leaves(value, f"{path}{key}.")
         else:

@@ -116,7 +116,7 @@ def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
 
 
 def _step_frequency(drive: "OneDrive", highest: float) -> float:
-    # As if the ramp were half a sine of its length.
+    # The ramp counts as half a sine of its length.
     return float(min(np.pi / (drive.ramp or 1.0), highest))
 
 
