@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import tomllib
+from argparse import Namespace
 from errno import ENOSPC
 
 from mpi4py import MPI
@@ -14,16 +15,20 @@ import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
-from vipetsc.case import Sweep
+from vipetsc.case import CaseError, Problem, Sweep
+from vipetsc.cli.verb import Work
+from vipetsc.cli.verbs import run_verb
+from vipetsc.cli.verbs.sweep_verb import simulate_members
 from vipetsc.dynamics import recorded_sizes
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies import linear_history
+from vipetsc.studies import sweep as studies_sweep
 from vipetsc.studies.ensemble import FAILED
 from vipetsc.studies.linear_history import LinearHistory
 from vipetsc.studies.pool import TaskPool
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.sweep import run_sweep
+from vipetsc.studies.sweep import SweepResult, run_sweep
 
 TABLE = """
 name = "small"
@@ -288,3 +293,46 @@ def test_blocks_of_jobs_hold_every_job_once():
     if comm.size == 1:
         # One rank does the jobs in their order.
         assert done == list(range(1007))
+
+
+class BegunError(Exception):
+    """The work of a verb came so far that all ranks work together."""
+
+
+@pytest.mark.parallel([2])
+def test_one_rank_reads_the_sweep_of_a_member(monkeypatch, tmp_path):
+    """A rank that does not see the file of the sweep takes it from rank 0, and goes on with the others."""
+    plan = sweep()
+
+    def read(options: Namespace) -> Sweep:
+        if MPI.COMM_WORLD.rank:
+            raise CaseError([Problem("case.toml", None, "not on this machine")])
+        return plan
+
+    def begin(of_rank: Sweep, *arguments: object) -> None:
+        assert of_rank.ids() == plan.ids()
+        raise BegunError
+
+    monkeypatch.setattr(run_verb, "_sweep_of", read)
+    monkeypatch.setattr(linear_history, "MemberHistory", begin)
+    work = Work(Namespace(member="0"), tmp_path, MPI.COMM_WORLD, StopRequest())
+    with pytest.raises(BegunError):
+        run_verb.simulate_and_measure(plan.case(0), work)
+
+
+@pytest.mark.parallel([2])
+def test_one_rank_reads_the_index_that_a_table_is_made_of(monkeypatch, tmp_path):
+    """The table of a sweep is made on rank 0, where the index is: another rank need not see that file."""
+    comm = MPI.COMM_WORLD
+    folder = tmp_path / f"seen-by-{comm.rank}"
+    if comm.rank == 0:
+        folder.mkdir()
+        (folder / "index.json").write_text('{"failed": [{"place": "amplitude = 1", "reason": "too large"}]}')
+    result = SweepResult(np.array([FAILED]), 1, 0.0, (1.0, 1.0), folder, warnings=[])
+    monkeypatch.setattr(studies_sweep, "run_sweep", lambda *arguments, **keywords: result)
+    work = Work(Namespace(force=False, resume=False), folder, comm, StopRequest())
+
+    reports: list[str] = []
+    monkeypatch.setattr(Work, "report", lambda self, text: reports.append(text))
+    assert not simulate_members(sweep(), work).complete
+    assert "member amplitude = 1: too large" in reports[0]

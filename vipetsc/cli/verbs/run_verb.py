@@ -63,7 +63,9 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     linear = None
     opening = None
     if work.options.member:
-        linear = MemberHistory(_sweep_of(work.options), case, work.comm, work.stop)
+        # Read by one rank: one that could not read the file would leave the others, which wait for it.
+        plan = on_root(work.comm, lambda: _sweep_of(work.options))
+        linear = MemberHistory(plan, case, work.comm, work.stop)
         opening = linear.opening
     result = simulate(case, work.folder, work.comm, opening=opening, **work.keywords)
     work.warn(result.warnings)

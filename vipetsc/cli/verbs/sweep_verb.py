@@ -12,6 +12,7 @@ from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import SWEEP, FolderError
 from vipetsc.io.read import outdated
+from vipetsc.parallel import on_root
 
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
@@ -25,7 +26,8 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
     result = run_sweep(plan, work.folder, work.comm, **work.keywords)
     work.warn(result.warnings)
-    work.report(sweep_table(result))
+    # The table is made where the index was written: other ranks may not see the file.
+    work.report(on_root(work.comm, lambda: sweep_table(result)))
     return Outcome(complete=result.complete)
 
 
