@@ -110,6 +110,9 @@ def test_written_out_and_read_back_it_has_the_same_members():
     [
         ("", "sweep: missing"),
         ("[sweep]\nfields = true", "contains no key that varies"),
+        ("[sweep.drive]", "contains no key that varies"),
+        ("[sweep.drive]\namplitude = { whole = [1, 3], count = 3 }", "give a list"),
+        ("[sweep.disorder]\nseed = { even = [1, 3], count = 3 }", "give a list"),
         ("[sweep]\nfeilds = true\n[sweep.drive]\namplitude = [1.0]", "did you mean sweep.fields?"),
         ("[sweep.drive]\namplitude = 3.0", "sweep.drive.amplitude = 3.0: give a list"),
         ("[sweep.drive]\namplitude = []", "give a list"),

@@ -79,12 +79,13 @@ class Sweep(StudyCase):
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
 
         values: Values = {}
-        for key, value in leaves(varying):
+        given = dict(leaves(varying))
+        for key, value in given.items():
             try:
                 values[key] = values_in(value)
             except ValueError as error:
                 problems.append(Problem(f"sweep.{key}", value, str(error)))
-        if not varying:
+        if not given:
             remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
 

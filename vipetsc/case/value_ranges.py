@@ -51,6 +51,9 @@ def values_in(value: Any) -> tuple[Any, ...]:
     (kind,) = value.keys() - {"count"}
     ends = value[kind]
     count = value["count"]
+    # "whole" is a range of searches alone: here it would have the values of a linear one, which are no whole numbers.
+    if kind not in ("log", "linear"):
+        raise ValueError(remedy)
     if not (isinstance(ends, list) and len(ends) == 2 and all(type(end) in (int, float) for end in ends)):
         raise ValueError(remedy)
     if type(count) is not int or not 1 <= count <= MOST_MEMBERS:
