@@ -94,6 +94,12 @@ def test_coordinates_are_numbers_where_they_can_be():
     assert list(coordinate([1, {"first": 3, "count": 2}])) == ["1", '{"first": 3, "count": 2}']
 
 
+def test_a_point_before_pi_is_no_number():
+    """Only digits are a factor of pi: ".5pi" is a number, and ".pi" is a text, which no key with a number takes."""
+    assert coordinate([".5pi", 1.0]).tolist() == [np.pi / 2, 1.0]
+    assert coordinate([".pi", 1.0]).tolist() == [".pi", "1.0"]
+
+
 def test_written_out_and_read_back_it_has_the_same_members():
     """The text of a sweep gives the same members under the same names."""
     plan = sweep_of('[sweep.drive]\nwavenumber = ["2pi/9", "5pi/9"]\namplitude = { log = [0.1, 20.0], count = 7 }')

@@ -18,7 +18,7 @@ Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
 """Runge-Kutta methods of PETSc (``-ts_rk_type``)."""
 
 
-MULTIPLE_OF_PI = r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
+MULTIPLE_OF_PI = r"\s*(\d+\.?\d*|\.\d+)?\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
 
 
 def number(value: Any) -> Any:
