@@ -137,6 +137,7 @@ def plan(*changes: str) -> OptimiseCase:
     ("changes", "message"),
     [
         (["contacts.sites=0", "contacts.clearance="], "no sites"),
+        (["contacts.sites=0", "contacts.clearance=", "optimise.variables={profile=[1e-4, 1e-3]}"], "no sites"),
         (["optimise.variables.clearance=[-1e-3, 1e-2]"], "clearance[1] = -0.001: must be greater than 0"),
         (["optimise.variables.clearance=[1e-2, 1e-3]"], "low below high"),
         (["optimise.objective=[{measure='band_share'}]"], "objective[1].band: missing; band_share needs a band"),
@@ -149,6 +150,7 @@ def plan(*changes: str) -> OptimiseCase:
         (["optimise.variables.clearance="], "contains no quantity that varies"),
         (["optimise.variables.profile=[1e-3, 1e-2]"], "not both"),
         (["optimise.variables.masses.5=[1e-3, 1e-2]"], "masses are numbered from 1 to 4"),
+        (["optimise.variables.masses.01=[1e-3, 1e-2]"], "masses are numbered from 1 to 4"),
         (["optimise.variables.springs.x=[1e3, 1e4]"], "springs are numbered from 1 to 4"),
         (["optimise.variables.sites=[10, 11]"], "within cells 1 to 40 and have room for all 3 sites"),
         (["optimise.variables.sites=[0, 30]"], "within cells 1 to 40"),

@@ -204,6 +204,15 @@ def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, m
     assert message in str(problem)
 
 
+def test_the_entries_of_an_empty_list_do_not_vary():
+    """A range of a list without entries is refused at the path of its key, as it has no variable."""
+    with pytest.raises(CaseError) as error:
+        plan_of({"drive": {"more": {"linear": [1.0, 2.0]}}}, drive={"more": []})
+    (problem,) = error.value.problems
+    assert problem.key == "optimise.variables.drive.more"
+    assert "empty list" in problem.remedy
+
+
 @pytest.mark.parametrize("variables", [{"restitution": [0.1, 0.9]}, {"contacts": {"restitution": [0.1, 0.9]}}])
 def test_a_key_that_the_sites_do_not_take_is_no_variable(variables):
     """The common restitution is no variable where each site has its own, since it has no effect."""

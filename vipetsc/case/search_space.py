@@ -88,9 +88,10 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
     rows = _named_rows(bounds, len(base.model().chain.sites))
     given = bounds.keys_of_case()
     table = _with_entries(table, base, [*(path for row in rows for path in row.paths), *given])
-    if bounds.profile:
+    gaps = base.model().chain.clearances
+    # Without sites there are no clearances, which ``variable_problems`` reports.
+    if bounds.profile and gaps:
         # The clearances of a profile follow from the first and the last one, whatever those of the case are.
-        gaps = base.model().chain.clearances
         table["contacts"] = table["contacts"] | {"clearance": {"first": gaps[0], "last": gaps[-1]}}
 
     for key, value in given.items():
@@ -179,6 +180,8 @@ def row_of(key: str, given: Any, table: Table) -> VariableRow:
     kind, low, high = _range_of(given)
     value = value_at(table, key)
     paths = [key]
+    if value == []:
+        raise ValueError("the case has an empty list there, in which no entry can vary")
     if isinstance(value, list):
         paths = [f"{key}[{i}]" for i in range(1, len(value) + 1)]
     return VariableRow(names=paths, paths=paths, low=low, high=high, kind=kind)

@@ -133,9 +133,11 @@ def _bounds_problems(bounds: VariablesTable, base: Case) -> Iterator[Problem]:
     given = bounds.model_dump(exclude_none=True, exclude={*SECTIONS})
     pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
     for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
+        # Numbers are compared as texts: paths have them as they are given, and that of "01" leads to no mass or spring.
+        numbers = [str(number) for number in range(1, count + 1)]
         for name, pair in given[kind].items():
             pairs[f"{kind}.{name}"] = pair
-            if not (name.isdecimal() and 1 <= int(name) <= count):
+            if name not in numbers:
                 yield Problem(f"{AT}.{kind}.{name}", pair, f"the cell's {kind} are numbered from 1 to {count}")
 
     for key, (low, high) in pairs.items():
