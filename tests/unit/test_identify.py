@@ -101,6 +101,8 @@ def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
         ({"quantity": "exponent", "bounds": [1.0, 2.0]}, "quantity", 'only the law "power" has an exponent'),
         ({"quantity": "clearance", "bounds": [-1.0, 1.0]}, "bounds", "must be positive"),
         ({"quantity": "clearance", "bounds": [2.0, 1.0]}, "bounds", "low below high"),
+        ({"quantity": "clearance", "bounds": [1e-5, np.inf]}, "bounds[2]", "finite number"),
+        ({"quantity": "cubic", "bounds": [-np.inf, 1.0]}, "bounds[1]", "finite number"),
         ({"quantity": "cubic", "bounds": [-1.0, 1.0], "scale": "logarithmic"}, "bounds", "must be positive"),
         ({"quantity": "restitution", "bounds": [0.5, 1.2]}, "bounds", "between 0 and 1"),
         ({"quantity": "clearance", "bounds": [1e-5, 1.0], "of": [[4]]}, "of", "from 1 to 3"),

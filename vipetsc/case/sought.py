@@ -12,6 +12,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
+from vipetsc.case.schema import Finite
 from vipetsc.lattice import UnitCell, pass_bands
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
@@ -61,7 +62,7 @@ class UnknownTable(Section):
         "grounding",
         "amplitude",
     ]
-    bounds: Annotated[list[float], Field(min_length=2, max_length=2)]
+    bounds: Annotated[list[Finite], Field(min_length=2, max_length=2)]
     of: Literal["all", "each"] | list[list[int]] = "all"
     scale: Literal["logarithmic", "linear"] | None = None
     start: float | list[float] | None = None
