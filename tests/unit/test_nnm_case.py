@@ -131,6 +131,46 @@ def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
     assert NnmCase.from_table({"contacts": {"side": "plus"}}).gaps() == ((pytest.approx(CLEARANCE), float("inf")),)
 
 
+OWN = {
+    "masses": [1.0, 1.0],
+    "springs": [{"start": 0, "end": 1, "stiffness": 1.0}, {"start": 1, "end": 2, "stiffness": 1.0}],
+}
+FREE = {"preset": "four-band", "cells": 8, "ends": "free"}
+OPEN = OWN | {"contacts": [{"host": 1, "resonator": 2, "clearance": 0.1}]}
+TOUCHING = OWN | {"contacts": [{"host": 1, "resonator": 2, "clearance": 0.0}]}
+
+
+@pytest.mark.parametrize(
+    ("contacts", "nnm", "key"),
+    [
+        ({"each": {"pair": [[1, 2]]}}, {}, "contacts.each.pair"),
+        ({"pair": [1, 2]}, {}, "contacts.pair"),
+        (
+            {"sites": [2], "clearance": 1e-3, "side": "minus", "each": {"clearance_minus": [0.0]}},
+            {"system": "chain"},
+            "contacts.each.clearance_minus",
+        ),
+        (
+            {"sites": [2], "clearance": 1e-3, "side": "plus", "each": {"pair": [[0, 3]]}},
+            {"system": "chain", "modes": [5]},
+            "contacts.each.pair",
+        ),
+        (
+            {"sites": [2, 4], "clearance": 1e-3, "each": {"pair": [[0, 3], [1, 2]], "side": ["both", "plus"]}},
+            {"system": "chain", "modes": [5]},
+            "contacts.each.pair",
+        ),
+        ({"each": {"next_cell": [True]}}, {"system": "own", "own": OPEN}, "contacts.each.next_cell"),
+        ({"stiffness": 1.0}, {"system": "own", "own": TOUCHING}, "nnm.own.contacts"),
+    ],
+)
+def test_a_wrong_key_is_named_where_it_is_given(contacts, nnm, key):
+    """A problem of a list over the contacts has its path, and one of a clearance of [nnm.own] the path of the pair."""
+    with pytest.raises(CaseError) as error:
+        NnmCase.from_table({"contacts": contacts, "lattice": FREE, "nnm": nnm})
+    assert key in [problem.key for problem in error.value.problems]
+
+
 def test_a_lattice_that_nothing_holds_is_not_pushed():
     """A free lattice between two stops to ground is accepted; one stop, whose mean force moves it away, is refused."""
     table = {

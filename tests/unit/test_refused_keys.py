@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.contacts import describe_stops
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics.propagator.step_choice import refusal
 
@@ -50,11 +51,48 @@ def test_a_key_of_a_stop_that_does_nothing_is_refused(contacts, key):
     assert [problem.key for problem in error.value.problems] == [key]
 
 
+@pytest.mark.parametrize(
+    ("contacts", "key"),
+    [
+        ({"each": {"pair": [[1, 2], [1, 9]]}}, "contacts.each.pair"),
+        ({"each": {"pair": [[1, 2], [3, 3]]}}, "contacts.each.pair"),
+        ({"pair": [1, 9]}, "contacts.pair"),
+        ({"sites": [4, 24], "each": {"next_cell": [False, True]}}, "contacts.each.next_cell"),
+        ({"sites": [4, 24], "next_cell": True}, "contacts.next_cell"),
+        ({"each": {"stiffness": [1e7, 1e7], "radius": [1e-3, 2e-3]}}, "contacts.each.stiffness"),
+    ],
+)
+def test_a_wrong_key_is_named_where_it_is_given(contacts, key):
+    """A problem of a list over the sites has the path of that list, not that of the key of all sites."""
+    with pytest.raises(CaseError) as error:
+        small_case(contacts={"sites": [4, 9], "clearance": 3e-5} | contacts)
+    assert [problem.key for problem in error.value.problems] == [key]
+
+
 def test_a_clearance_of_the_side_minus_is_taken_where_one_site_has_a_stop_there():
     """``clearance_minus`` is accepted if at least one site has a stop on that side."""
     case = small_case(contacts={"sites": [4, 9], "clearance": 3e-5, "clearance_minus": 1e-5,
                                 "each": {"side": ["plus", "both"]}})  # fmt: skip
     assert case.model().gaps[1] == (3e-5, 1e-5)
+
+
+def test_a_pressed_site_of_a_law_is_named_where_it_is_given():
+    """A law has no value at a site that is pressed at rest, by a key for all sites or by a list."""
+    contacts = {"sites": [6, 12], "clearance": 1e-4, "side": "plus", "restitution": 1.0}
+    for pressed, key in (({"precompression": 2e-4}, "contacts"), ({"precompression": [0.0, 2e-4]}, "contacts.each")):
+        given = pressed if key == "contacts" else {"each": pressed}
+        with pytest.raises(CaseError) as error:
+            LawCase.from_table({"lattice": {"preset": "four-band"}, "contacts": contacts | given, "law": {}})
+        assert [problem.key for problem in error.value.problems] == [f"{key}.precompression"]
+
+
+def test_a_restitution_of_steady_states_suits_the_damping_of_every_site():
+    """The damping of one site that grows without bound towards 0 bounds the restitutions of all curves from below."""
+    contacts = {"sites": [4, 9], "clearance": 3e-5, "each": {"damping": ["paper", "flores"]}}
+    table = {"lattice": {"preset": "four-band", "cells": 24}, "contacts": contacts}
+    with pytest.raises(CaseError) as error:
+        NfrcCase.from_table(table | {"nfrc": {"restitutions": [0.01, 0.5]}})
+    assert [(problem.key, problem.value) for problem in error.value.problems] == [("nfrc.restitutions", [0.01])]
 
 
 def test_what_follows_in_other_lines_of_an_override_is_refused():

@@ -49,7 +49,8 @@ def check_per_site(
     # A stiffness would contradict a material; the lists over sites may give either.
     has_material = bool(per_site.keys() & {*MATERIAL})
     if has_material and (contacts.stiffness is not None or "stiffness" in per_site):
-        yield Problem("contacts.stiffness", contacts.stiffness, "give it or the material of each site, not both")
+        remedy = "give it or the material of each site, not both"
+        yield Problem(path_of(contacts, "stiffness"), contacts.stiffness, remedy)
         return
     if not valid("contacts"):
         return
@@ -71,7 +72,7 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
         is_given = any(value is not None for value in values)
-        path = _path_of(contacts, key)
+        path = path_of(contacts, key)
         if is_given and parameter.law not in laws:
             value = lists_of(contacts).get(key, getattr(contacts, key))
             yield Problem(path, value, f'applies only to law = "{parameter.law}"')
@@ -85,14 +86,14 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
         if name and restitution < least_restitution(name):
             remedy = f"the {name} damping increases without bound towards 0; give at least {least_restitution(name):g}"
-            yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
-    yield from check_factors(_path_of(contacts, "damping"), names, restitutions)
+            yield Problem(path_of(contacts, "restitution"), restitution, remedy)
+    yield from check_factors(path_of(contacts, "damping"), names, restitutions)
 
 
 def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> Iterator[Problem]:
     """Problems with the ``laws`` of sites that users' modules register: their parameters, and their formulas."""
     given = values_of_sites(contacts, "parameters", max(count, 1))
-    wrong = list(check_law_parameters(_path_of(contacts, "parameters"), laws, given))
+    wrong = list(check_law_parameters(path_of(contacts, "parameters"), laws, given))
     yield from wrong
     if wrong or not any(registered_law(name) for name in laws):
         return
@@ -106,7 +107,7 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
     for name, law in first.items():
         reason = check_law(law)
         if reason:
-            yield Problem(_path_of(contacts, "law"), name, reason)
+            yield Problem(path_of(contacts, "law"), name, reason)
 
 
 def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
@@ -114,7 +115,7 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     is_given = contacts.clearance_minus is not None or "clearance_minus" in lists_of(contacts)
     if is_given and count and set(values_of_sites(contacts, "side", count)) == {"plus"}:
         remedy = 'with side = "plus" no site has a stop on the side -; omit it'
-        yield Problem(_path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
+        yield Problem(path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
 
 
 def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
@@ -131,7 +132,7 @@ def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence
                 f"site {number} touches its stop at rest: its first contact has no approach velocity, by which the"
                 " damping divides; give restitution = 1, a clearance, or an approach_floor in m/s"
             )
-            yield Problem(_path_of(contacts, "restitution"), restitutions[number - 1], remedy)
+            yield Problem(path_of(contacts, "restitution"), restitutions[number - 1], remedy)
             return
 
 
@@ -148,15 +149,15 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
             return
         if precompressions[number - 1] and max(plus, minus) < np.inf:
             remedy = f"site {number} has stops on both sides; a precompressed contact has one: set contacts.side"
-            yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
+            yield Problem(path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = f"site {number}: {NO_APPROACH}"
-            yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
+            yield Problem(path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
 
 
-def _path_of(contacts: ContactsTable, key: str) -> str:
+def path_of(contacts: ContactsTable, key: str) -> str:
     """Path of a key, in the lists over sites if it is given there."""
     if key in lists_of(contacts):
         return f"contacts.each.{key}"
@@ -271,13 +272,14 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"
         if max(pair.host, pair.resonator) >= cell.dofs or pair.resonator < 0:
             remedy = f"{what}; the masses of the cell are numbered from 1 to {cell.dofs}, and host 0 is the ground"
-            yield Problem("contacts.pair", [pair.host + 1, pair.resonator + 1], remedy)
+            yield Problem(path_of(contacts, "pair"), [pair.host + 1, pair.resonator + 1], remedy)
             return
         if pair.host == pair.resonator and not pair.next_cell:
-            yield Problem("contacts.pair", [pair.host + 1] * 2, f"{what}; did you mean next_cell = true?")
+            yield Problem(path_of(contacts, "pair"), [pair.host + 1] * 2, f"{what}; did you mean next_cell = true?")
             return
         if pair.next_cell and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
-            yield Problem("contacts.next_cell", True, f"site {number} in cell {at} has no next cell to touch")
+            remedy = f"site {number} in cell {at} has no next cell to touch"
+            yield Problem(path_of(contacts, "next_cell"), True, remedy)
             return
 
     # Where no pair is given, a cell that is listed twice is reported by ``check_sites``.

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
-from vipetsc.case.contacts import gaps_of_sites, lists_of, values_of_sites
+from vipetsc.case.contacts import gaps_of_sites, lists_of, path_of, values_of_sites
 from vipetsc.case.kinds import SiteKinds, lesser_clearances, mean_clearance, site_kinds
 from vipetsc.case.resolve import check_cell, with_preset
 from vipetsc.case.schema import PRESETS, Positive
@@ -311,7 +311,7 @@ def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
                 f"site {number + 1} is pressed at rest and acts on the weakest wave; the law is one of amplitude over"
                 " clearance, which has no value there; omit it"
             )
-            yield Problem("contacts.precompression", pressed[number], remedy)
+            yield Problem(path_of(contacts, "precompression"), pressed[number], remedy)
             return
 
 

@@ -11,7 +11,7 @@ import tomli_w
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
-from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
+from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, lists_of
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
@@ -196,7 +196,8 @@ class NfrcCase(Case):
             if nfrc.restitutions and contacts.each and contacts.each.restitution:
                 remedy = "each site has a restitution of its own, contacts.each.restitution; omit one of them"
                 yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
-            least = least_restitution(contacts.damping or "paper")
+            dampings = lists_of(contacts).get("damping", [contacts.damping])
+            least = max(least_restitution(damping or "paper") for damping in dampings)
             if small := [r for r in nfrc.restitutions if r < least]:
                 yield Problem("nfrc.restitutions", small, f"below {least:g} this damping increases without bound")
             if contacts.sites in (0, []) and valid("lattice"):

@@ -19,6 +19,7 @@ from vipetsc.case.contacts import (
     contact_of,
     gaps_of_sites,
     laws_of_sites,
+    path_of,
     with_stiffness,
 )
 from vipetsc.case.disorder import DisorderTable, with_drawn
@@ -247,9 +248,13 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
         return
     for key in ("pair", "next_cell"):
         if getattr(contacts, key) is not None or (contacts.each and getattr(contacts.each, key)):
-            yield Problem(f"contacts.{key}", None, "[nnm.own] names the masses of each contact; omit the key")
+            yield Problem(path_of(contacts, key), None, "[nnm.own] names the masses of each contact; omit the key")
     yield from check_stiffness(contacts, bool(custom.contacts), valid)
-    yield from _check_stops(contacts, [pair.clearance for pair in custom.contacts], valid)
+    for problem in _check_stops(contacts, [pair.clearance for pair in custom.contacts], valid):
+        # The contacts of such a system have their clearances in [nnm.own].
+        if problem.key == "contacts.clearance":
+            problem = replace(problem, key="nnm.own.contacts")
+        yield problem
 
     masses = len(custom.masses)
     yield from check_forced(nnm, None, masses)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
 from vipetsc.case.case_file import Problem, Valid
-from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites
+from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites, path_of, values_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
 from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_LATTICE, NnmTable
@@ -93,7 +93,7 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
     for key in ("pair", "next_cell"):
         if getattr(contacts, key) is not None or key in given:
             remedy = "the reduced model is that of the two masses in contact within a cell, cell.contact; omit the key"
-            yield Problem(f"contacts.{key}", getattr(contacts, key), remedy)
+            yield Problem(path_of(contacts, key), getattr(contacts, key), remedy)
             return
 
     if given:
@@ -116,10 +116,10 @@ def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Pr
         return
     if any(0 in gap for gap in gaps):
         remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
-        key = "clearance"
-        if contacts.clearance_minus == 0:
-            key = "clearance_minus"
-        yield Problem(f"contacts.{key}", 0.0, f"{remedy}; give a clearance above 0, or a precompression")
+        key = "contacts.clearance"
+        if 0 in values_of_sites(contacts, "clearance_minus", len(gaps)):
+            key = path_of(contacts, "clearance_minus")
+        yield Problem(key, 0.0, f"{remedy}; give a clearance above 0, or a precompression")
 
 
 def check_lattice(
@@ -157,14 +157,15 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
         fixed = "press it against the ground (contacts.precompression), or use equal stops on both sides"
     if any(plus != minus for plus, minus in to_ground):
         remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
-        yield Problem("contacts.pair", contacts.pair, f"{remedy}; {fixed}")
+        yield Problem(path_of(contacts, "pair"), contacts.pair, f"{remedy}; {fixed}")
     # Symmetric motions pass the centre between the stops. Unsymmetric ones have a mean position, which small motions,
     # without contact, do not determine.
     elif any(plus != minus for plus, minus in gaps) or not _is_odd(lattice):
         remedy = (
             "nothing holds this lattice between its stops to ground, and its other forces are not symmetric, so that"
         )
-        yield Problem("contacts.pair", contacts.pair, f"{remedy} small motions have no place of their own; {fixed}")
+        remedy += f" small motions have no place of their own; {fixed}"
+        yield Problem(path_of(contacts, "pair"), contacts.pair, remedy)
 
 
 def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
