@@ -112,6 +112,20 @@ def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_t
     assert case.drive.frequency == pytest.approx(3.141592653589793e5)
 
 
+@pytest.mark.parametrize("first", [{"frequency": 1000.0}, {"waveform": "impulse", "duration": 1e-4}])
+def test_a_further_drive_needs_a_wave(first):
+    """A wavenumber so small that its frequency is 0 is refused for every drive, whatever the first one is."""
+    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
+    further = [{"frequency": 900.0}, {"wavenumber": 1e-9, "band": 1}]
+    key, remedy = problem_of({
+        "lattice": {"cell": {"masses": [1e-3], "springs": [spring]}, "cells": 24},
+        "contacts": {"sites": []},
+        "drive": first | {"more": further},
+        "time": {"end": 1e-3, "sample_interval": 1e-4},
+    })  # fmt: skip
+    assert key == "drive.more[2].wavenumber" and "the frequency there is 0" in remedy
+
+
 def test_a_burst_without_springs_needs_its_frequency():
     table = unsprung_table() | {"drive": {"amplitude": 1.0}}
     with pytest.raises(CaseError) as error:

@@ -133,8 +133,8 @@ class Case(CaseFile):
         yield from _check_output(sections["output"], length, cell, valid)
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
-        # Only for drives without problems, since the waves of the first one are computed.
-        if cell and cell.joins_cells and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
+        # Only for drives without problems, since their waves are computed.
+        if cell and cell.joins_cells and not problems and valid("lattice", "drive", "time.end"):
             yield from check_waves(cell, drive, time)
         if cell and not cell.joins_cells and valid("drive", "time"):
             yield from check_waves(cell, drive, time)

@@ -209,25 +209,27 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 
 
 def check_waves(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """Problems with the wave of a valid ``drive``, and with what would follow from waves that the cells do not have."""
+    """Problems with the waves of a valid ``drive``, and with what would follow from waves that cells do not have."""
     if cell.joins_cells:
         yield from _check_wave(cell, drive, time)
     else:
         yield from _check_without_bands(drive, time)
 
 
-def _check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
-    """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
-    frequency, speed = driven_wave(cell, drive)
-    # The problem names the key by which the user has chosen the wave.
-    key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
-    if not frequency > 0:
-        yield Problem(
-            f"drive.{key}", getattr(drive, key), "the frequency there is 0; choose another wavenumber or band"
-        )
-    elif time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
-        remedy = f"the wave at {frequency:.6g} rad/s has group velocity 0 and never crosses the lattice"
-        yield Problem(f"drive.{key}", getattr(drive, key), f"{remedy}; give time.end in s, or another wavenumber")
+def _check_wave(cell: UnitCell, drives: DriveTable, time: TimeTable) -> Iterator[Problem]:
+    """Problems with valid drives that send out no wave, or with a wave of the first that never crosses the lattice."""
+    for path, drive in drives.every:
+        if not drive.wave_choices:
+            continue
+        frequency, speed = driven_wave(cell, drive)
+        # The problem names the key by which the user has chosen the wave.
+        key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
+        value = getattr(drive, key)
+        if not frequency > 0:
+            yield Problem(f"{path}.{key}", value, "the frequency there is 0; choose another wavenumber or band")
+        elif drive is drives and time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
+            remedy = f"the wave at {frequency:.6g} rad/s has group velocity 0 and never crosses the lattice"
+            yield Problem(f"{path}.{key}", value, f"{remedy}; give time.end in s, or another wavenumber")
 
 
 def _check_without_bands(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
