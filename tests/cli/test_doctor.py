@@ -21,6 +21,7 @@ from vipetsc.cli.installation import (
     BLAS_LIBRARY,
     MPI_LIBRARY,
     PACKAGES,
+    Package,
     check_blas,
     check_mpi,
     check_package,
@@ -78,6 +79,14 @@ def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of
     assert "2024.9.0; FAULT: too old" in ended.stdout
     assert "FAULT: missing" in ended.stdout
     assert ended.stdout.endswith("the program cannot run here: cma, xarray on rank 0\n")
+
+
+def test_a_package_that_was_built_for_another_numpy(tmp_path, monkeypatch):
+    """A package whose import raises anything is a fault with the reason: pandas raises a ValueError for its numpy."""
+    (tmp_path / "built_for_another_numpy.py").write_text('raise ValueError("numpy.dtype size changed")')
+    monkeypatch.syspath_prepend(tmp_path)
+    check = check_package(Package("frames", "1.0", "2.0", module="built_for_another_numpy"))
+    assert check.fault == "does not load (numpy.dtype size changed): pip install 'frames>=1.0'"
 
 
 def test_a_package_that_is_newer_than_any_tried(version_of):

@@ -98,6 +98,9 @@ def check_package(package: Package) -> Check:
         module = importlib.import_module(package.module or package.name)
     except ImportError as error:
         return Check(package.name, fault=f"missing ({error}): {remedy}")
+    # A package that was built for another version of one that it loads raises anything, as pandas does under xarray.
+    except Exception as error:
+        return Check(package.name, fault=f"does not load ({error}): {remedy}")
 
     version = str(getattr(module, "__version__", ""))
     numbers = _numbers(version)
