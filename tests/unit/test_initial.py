@@ -271,6 +271,28 @@ def test_an_orbit_that_a_branch_does_not_hold_is_refused(branch, key, message):
         case_with(initial={"kind": "file", "path": str(branch)} | key)
 
 
+def test_a_state_of_other_dimensions_is_refused(tmp_path):
+    """Displacements of cells with one mass each have an axis for the mass, too; without it there is no state."""
+    path = tmp_path / "state.h5"
+    data = {"cell": variable("cell", [1, 2, 3], "1", "cell")}
+    data |= {name: variable("cell", [1e-3, 0.0, 0.0], "m", name) for name in ("displacement", "velocity")}
+    write_netcdf(path, xr.Dataset(data))
+    with pytest.raises(CaseError, match=r"state\.h5 contains no state: its displacement .* not over \(cell, dof\)"):
+        case_with(initial={"kind": "file", "path": str(path), "frequency": 100.0})
+
+
+def test_a_branch_without_orbits_is_named_whole(tmp_path):
+    """The message has the whole path of an empty branch, also if words of the message are part of the path."""
+    path = tmp_path / "a branch that has orbits.h5"
+    put_branch(path)
+    with xr.open_dataset(path, group="states") as states:
+        empty = states.isel(orbit=slice(0)).load()
+    names = {name: f"states/{name}" for name in (*empty.variables, *empty.dims)}
+    write_netcdf(path, empty.rename(names))
+    with pytest.raises(ValueError, match=r"a branch that has orbits\.h5 contains no state: it is empty"):
+        State.read(path)
+
+
 def test_an_orbit_at_rest_is_refused(branch):
     put_branch(branch, size=0.0)
     with pytest.raises(CaseError, match="is at rest"):

@@ -38,7 +38,10 @@ class State(NamedTuple):
             if "states/displacement" in file:
                 prefix = "states/"
             names = [prefix + name for name in ("displacement", "velocity", "cell")]
-            missing = [name for name in names if name not in file]
+            needed = names
+            if prefix:
+                needed = [*names, "states/period"]
+            missing = [name for name in needed if name not in file]
             if missing:
                 raise ValueError(f"{path} contains no state: it lacks {', '.join(missing)}")
             u, v, cell = (file[name] for name in names)
@@ -46,7 +49,7 @@ class State(NamedTuple):
             # Which state of the file it is; a file may hold a single one.
             origin: dict[str, Any] = {}
             if prefix:
-                row = _row(np.arange(1, len(u) + 1), orbit, 0.5, f"{path} has orbits")
+                row = _row(np.arange(1, len(u) + 1), orbit, reach=0.5, path=path, noun="orbits")
                 origin = {"orbit": row + 1, "period": float(file["states/period"][row])}
             elif u.ndim == 3:
                 times = file[str(u.dims[0])].values
@@ -54,12 +57,14 @@ class State(NamedTuple):
                 interval = np.inf
                 if len(times) > 1:
                     interval = float(times[1] - times[0])
-                row = _row(times, time, 0.5 * interval, f"{path} has samples in s")
+                row = _row(times, time, reach=0.5 * interval, path=path, noun="samples in s")
                 origin = {"time": float(times[row]), "case": file.attrs.get("case")}
             # Values are read when they are used: of all states only this one is.
             if u.ndim == 3:
                 u = u[row]
                 v = v[row]
+            if u.ndim != 2 or v.shape != u.shape or cell.shape != u.shape[:1]:
+                raise ValueError(f"{path} contains no state: its displacement and velocity are not over (cell, dof)")
 
             state = cls(
                 cell=cell.values.astype(np.int64),
@@ -110,16 +115,17 @@ class State(NamedTuple):
         return float(sizes.max()), int(self.cell[np.argmax(sizes)])
 
 
-def _row(values: np.ndarray, wanted: float | None, reach: float, text: str) -> int:
+def _row(values: np.ndarray, wanted: float | None, reach: float, path: str | Path, noun: str) -> int:
     """The row of ``values`` (row,) nearest to ``wanted``, by default the last one.
 
-    Raises ValueError, with a message that begins with ``text``, if none is within ``reach`` or there are none.
+    Raises ValueError, with a message that calls the values of the file ``path`` a ``noun``, if none is within ``reach``
+    or there are none.
     """
     if not len(values):
-        raise ValueError(f"{text.split(' has ')[0]} contains no state: it is empty")
+        raise ValueError(f"{path} contains no state: it is empty")
     if wanted is None:
         return len(values) - 1
     row = int(np.argmin(np.abs(values - wanted)))
     if abs(values[row] - wanted) > reach:
-        raise ValueError(f"{text} from {values[0]:g} to {values[-1]:g}, not {wanted:g}")
+        raise ValueError(f"{path} has {noun} from {values[0]:g} to {values[-1]:g}, not {wanted:g}")
     return row
