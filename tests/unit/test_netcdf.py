@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vipetsc.io.errors import UnreadableFileError
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 
 
@@ -153,6 +154,17 @@ def test_a_file_without_scales_is_read(tmp_path):
         assert read.dims == ("group/field/axis_0", "group/field/axis_1")
         assert read.attrs["empty"].tolist() == []
         np.testing.assert_array_equal(read.attrs["pairs"], values)
+
+
+def test_a_dimension_of_two_lengths_is_refused_with_the_file(tmp_path):
+    """A dataset that is shorter than its scale, as netCDF-4 may have it, is an error that names the file."""
+    with h5py.File(tmp_path / "uneven.h5", "w") as file:
+        file["time"] = np.arange(4.0)
+        file["time"].make_scale()
+        file["value"] = np.arange(3.0)
+        file["value"].dims[0].attach_scale(file["time"])
+    with pytest.raises(UnreadableFileError, match=r"uneven\.h5 cannot be opened as a run: conflicting sizes"):
+        open_netcdf(tmp_path / "uneven.h5", "run")
 
 
 def test_files_of_another_kind_are_refused(tmp_path):

@@ -190,11 +190,12 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     files = CachingFileManager(h5py.File, str(path), mode="r")
     try:
         variables, attributes = _contents(files)
-    # Files of other programs have types and links that h5py does not know, and meets with any exception.
+        data = xr.Dataset(variables, attrs=attributes)
+    # Files of other programs have types and links that h5py does not know, and meets with any exception. In some, a
+    # dimension has two lengths, which xarray refuses.
     except Exception as error:
         files.close()
         raise _unreadable(path, kind, error) from error
-    data = xr.Dataset(variables, attrs=attributes)
     data.set_close(files.close)
 
     # Variables, and the groups that hold any.
