@@ -201,6 +201,17 @@ def test_a_full_disk_is_no_error_of_the_results(folder, monkeypatch):
     assert not isinstance(raised.value, FolderError)
 
 
+@pytest.mark.parametrize("name", ["missing.h5", "case.toml"])
+def test_a_file_without_results_next_to_a_run_is_refused_before_anything_is_written(folder, in_process, tmp_path, name):
+    """Bad input leaves no file: neither a missing file nor one of another kind brings the mesh of the run beside it."""
+    shutil.copy(folder / "run.h5", tmp_path / "run.h5")
+    (tmp_path / "case.toml").write_text("no results")
+    ended = in_process("export", tmp_path / name)
+    assert ended.returncode == 2
+    assert name in ended.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "run.h5"]
+
+
 def test_what_holds_no_results_is_refused(in_process, tmp_path):
     ended = in_process("export", tmp_path)
     assert ended.returncode == 2

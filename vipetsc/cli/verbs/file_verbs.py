@@ -50,6 +50,7 @@ def write_exports(path: Path) -> list[Path]:
     Raises FolderError for results that cannot be read, and for a path without any.
     """
     from vipetsc.io.export import write_curves, write_xdmf
+    from vipetsc.io.read import open_results
 
     folder = _folder_of(path)
     sources = [path]
@@ -58,6 +59,9 @@ def write_exports(path: Path) -> list[Path]:
         sources = sorted(path.glob("branch-*.h5")) or [path]
     written = []
     try:
+        # A file without results that lies beside a run is refused before the mesh of the run is written.
+        if not path.is_dir():
+            open_results(path).close()
         if (folder / "run.h5").exists():
             mesh = write_xdmf(folder)
             if mesh:
