@@ -105,7 +105,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     files = {pictures.file for pictures in by_source.values()}
     folders = list(paths)
     for i, path in enumerate(paths):
-        if path.name in files:
+        if any(path.match(pattern) for pattern in files):
             folders[i] = path.parent
         # Pages name branches of one name by their folders, and "." has no name.
         if not folders[i].name:
