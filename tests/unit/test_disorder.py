@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import fields, replace
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import put_members
+from tests.conftest import put_members, small_case
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.disorder import Deviation, with_cell
+from vipetsc.case.disorder import Deviation, DisorderTable, with_cell
 from vipetsc.case.schema import SpringTable
 from vipetsc.case.verb_cases import disorder_of
+from vipetsc.cli.verbs.validate_verb import disorder_rows
 from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
@@ -167,6 +169,16 @@ def test_the_clearances_of_the_two_sides_are_drawn_independently():
     changed = "draws|sign must not change"
     with pytest.raises(CaseError, match=changed):
         draw(TEN_SITES | {"clearance_minus": 1e-6}, clearance={"absolute": 1e-5})
+
+
+def test_a_stop_that_touches_does_not_scatter():
+    """A clearance of 0 stays 0 under a relative deviation, and ``validate`` shows the ratio 1, without a warning."""
+    stops = {"sites": [4, 9], "clearance": [0.0, 3e-5], "side": "plus", "restitution": 1.0}
+    nominal = small_case(contacts=stops)
+    drawn = small_case(contacts=stops, disorder={"clearance": {"relative": 0.01}})
+    [(_, text)] = disorder_rows(DisorderTable(clearance={"relative": 0.01}), nominal, drawn)
+    assert drawn.contacts.clearance[0] == 0
+    assert re.fullmatch(r"normal, deviation 1 %; seed 0: times 1, (1\.0|0\.9)\d+", text)
 
 
 def test_a_deviation_is_described_with_its_size_and_distribution():

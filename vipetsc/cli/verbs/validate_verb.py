@@ -71,7 +71,10 @@ def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
         if name == "sites":
             values = f"cells {first_few([f'{cell:.5g}' for cell in after[name]])}"
         else:
-            values = f"times {first_few([f'{ratio:.5g}' for ratio in np.divide(after[name], before[name])])}"
+            # The clearance of a stop that touches is 0 and does not scatter: its ratio is 1.
+            ratios = np.ones(len(before[name]))
+            np.divide(after[name], before[name], out=ratios, where=np.not_equal(before[name], 0))
+            values = f"times {first_few([f'{ratio:.5g}' for ratio in ratios])}"
         rows.append((f"disorder of {name}", f"{deviation}; seed {disorder.seed}: {values}"))
     return rows
 
