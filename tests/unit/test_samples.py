@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from tests.conftest import small_case
+from vipetsc.case import CaseError
+from vipetsc.case.measured import MeasuredError, RecordTable, read_measured
 from vipetsc.case.samples import MOST_SAMPLES, with_samples
 
 
@@ -27,6 +31,7 @@ def file(tmp_path: Path) -> Path:
         file.create_dataset("endless", shape=(10**12, 2), chunks=(1000, 2), dtype=float)
         file.create_group("group")
         file["three"] = np.zeros((4, 3))
+        file["none"] = h5py.Empty("f8")
     return path
 
 
@@ -39,9 +44,25 @@ def test_the_size_of_a_data_set_is_checked_before_it_is_read(file):
 
 
 def test_what_is_no_table_of_two_columns_is_refused(file):
-    """A group and a table of three columns are named as such."""
+    """A group, a table of three columns and a data set without numbers are named as such."""
     assert "group is not a dataset" in refusal(file=str(file), dataset="group")
     assert "holds (4, 3) numbers" in refusal(file=str(file), dataset="three")
+    assert "none is not a dataset of numbers" in refusal(file=str(file), dataset="none")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "loop"])
+def test_a_name_that_leads_to_no_file_is_refused(tmp_path, monkeypatch, name):
+    """A name with a NUL, and a link to itself, are a problem of the key of samples, of a state and of a record."""
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    reason = "embedded null byte|Symlink loop|Too many levels"
+    assert re.search(reason, refusal(file=name))
+    with pytest.raises(CaseError, match=reason) as error:
+        small_case(initial={"kind": "file", "path": name})
+    assert [problem.key for problem in error.value.problems] == ["initial.path"]
+    sensor = {"quantity": "velocity", "column": "v", "cell": 2}
+    with pytest.raises(MeasuredError, match=reason):
+        read_measured(RecordTable.model_validate({"file": name, "rate": 1.0, "sensors": [sensor]}))
 
 
 def test_a_missing_value_in_the_first_row_is_no_line_of_names(tmp_path):

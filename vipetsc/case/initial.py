@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
-from vipetsc.io.names import path_named, readable
+from vipetsc.io.names import readable, resolved_path
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
@@ -313,8 +313,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     if initial.sha256 and initial.amplitude and frequency:
         return Beginning(initial, frequency, cell=1)
 
-    path = path_named(str(initial.path)).resolve()
-    state, digest = _read_state(path, initial)
+    path, state, digest = _read_state(initial)
     # The lattice is checked before the numbers, since a state of another lattice has no meaning here.
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
@@ -335,10 +334,11 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     return Beginning(initial.model_copy(update=update), frequency, cell, state.moving())
 
 
-def _read_state(path: Path, initial: InitialTable) -> tuple[State, str]:
-    """The state in a file and the file's hash; raises CaseError."""
+def _read_state(initial: InitialTable) -> tuple[Path, State, str]:
+    """The path of the file that the section names, the state in it, and its hash; raises CaseError."""
     try:
-        return State.read(path, initial.time, initial.orbit), file_hash(path)
+        path = resolved_path(str(initial.path))
+        return path, State.read(path, initial.time, initial.orbit), file_hash(path)
     except (OSError, ValueError, KeyError) as error:
         raise CaseError([Problem("initial.path", initial.path, str(error))]) from None
 

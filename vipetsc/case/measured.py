@@ -15,7 +15,7 @@ from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.samples import is_number
 from vipetsc.case.schema import Finite, Positive
-from vipetsc.io.names import path_named
+from vipetsc.io.names import resolved_path
 from vipetsc.wording import counted
 
 # Lines of a table of text. Fields are split in Python: a million lines of two columns take 1.6 s and 300 MB.
@@ -103,8 +103,8 @@ class MeasuredError(ValueError):
 
 def read_measured(record: RecordTable) -> Measured:
     """The times and values of a ``record`` between its ``begin`` and ``end``; raises MeasuredError for bad data."""
-    path = path_named(record.file).resolve()
     try:
+        path = resolved_path(record.file)
         digest = file_hash(path)
     except FileNotFoundError:
         raise MeasuredError("file", record.file, MISSING) from None

@@ -12,7 +12,7 @@ from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
-from vipetsc.io.names import path_named, readable
+from vipetsc.io.names import readable, resolved_path
 
 # The resolved case holds the samples, and so does every result: so many are 5 MB of text and 0.6 s to read.
 MOST_SAMPLES = 100_000
@@ -61,14 +61,15 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     key = f"{path}.samples.file"
     if {"time", "value"} & samples.keys():
         return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
-    # The absolute path is recorded, since the resolved case is stored in a folder of results.
-    file = path_named(samples["file"]).resolve()
     try:
+        # The absolute path is recorded, since the resolved case is stored in a folder of results.
+        file = resolved_path(samples["file"])
         rows = _read(file, samples.get("dataset"))
         digest = file_hash(file)
     except FileNotFoundError:
         return drive, [Problem(key, samples["file"], MISSING)]
-    except (OSError, ValueError, KeyError) as error:
+    # TypeError: a dataset of a type that numpy does not have.
+    except (OSError, ValueError, KeyError, TypeError) as error:
         return drive, [Problem(key, samples["file"], str(error))]
 
     # Numbers that are smaller than those allowed in a case are noise about 0.
@@ -78,12 +79,12 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
 
 
 def _read(path: Path, dataset: Any) -> np.ndarray:
-    """Rows (sample, 2) of time in s and value; raises OSError, ValueError or KeyError."""
+    """Rows (sample, 2) of time in s and value; raises OSError, ValueError, KeyError or TypeError."""
     if dataset is not None:
         with h5py.File(path, "r") as file:
             values = file[str(dataset)]
-            if not isinstance(values, h5py.Dataset):
-                raise ValueError(f"{dataset} is not a dataset")
+            if not isinstance(values, h5py.Dataset) or values.shape is None:
+                raise ValueError(f"{dataset} is not a dataset of numbers")
             # The shape is checked before the data are read: a file may hold more than the memory.
             _check_shape(values.shape)
             rows = np.asarray(values, float)

@@ -4,6 +4,7 @@ Python decodes names in the encoding of the locale, and turns bytes that are inv
 383). These cannot be written as UTF-8; and some locales (C, Latin-1) lack characters that UTF-8 has.
 """
 
+import errno
 import os
 from pathlib import Path
 
@@ -20,3 +21,12 @@ def path_named(text: str) -> Path:
     except UnicodeEncodeError:
         return Path(os.fsdecode(text.encode("utf-8")))
     return Path(text)
+
+
+def resolved_path(text: str) -> Path:
+    """The path that ``text`` names, absolute and without links; raises OSError for one that can lead to no file."""
+    try:
+        return path_named(text).resolve()
+    # Python up to 3.12 raises RuntimeError for links that lead to each other; a NUL in the name is a ValueError.
+    except (RuntimeError, ValueError) as error:
+        raise OSError(errno.EINVAL, str(error)) from None
