@@ -141,6 +141,11 @@ def test_members_are_selected_by_the_values_of_swept_keys(folder):
         select(ensemble, amplitude=0.2)
     with pytest.raises(KeyError, match="ibtet is not a coordinate"):
         select(ensemble, ibtet=3.0)
+    # A value of another type is one that no member has.
+    with pytest.raises(KeyError, match="no member has amplitude = 'large'"):
+        select(ensemble, amplitude="large")
+    with pytest.raises(KeyError, match="no member has law = 3"):
+        select(ensemble, law=3)
 
 
 def test_members_lead_to_their_folders(folder):

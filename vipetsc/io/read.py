@@ -170,11 +170,11 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
             raise KeyError(f"{name} is not a coordinate; the coordinates are {', '.join(map(str, data.coords))}")
 
         coordinate = data[name].values
-        if np.issubdtype(coordinate.dtype, np.number):
+        if np.issubdtype(coordinate.dtype, np.number) and isinstance(value, int | float | np.number):
             # To five digits, since a user types what messages print; amplitudes of one sweep lie further apart.
             match = np.isclose(coordinate, value, rtol=1e-5, atol=0)
         else:
-            match = coordinate == value
+            match = np.array([item == value for item in coordinate.tolist()])
         dimension = str(data[name].dims[0])
         matches[dimension] = matches.get(dimension, np.array(True)) & match
         if not matches[dimension].any():
