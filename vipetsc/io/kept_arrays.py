@@ -77,8 +77,12 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def _checksum(arrays: Arrays) -> np.ndarray:
-    """The CRC-32 of each of ``arrays`` (array,)."""
-    return np.array([zlib.crc32(np.ascontiguousarray(values).data) for values in arrays.values()])
+    """The CRC-32 of each of ``arrays`` (array,) with its name, type and shape, which the header of the file has."""
+    checksums = []
+    for name, values in arrays.items():
+        about = f"{name} {values.dtype.descr} {values.shape}".encode()
+        checksums.append(zlib.crc32(np.ascontiguousarray(values).data, zlib.crc32(about)))
+    return np.array(checksums)
 
 
 def _remove_oldest(folder: Path) -> None:
