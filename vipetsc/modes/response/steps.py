@@ -64,8 +64,12 @@ class TurningSteps:
     def judge(self, before: Response, after: Response, geometry: Geometry) -> Verdict:
         """Accept a step on which neither the tangent turns too far nor the correction is too long; else half of it."""
         # A comparison with NaN is false, which refuses the step.
-        if not (geometry.turn <= TURN and geometry.corrector <= CORRECTION):
+        why = ""
+        if not geometry.turn <= TURN:
             why = f"the curve turns too sharply ({geometry.turn:.2g} rad)"
+        elif not geometry.corrector <= CORRECTION:
+            why = f"the correction is too long ({geometry.corrector:.2g} of the step)"
+        if why:
             return Verdict(accepted=False, step=after.step / 2, why=why)
         growth = min(MOST_GROWTH, 0.5 * TURN / max(geometry.turn, LEAST_ANGLE))
         # An accepted turn is at most TURN, so that the quotient is at least 1/2, but for rounding.
@@ -98,12 +102,16 @@ class TurningSteps:
             at += f", {states.parameter.over} = {value:.6g}"
             states = states.states_at(value)
 
+        why = verdict.why
+        if attempt is None:
+            # A first step, or the one that an accepted step asks for, may be shorter than is allowed.
+            why = f"the next step, {verdict.step:.3g}, is below nfrc.smallest_step"
         remedy = "increase nfrc.harmonics or nfrc.max_newton, or decrease nfrc.smallest_step"
         laws = [stops.law for stops in states.forces.contacts]
         if any(law.damping and not law.approach_floor for law in laws):
             # The damping factor is divided by the approach velocity, which vanishes where a contact begins.
             remedy += "; a contact with loss that only grazes its stop needs contacts.approach_floor in m/s"
-        return f"no step from the last good point, {at}: {verdict.why}; {remedy}"
+        return f"no step from the last good point, {at}: {why}; {remedy}"
 
 
 def first_state(
