@@ -13,6 +13,7 @@ from vipetsc.lattice import Chain, Contact, DenseCompliance, ModalCompliance, Sp
 from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.departures import fraction_closed
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -105,6 +106,20 @@ def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
     # The closed part of a period is counted in whole samples.
     closed = (w > [[1.0], [0.8], [0.5]]) | (-w > [[1.0], [0.4], [np.inf]])
     assert series.closed == pytest.approx(closed.mean(axis=1), abs=1e-4)
+
+
+def test_time_in_which_several_contacts_are_closed_counts_once():
+    """Three contacts, each closed for a third of the period, two of them at once for 40 degrees, are so for 320."""
+    law = Contact("bilinear", 3.0)
+    forces = SiteForces([Stops(law, 0.5, np.inf)] * 3)
+    # cos(theta - shift) is above 1/2 within 60 degrees of the shift: from -60 to 60, 30 to 150 and 190 to 310 degrees.
+    shifts = np.radians([0.0, 90.0, 250.0])
+    z = np.column_stack([np.zeros(3), np.exp(-1j * shifts)])
+
+    assert fraction_closed(forces.series(z, OMEGA)) == pytest.approx(320 / 360, abs=1e-9)
+    # One contact alone, and none.
+    assert fraction_closed(forces.series(z * [[1], [0], [0]], OMEGA)) == pytest.approx(120 / 360, abs=1e-9)
+    assert fraction_closed(forces.series(0 * z, OMEGA)) == 0.0
 
 
 def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():

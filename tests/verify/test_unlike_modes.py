@@ -108,6 +108,24 @@ def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
     assert points[-1].x[0] < -1e-3 * 0.1
 
 
+def test_the_time_with_a_contact_closed_is_that_of_shooting():
+    """Two masses that meet stops at different times have contact for the time that shooting counts."""
+    law = Contact("bilinear", STOP)
+    pairs = [ContactPair(None, mass, clearance, law, np.inf) for mass, clearance in enumerate((0.5, 0.45))]
+    system = System.assemble([1.0, 1.2], [(None, 0, 10.0), (0, 1, 10.0), (None, 1, 10.0)], pairs)
+    energy = 0.9 * system.grazing_energy(1)
+    problem, points = condensed_branch(system, 1, energy, truncation=1e-6, points=30, largest_step=0.2)
+    point = points[-1]
+    assert point.episodes == 2
+
+    u = np.concatenate(list(state_of(problem, point, 2).values()))
+    frame = Shooting(Dop853Flow(system), MAPS["half"], 1e-12).relative_frame(u, point.period)
+    row = np.append(u / np.linalg.norm(u), 0.0)
+    orbit = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
+    assert orbit.period == pytest.approx(point.period, rel=1e-5)
+    assert point.closed == pytest.approx(orbit.closed, rel=1e-4)
+
+
 def test_the_other_side_has_the_mirrored_orbits():
     """Every orbit of a lattice is mirrored if the clearances of the two sides of each contact are exchanged."""
     case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)

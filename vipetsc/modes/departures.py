@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 # The tolerances on phases, in periods, and on squares of lengths. Symmetric orbits are symmetric to about 1e-12. So is
 # the depth of a short contact, which is proportional to the square of its length; the length itself is less accurate.
 SAME_PHASE = 1e-6
@@ -53,6 +55,16 @@ def within_arc(spans: Iterable[tuple[float, float]], fraction: float, rest_after
             end = 2 * fraction - begin
         departures.append(Departure(middle=(begin + end) / 2, length=end - begin))
     return departures
+
+
+def union_length(intervals: np.ndarray) -> float:
+    """Length of the union of ``intervals`` (number, 2), begin and end each, which may overlap."""
+    if not len(intervals):
+        return 0.0
+    # Sorted by ends and by beginnings apart, the gaps between neighbours are those of the union.
+    times = np.sort(intervals, axis=0)
+    gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
+    return float(times[-1, 1] - times[0, 0] - gaps)
 
 
 def families(departures: Sequence[Departure]) -> Counter[int]:

@@ -1,15 +1,16 @@
 """When contacts in a motion given by its harmonics are not what they are at rest: closed, or open if pressed at rest.
 
-Shooting integrates a part of the period, the arc, after which the motion repeats itself by a symmetry, and counts the
-episodes in it. The same are counted here, so that points of both methods can be compared.
+Shooting integrates a part of the period, the arc, after which the motion repeats itself by a symmetry, counts the
+episodes in it, and measures the time with a contact closed. The same is done here, so that points of both methods can
+be compared.
 """
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from vipetsc.modes.balance.harmonics import Episode, SiteForces
-from vipetsc.modes.departures import Departure
+from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
+from vipetsc.modes.departures import Departure, union_length
 
 # An episode centred on an end of the arc counts. Rounding may put its middle outside by up to 1e-9 rad at either end,
 # here as a part of the period.
@@ -41,6 +42,22 @@ def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Depar
             if (middle + ROUNDING) % 1 < end + 2 * ROUNDING:
                 departures.append(Departure(middle=middle, length=(stop - begin) / (2 * np.pi)))
     return departures
+
+
+def fraction_closed(series: ForceSeries) -> float:
+    """The fraction of the period in which one contact or more is closed, as shooting counts it."""
+    # The episodes of one contact do not overlap.
+    if np.count_nonzero(series.closed) < 2:
+        return float(series.closed.max(initial=0.0))
+
+    intervals = []
+    for episode in series.episodes:
+        begin = episode.onset
+        if begin < 0:
+            # An episode that contains phase 0 begins before it, at the end of the period.
+            intervals.append((begin + 2 * np.pi, 2 * np.pi))
+        intervals.append((max(begin, 0.0), episode.onset + episode.length))
+    return union_length(np.array(intervals)) / (2 * np.pi)
 
 
 def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

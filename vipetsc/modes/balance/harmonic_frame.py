@@ -11,7 +11,7 @@ and s instead, of any length, with period = 2 pi/Om and so dperiod = -(period^2/
 
 import numpy as np
 
-from vipetsc.modes.balance.departures import departures_of
+from vipetsc.modes.balance.departures import departures_of, fraction_closed
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
@@ -122,7 +122,7 @@ class HarmonicFrame:
             energy=balance.energy(x, omega, self.shift),
             residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
             episodes=len(departures_of(balance.forces, series.episodes)),
-            closed=float(series.closed.max(initial=0.0)),
+            closed=fraction_closed(series),
             # The history has the residual of the guess, too; that of a guess which is not corrected is empty.
             newton=max(len(attempt.history) - 1, 0),
             order=balance.order,

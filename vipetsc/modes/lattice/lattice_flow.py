@@ -25,6 +25,7 @@ from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.tangent import MOST_TAPE_ROWS, TangentPropagator
 from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.departures import union_length
 from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed: below the 1e-12 to which orbits of lattices are
@@ -107,7 +108,7 @@ class LatticeFlow:
         """
         engine, end = self._run(start, duration, self.steps(duration))
         contacts = engine.contacts()
-        closed = _union(np.concatenate(self.comm.allgather(contacts.closed_substeps)))
+        closed = union_length(np.concatenate(self.comm.allgather(contacts.closed_substeps)))
         departures = np.concatenate(self.comm.allgather(contacts.departures))
         return LatticeArc(duration, start, end, departures, closed, engine)
 
@@ -166,13 +167,3 @@ class LatticeFlow:
         cells = np.concatenate(self.comm.allgather(block), axis=-1)
         halves = cells.reshape(*block.shape[:-2], 2, self.layout.dofs, self.layout.cells)
         return np.moveaxis(halves, -1, -2).reshape(*block.shape[:-2], -1).copy()
-
-
-def _union(intervals: np.ndarray) -> float:
-    """Length of the union of ``intervals`` (number, 2), which may overlap."""
-    if not len(intervals):
-        return 0.0
-    # Sorted by ends and by beginnings apart, the gaps between neighbours are those of the union.
-    times = np.sort(intervals, axis=0)
-    gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
-    return float(times[-1, 1] - times[0, 0] - gaps)
