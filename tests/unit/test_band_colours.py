@@ -16,7 +16,7 @@ BANDS = (1, 2, 3, 4)
 X = np.array([1.0, 2.0, 4.0])
 
 
-def prediction(level: float = 0.2) -> Figure:
+def prediction(level: float = 0.2, onset: float = 1.0) -> Figure:
     # All energies are equal, hence curves coincide and differ in their style alone.
     energies = np.full((3, 4), level)
     data = {"sites/cell": ("site", [5, 9, 12])}
@@ -24,7 +24,7 @@ def prediction(level: float = 0.2) -> Figure:
         data |= {f"{kind}/bands": (("amplitude", "band"), energies)}
         data |= {f"{kind}/{name}": ("amplitude", energies[:, 0]) for name in ("upper", "dissipated")}
     data |= {"predicted/z": (("amplitude", "site"), np.outer(X, [1.0, 1.1, 1.2]))}
-    about = {"drive_band": 2, "onset_amplitude": 1.0}
+    about = {"drive_band": 2, "onset_amplitude": onset}
     coords = {"amplitude": ("amplitude", X, {"units": "N"}), "band": [*BANDS]}
     return predicted_energies.prediction(xr.Dataset(data, coords, about))
 
@@ -97,6 +97,15 @@ def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
         assert box.y0 > max(points[:, 1].max() for points in drawn)
         # A legend as wide as its axes would leave no place for the curves.
         assert box.x1 < axes.bbox.x1
+
+
+@pytest.mark.parametrize(("level", "onset", "least"), [(1e-16, 8.0, 1e-4), (1e-6, 0.5, 1e-4), (0.3, 0.5, 0.2)])
+def test_the_axis_of_transferred_energies_rises(level, onset, least):
+    """The axis rises from 1e-4, or from the smallest energy with contact, also where nothing is as large as that."""
+    with style.rc_style():
+        low, high = prediction(level, onset).get_axes()[0].get_ylim()
+    assert low == pytest.approx(least)
+    assert high > max(level, least)
 
 
 def test_the_amplitude_of_first_contact_is_apart_from_the_frame():

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 
 LEAST = 1e-4  # smallest energy shown, over the work
+WHOLE = 1.5  # upper limit of an axis on which an energy may be as large as the work
 MOST_SITES = 6  # sites that have a name in the legend: as many as there are dashes
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
 LOSSES: dict[str, dict[str, Any]] = {
@@ -38,7 +39,12 @@ def prediction(data: xr.Dataset) -> Figure:
     _draw_total(transferred, data, name)
     transferred.set(title=title, ylabel="Energy at the end / work", xscale="log", yscale="log")
     # The axis begins at what contacts transfer: members without contact have rounding errors, far below.
-    transferred.set_ylim(max(LEAST, _least(data, name) / 1.5), None)
+    low = max(LEAST, _least(data, name) / 1.5)
+    high = transferred.get_ylim()[1]
+    if high <= low:
+        # Nothing reaches the axis.
+        high = WHOLE
+    transferred.set_ylim(low, high)
     _put_legend_above(transferred, columns=2)
 
     _draw_losses(dissipated, data)
@@ -46,7 +52,7 @@ def prediction(data: xr.Dataset) -> Figure:
     dissipated.set_ylim(0, None)
 
     _draw_bands(every_band, data)
-    every_band.set(title="Every band", ylabel="Energy at the end / work", yscale="log", ylim=(LEAST, 1.5))
+    every_band.set(title="Every band", ylabel="Energy at the end / work", yscale="log", ylim=(LEAST, WHOLE))
     _put_legend_above(every_band, columns=4)
 
     _draw_sites(sites, data)
@@ -132,8 +138,11 @@ def _put_legend_above(axes: Axes, columns: int) -> None:
 
 
 def _least(data: xr.Dataset, name: str) -> float:
-    """Return the smallest positive energy above the onset, predicted or simulated; 1 without any."""
+    """Return the smallest positive energy above the onset, predicted or simulated; ``LEAST`` without any."""
     touches = data["amplitude"].values > float(data.attrs["onset_amplitude"])
     values = [data[f"{kind}/{name}"].values[touches] for kind in LOOKS if f"{kind}/{name}" in data]
     together = np.concatenate(values)
-    return float(together[together > 0].min(initial=1.0))
+    positive = together[together > 0]
+    if not len(positive):
+        return LEAST
+    return float(positive.min())
