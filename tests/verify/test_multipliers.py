@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,6 +22,7 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.lattice import floquet
 from vipetsc.modes.lattice.floquet import largest_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
+from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting
@@ -89,6 +91,24 @@ def test_the_product_is_the_derivative_of_the_residual(breather):
     ahead = frame.residual(frame.xi + 1e-6 * change)
     behind = frame.residual(frame.xi - 1e-6 * change)
     np.testing.assert_allclose(product, (ahead - behind) / 2e-6, atol=1e-6 * np.abs(product).max())
+
+
+def test_a_tangent_that_gmres_does_not_find_is_none(breather):
+    """A point whose null vector GMRES has not found has no tangent: a step to it fails, and no branch begins there."""
+    problem, point = breather
+    frame = problem.frame(replace(point, tangent=problem.first_tangent(point, 1)))
+    before = frame.tangent_at(frame.xi)
+    ksp = problem.newton._snes.getKSP()
+    _, _, _, products = ksp.getTolerances()
+    try:
+        ksp.setTolerances(max_it=2)
+        with pytest.raises(np.linalg.LinAlgError, match="GMRES ends with a residual of"):
+            frame.tangent_at(frame.xi)
+        with pytest.raises(ContinuationError, match="no unique tangent: GMRES"):
+            problem.first_tangent(point, 1)
+    finally:
+        ksp.setTolerances(max_it=products)
+    assert frame.tangent_at(frame.xi).tolist() == before.tolist()
 
 
 def test_a_linear_mode_is_continued_as_by_the_dense_method():

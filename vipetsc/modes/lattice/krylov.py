@@ -24,7 +24,7 @@ from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, StartError
+from vipetsc.modes.problem import Attempt, ContinuationError, StartError
 from vipetsc.modes.shooting.charts import Chart
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
@@ -115,7 +115,10 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
         y.setArray(self._local(np.append(product, self._row[0] @ change)))
 
     def null_vector(self, equations: KrylovEquations, xi: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """The vector (size,) on which the derivative at ``xi`` vanishes and ``row`` does not, of unit length."""
+        """The vector (size,) on which the derivative at ``xi`` vanishes and ``row`` does not, of unit length.
+
+        Raises LinAlgError on all ranks where GMRES does not find it, as where there are several.
+        """
         self._equations = equations
         self._at = xi
         self._row = row, 0.0
@@ -126,6 +129,8 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
         right.setArray(self._local(np.append(np.zeros(len(xi) - 1), 1.0)))
         with self._errors.raised_after():
             ksp.solve(right, x)
+        if ksp.getConvergedReason() < 0:
+            raise np.linalg.LinAlgError(f"GMRES ends with a residual of {ksp.getResidualNorm():.1e}")
         vector = self._whole(x)
         return vector / np.linalg.norm(vector)
 
@@ -151,7 +156,10 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
         return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own.
+
+        Raises LinAlgError where it is not found.
+        """
         return self.problem.newton.null_vector(self, xi, self.tangent)
 
 
@@ -199,10 +207,16 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         return Diagonal(x, period)
 
     def null_vector(self, start: Point) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, of either sign; a second null vector would not be seen."""
+        """Tangent d(x, period) at a corrected orbit, of either sign.
+
+        A second null vector may not be seen; raises ContinuationError where GMRES does not find the first one.
+        """
         frame = self.frame_at("relative", start.x, start.period, np.empty(0))
         row = np.append(frame.xi[:-1], 0.0)
-        null = self.newton.null_vector(frame, frame.xi, row / np.linalg.norm(row))
+        try:
+            null = self.newton.null_vector(frame, frame.xi, row / np.linalg.norm(row))
+        except np.linalg.LinAlgError as error:
+            raise ContinuationError(f"{start.describe()} has no unique tangent: {error}") from error
         return frame.chart.to_changes(frame.xi, null)
 
     def breather(self, omega: float, sites: Sequence[int] = (1,)) -> Point:
