@@ -80,6 +80,15 @@ def test_pairs_that_are_not_in_the_system_are_named(key):
         NnmCase.from_table({"nnm": {"system": "own", "own": own}})
 
 
+def test_unknowns_by_the_gap_of_a_contact_need_a_contact():
+    """The chart "grazing" is refused for a system without contacts; "auto" takes another one there."""
+    own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}]}
+    nnm = {"system": "own", "modes": [1], "own": own}
+    with pytest.raises(CaseError, match=r"nnm\.chart = 'grazing'.*there is no contact"):
+        NnmCase.from_table({"nnm": nnm | {"chart": "grazing"}})
+    NnmCase.from_table({"nnm": nnm | {"chart": "auto"}})
+
+
 def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
     """Presets have default clearances and contact stiffnesses; another cell without them is refused."""
     springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]

@@ -249,6 +249,8 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
     for key in ("pair", "next_cell"):
         if getattr(contacts, key) is not None or (contacts.each and getattr(contacts.each, key)):
             yield Problem(path_of(contacts, key), None, "[nnm.own] names the masses of each contact; omit the key")
+    if nnm.chart == "grazing" and not custom.contacts:
+        yield Problem("nnm.chart", "grazing", "its unknown is the gap of a contact, and there is no contact; omit it")
     yield from check_stiffness(contacts, bool(custom.contacts), valid)
     for problem in _check_stops(contacts, [pair.clearance for pair in custom.contacts], valid):
         # The contacts of such a system have their clearances in [nnm.own].
