@@ -203,7 +203,7 @@ def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     summary = run_search(OptimiseCase.from_table(table), tmp_path, MPI.COMM_SELF)
     found = datasets(tmp_path / "optimum.h5")
     assert np.isnan(found["value"]).all()
-    assert found["reason"][0].startswith(b"curve r1-1: 4 points reached: increase nfrc.points")
+    assert found["reason"][0].startswith(b"curve r1-1: 5 points reached: increase nfrc.points")
     assert "2 designs, 2 runs, 2 frequency responses; 2 designs failed" in summary
     assert np.isfinite(found["curve/dissipated"]).all()
 

@@ -16,6 +16,7 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.lattice.chain import Pair
+from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.response.condensation import stops_of
 from vipetsc.modes.response.state import Response
@@ -229,6 +230,14 @@ def test_curves_of_a_case_have_one_compliance():
     nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.1, 0.2], "restitutions": [1.0, 0.7]}
     method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), MPI.COMM_SELF)
     assert len({id(method.problem(job).compliance) for job in range(4)}) == 1
+
+
+def test_a_curve_that_has_used_up_its_points_tells_their_number():
+    """The start is one of the points of a curve: with nfrc.points = 3 it has three, and its ending says so."""
+    case = NfrcCase.from_table(TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"points": 3}})
+    (curve,) = follow_all(case, None, MPI.COMM_SELF)
+    assert len(curve.regular()) == 3
+    assert curve.ending == "3 points reached: increase nfrc.points and resume to continue"
 
 
 def test_a_pressed_contact_is_refused_a_loss():

@@ -67,8 +67,12 @@ class Growth:
         # Points of an earlier run count against the number that a branch may have; its start does not.
         done = max(len(regular) - 1, 0) + points_elsewhere
         rule = rule_of(problem, start, done)
+        # The ending of a branch that has used up its points tells their number as its case counts them.
+        counted = done + int(self.method.counts_start)
         # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
-        continuation = Continuation(problem, start, rule, direction, step=branch.next_step or None, points_before=done)
+        continuation = Continuation(
+            problem, start, rule, direction, step=branch.next_step or None, points_before=counted
+        )
         monitor = self.method.monitor(problem)
         # The monitor compares each point with all earlier ones, to see whether the branch retraces itself or returns to
         # the linear mode. A resumed branch must be judged as one that was not interrupted: that one began without

@@ -35,12 +35,14 @@ class Method(ABC, Generic[S]):
     not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_interrupted``: a
     branch that failed or was stopped has the additions to the file of a whole branch, too (``finish``). ``locates``:
     special points are looked for between the regular ones, those where a contact grazes only with ``locates_grazing``.
+    ``counts_start``: the start is one of the points of which the case gives the largest number.
     """
 
     kind: ClassVar[str]
     shared: ClassVar[bool] = False
     # Where the derivative is singular a motion has no unique tangent.
     failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError, np.linalg.LinAlgError)
+    counts_start: ClassVar[bool] = False
     keeps_empty: ClassVar[bool] = True
     finishes_interrupted: ClassVar[bool] = False
     locates_grazing: bool = False

@@ -40,6 +40,7 @@ class ResponseMethod(Method[Response]):
     kind = RESPONSES
     failures = FAILURES
     keeps_empty = False  # pictures and tables of curves need a first state
+    counts_start = True
 
     case: NfrcCase
 
