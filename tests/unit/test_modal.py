@@ -119,6 +119,37 @@ def test_inverse_iteration_gives_the_modes_of_a_dense_solution(name):
     assert np.abs(residual).max() < 1e-13 * squared[-1]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("ends", ["fixed", "free"])
+def test_modes_of_equal_masses_are_those_of_the_formula(ends):
+    """Chains of 2 to 40 equal masses have the frequencies 2 (k/m)^1/2 sin(p j/2), with p = pi/(n + 1) or pi/n.
+
+    An eigenvalue is often exact to the last bit in such a chain, and a matrix shifted by it has no inverse.
+    """
+    cell = UnitCell((1e-3,), (Spring(0, 0, 1e4, next_cell=True),), 0, 0)
+    for cells in range(2, 41):
+        found = linear_modes(Chain(cell, cells, ends))
+        exact = 2 * np.sqrt(1e7) * np.sin(np.pi * np.arange(cells) / (2 * cells))
+        if ends == "fixed":
+            exact = 2 * np.sqrt(1e7) * np.sin(np.pi * np.arange(1, cells + 1) / (2 * (cells + 1)))
+        assert found.frequency == pytest.approx(exact, rel=1e-10, abs=1e-3)
+        assert np.abs(found.vectors.T @ found.vectors - np.eye(cells)).max() < 1e-12
+
+
+def test_modes_that_inverse_iteration_misses_are_those_of_a_dense_solution(monkeypatch):
+    """Vectors that are not finite, as those that are not orthonormal, are replaced by those of a dense solution."""
+    chain = Chain(CELLS["diatomic"], 21)
+    exact = linear_modes(chain)
+    modes._modes.cache_clear()
+    squared = exact.frequency**2
+    for vectors in (np.full_like(exact.vectors, np.nan), np.ones_like(exact.vectors)):
+        with monkeypatch.context() as patch:
+            patch.setattr(modes, "_near_diagonal", lambda matrix, vectors=vectors: (squared, vectors))
+            found = linear_modes(chain)
+        modes._modes.cache_clear()
+        assert np.abs(np.abs(found.vectors.T @ exact.vectors) - np.eye(len(squared))).max() < 1e-10
+
+
 def test_chains_that_differ_in_contacts_alone_share_their_modes():
     """Modes are computed once for chains that differ in contacts alone."""
     chain = Chain(CELLS["diatomic"], 20)

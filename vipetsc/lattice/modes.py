@@ -127,7 +127,8 @@ def _modes(chain: Chain) -> Modes:
     # The norm of two random fields shows whether inverse iteration has left modes that are not orthogonal.
     x = np.random.default_rng(0).standard_normal((2, len(squared)))
     norm = np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1)
-    if np.any(np.abs(norm - 1) > ORTHONORMAL):
+    # Not "any > ORTHONORMAL", which is false for NaN.
+    if not np.all(np.abs(norm - 1) <= ORTHONORMAL):
         squared, vectors = eigh(matrix.toarray(), driver="evr")
 
     squared[squared < AT_REST * squared[-1]] = 0.0  # free ends
@@ -272,12 +273,16 @@ def _band(matrix: csc_matrix) -> np.ndarray:
 
 
 class _BandFactor:
-    """LU factors of ``band`` - ``shift``, of a matrix as ``_band`` lays it out; ``band`` itself is overwritten."""
+    """LU factors of ``band`` - ``shift``, of a matrix as ``_band`` lays it out; ``band`` itself is overwritten.
+
+    If the result ``is_singular``, the shift being an eigenvalue to the last bit, nothing can be solved with it.
+    """
 
     def __init__(self, band: np.ndarray, shift: float) -> None:
         self._width = len(band) // 3
         band[2 * self._width] -= shift
-        self._factor, self._pivots, _ = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
+        self._factor, self._pivots, zero_pivot = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
+        self.is_singular = zero_pivot > 0
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """The solution (n,) for the right-hand side ``x``."""
@@ -305,6 +310,11 @@ def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
         # Equal eigenvalues get shifts apart, or inverse iteration would give the same vector again.
         shift = max(value, shift + 4 * EPS * squared[-1])
         shifted = _BandFactor(band.copy(order="F"), shift)
+        # As happens in chains of equal masses. A shift that is off by some roundings serves as well.
+        while shifted.is_singular:
+            shift += 4 * EPS * squared[-1]
+            shifted = _BandFactor(band.copy(order="F"), shift)
+
         x = noise[j]
         for _ in range(ITERATIONS):
             x = shifted.solve(x)

@@ -38,7 +38,7 @@ def _kept(chain: Chain) -> Modes:
     stiffness = chain.stiffness_matrix()
     matrix = (chain.masses(), stiffness.data, stiffness.indices, stiffness.indptr)
     ends = f"{chain.cells} {chain.ends}".encode()
-    arrays = kept_arrays("modes", [ends, *(values.tobytes() for values in matrix)], compute)
+    arrays = kept_arrays("linear-modes", [ends, *(values.tobytes() for values in matrix)], compute)
     return Modes(
         chain=chain,
         frequency=arrays["frequency"],
