@@ -201,6 +201,12 @@ def test_a_rigid_motion_is_no_mode_to_begin_with():
     """The mode 1 of a free lattice, with the frequency 0, is refused as an initial motion."""
     with pytest.raises(CaseError, match="frequency of this mode is 0"):
         case_with(lattice=FOUR_BAND | {"ends": "free"}, initial={"kind": "mode", "number": 1, "amplitude": 1e-3})
+    # One free mass has no other mode.
+    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
+    one_mass = {"cells": 1, "ends": "free", "cell": {"masses": [1e-3], "springs": [spring]}}
+    for which in ({"number": 1}, {"near": 100.0}):
+        with pytest.raises(CaseError, match="frequency of this mode is 0"):
+            Case(lattice=one_mass, initial={"kind": "mode", "amplitude": 1e-3} | which, time={"end": 1e-2})
 
 
 def test_scattering_laws_begin_at_rest():

@@ -263,7 +263,8 @@ def _scaled(chain: Chain) -> csc_matrix:
 
 def _band(matrix: csc_matrix) -> np.ndarray:
     """The band of ``matrix`` (3 width + 1, n) in the layout of LAPACK's ``dgbtrf``, which fills the ``width`` above."""
-    width = int(np.abs(np.subtract(*matrix.nonzero())).max())
+    # One free mass has no spring: its matrix is 0, and has no entry.
+    width = int(np.abs(np.subtract(*matrix.nonzero())).max(initial=0))
     band = np.zeros((3 * width + 1, matrix.shape[0]))
     for k in range(-width, width + 1):
         diagonal = matrix.diagonal(k)
