@@ -71,3 +71,18 @@ def test_its_measures_are_taken():
     data, _ = simulated(case)
     analysis = analyse(data)
     assert {"kinetic_energy", "dispersion", "modal/energy"} & {*map(str, analysis.data_vars)}
+
+
+@pytest.mark.filterwarnings("error")
+def test_cells_that_the_motion_has_not_reached_have_no_fractions():
+    """Of cells that are at rest in the whole record the energy has no fractions, and no warning says so."""
+    case = Case(
+        lattice={"cells": 24},
+        contacts={"sites": [], "clearance": 1e-5},
+        initial={"kind": "velocity", "cell": 1, "velocity": 0.5},
+        time={"end": 4e-4, "engine": "propagator"},
+        output={"window": [23, 24]},
+    )
+    data, _ = simulated(case)
+    assert not data["velocity"].values.any()
+    assert np.isnan(analyse(data)["bands/share"].values).all()

@@ -67,6 +67,9 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
     total = energy[:, span.first : span.last].sum(axis=0)
     # The energy at an instant without motion has no fractions.
     moving = total > 0
+    fractions = np.full(len(energy), np.nan)
+    if moving.any():
+        fractions = (energy[:, span.first : span.last][:, moving] / total[moving]).mean(axis=1)
 
     times = {
         "start": record.time[span.first],
@@ -88,7 +91,7 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         "bands/edges": parts.edges,
         "bands/energy": energy,
         "bands/above": above.astype(np.int8),
-        "bands/share": (energy[:, span.first : span.last][:, moving] / total[moving]).mean(axis=1),
+        "bands/share": fractions,
     }
 
 
