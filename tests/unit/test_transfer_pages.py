@@ -218,6 +218,21 @@ def test_amplitudes_of_a_moved_wall_are_in_metres():
     assert figure.axes[0].get_ylabel() == "Kinetic energy / A² (J/m²)"
 
 
+@pytest.mark.parametrize(
+    ("peaks", "limits"),
+    [
+        ([2.0, 1e-3], (1e-8, 2e4)),
+        ([1e-3, 2.0], (1e-8, 2e4)),
+        ([2.0, 0.0], (2e-5, 2e4)),
+        ([2.0, 1e-30], (2e-10, 2e4)),
+        ([0.0, 0.0], (1e-5, 1e4)),
+    ],
+)
+def test_spectra_of_two_cells_have_room_on_their_axis(peaks, limits):
+    """The common axis ends above the larger peak and begins below the smaller one, unless that is a rounding error."""
+    assert transfer._spectra_limits(peaks) == pytest.approx(limits)
+
+
 def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:
     """Return the warnings below a picture of that ``series``."""
     monkeypatch.setattr(sweep_members, "series_of", lambda sweeps, *needs: iter([series]))

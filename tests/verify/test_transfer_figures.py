@@ -17,7 +17,7 @@ from vipetsc.figures.panels import block_means
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
-from vipetsc.figures.transfer import closing_error
+from vipetsc.figures.transfer import ROOM, closing_error
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.studies.backbone import initiation_of, relate_folders
@@ -257,6 +257,11 @@ def test_transfer_spectrum_is_that_of_the_cells_velocity(whole, transfer_picture
 
     x, y = lines(panel(figure, "cell 5"))["mass 1"]
     assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
+
+    # The common axis has room above the larger of both peaks.
+    spectra = [curve for cell in ("cell 5", "cell 10") for curve in lines(panel(figure, cell)).items()]
+    peak = max(values.max() for name, (_, values) in spectra if name.startswith("mass"))
+    assert axes.get_ylim()[1] == pytest.approx(ROOM * peak)
 
 
 @pytest.mark.slow

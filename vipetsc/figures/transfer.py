@@ -49,7 +49,7 @@ SEGMENTS = {
 }
 OUTLINE = [withStroke(linewidth=3.4, foreground=style.BLACK)]  # seen on bright and dark places of a map
 TEXT_OUTLINE = [withStroke(linewidth=1.4, foreground=style.BLACK)]
-ROOM = 1e4  # factor from the peak of a spectrum to the end of its axis: room for the inset with the time history
+ROOM = 1e4  # factor from the largest peak of spectra to the end of its axis: room for the inset with the time history
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
 MOST_COLUMNS = 4  # of dispersions on a page
 MOST_PANELS = 12  # on a page of members that have nothing in common
@@ -96,11 +96,15 @@ def nine_panels(member: MemberRun) -> Figure:
     panels.colour_bar(image, maps, "Energy per bin (J)")
 
     cells = INPUT_CELL, member.model.chain.cells // 2
-    for axes, number in zip(lower.subplots(1, 2, sharey=True), cells, strict=True):
+    both = lower.subplots(1, 2, sharey=True)
+    peaks: list[float] = []
+    for axes, number in zip(both, cells, strict=True):
         index = nearest_cell(run, number)
-        _draw_spectra(axes, member, run["velocity"][:, index].values)
+        peaks.append(_draw_spectra(axes, member, run["velocity"][:, index].values))
         axes.set_title(f"({next(tags)}) Velocity spectra, cell {run['cell'].values[index]}")
         axes.label_outer()
+    # Their axis is common.
+    both[0].set_ylim(_spectra_limits(peaks))
     return figure
 
 
@@ -145,10 +149,19 @@ def _mark_segments(axes: Axes, member: MemberRun) -> None:
         axes.text(0.955, 0.5 * (low + high), name, transform=across, **text)
 
 
-def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
+def _spectra_limits(peaks: Sequence[float]) -> tuple[float, float]:
+    """Return the limits of a logarithmic axis of spectra with these ``peaks``, 0 for a cell that no wave reaches."""
+    positive = [peak for peak in peaks if peak > 0] or [1.0]
+    decades = 10.0**-panels.DECADES
+    # Behind a site a spectrum may be far smaller; rounding errors are no spectrum.
+    smallest = max(min(positive), decades * max(positive))
+    return decades * smallest, ROOM * max(positive)
+
+
+def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> float:
     """Draw amplitude spectra of the masses of one cell by their ``velocity`` (t, dof) in m/s, which is in an inset.
 
-    Pass bands are shaded and numbered.
+    Pass bands are shaded and numbered. Returns the largest value in m.
     """
     cell = member.model.chain.cell
     step = field_interval(member.run)
@@ -168,10 +181,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     labels = [f"mass {mass + 1}{roles.get(mass, '')}" for mass in range(cell.dofs)]
     line = {"lw": 0.5, "alpha": 0.85, "rasterized": True}
     axes.plot(frequency[shown], np.maximum(spectrum[shown], 1e-300), label=labels, **line)
-    # A cell that the wave does not reach has a spectrum of zeros, and the axis needs a positive limit.
-    peak = spectrum.max() or 1.0
-    low = min(10.0**-panels.DECADES * peak, axes.get_ylim()[1])
-    axes.set(yscale="log", xlim=(0, frequency[shown][-1]), ylim=(low, ROOM * peak))
+    axes.set(yscale="log", xlim=(0, frequency[shown][-1]))
     axes.set(xlabel=panels.OMEGA, ylabel="Velocity spectrum (m)")
     axes.legend(loc="upper left", fontsize=5.5, handlelength=1.0, labelspacing=0.2)
 
@@ -181,6 +191,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     inset.tick_params(labelsize=5, pad=1)
     inset.set_ylabel("m/s", fontsize=5.5, labelpad=0)
     inset.set_xlabel("time (s)", fontsize=5.5, labelpad=0)
+    return float(spectrum.max())
 
 
 class CaseFolder(NamedTuple):
