@@ -11,7 +11,7 @@ from tests.conftest import assert_same_bits, datasets, run_of, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.dynamics.recorder import Recorder
-from vipetsc.io import chunks
+from vipetsc.io import atomic, chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
@@ -132,14 +132,20 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]
 
 
-def test_arrays_come_back_as_they_were(tmp_path):
+@pytest.mark.parametrize("largest", [atomic.LARGEST_RECORD, 0])
+def test_arrays_come_back_as_they_were(tmp_path, monkeypatch, largest):
+    """Arrays have their types and shapes again, from one record and, if they are too large for it, from a sequence."""
+    monkeypatch.setattr(atomic, "LARGEST_RECORD", largest)
     arrays = {
         "a": np.arange(6.0).reshape(2, 3)[:, ::2],
         "b": np.array(7),
         "c": np.zeros((0, 4)),
         "d": np.array([1, -1]),
+        "energy/e": np.zeros(3, [("time", float), ("site", int)]),
     }
     save_arrays(tmp_path / "x.npy", arrays)
+    # The first array of a sequence is that of the names.
+    assert (np.load(tmp_path / "x.npy").dtype.names is None) == (largest == 0)
     back = load_arrays(tmp_path / "x.npy")
 
     assert list(back) == list(arrays)
@@ -150,9 +156,16 @@ def test_arrays_come_back_as_they_were(tmp_path):
 
     # Mapped arrays let a rank read only its own part of the states of others.
     mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]
-    assert not mapped.flags.writeable
+    assert not mapped.flags.writeable and not mapped.flags.owndata
     np.testing.assert_array_equal(mapped, arrays["a"])
     assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
+
+    with pytest.raises(OSError, match=r"x\.npy cannot be read: .*f"):
+        load_arrays(tmp_path / "x.npy", ["f"])
+    content = (tmp_path / "x.npy").read_bytes()
+    (tmp_path / "x.npy").write_bytes(content[:-1])
+    with pytest.raises(OSError, match=r"x\.npy cannot be read"):
+        load_arrays(tmp_path / "x.npy")
 
 
 def test_contacts_that_still_last_at_the_end_are_logged(folder):

@@ -1,5 +1,6 @@
 """Files that are complete or absent: written under a temporary name, and renamed when complete."""
 
+import math
 import os
 import platform
 import re
@@ -9,11 +10,13 @@ import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
 
 Arrays = Mapping[str, np.ndarray]
+LARGEST_RECORD = 2**31 - 1  # bytes, which numpy counts in a C int
 
 
 @contextmanager
@@ -95,25 +98,43 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Write ``arrays`` as the fields of one record in numpy's format (.npy); raises OSError as ``atomic_write``.
+    """Write ``arrays`` to ``path`` in numpy's format (.npy); raises OSError as ``atomic_write``.
 
-    numpy's own format for several arrays, a zip file, takes three times as long.
+    They are the fields of one record or, if they are too large for it, arrays one after another, of which the first
+    has the names of the others. numpy's own format for several arrays, a zip file, takes three times as long as a
+    record, and cannot be mapped.
     """
-    record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
     with atomic_write(path) as aside, aside.open("wb") as file:
-        # The header is numpy's. The values follow it one after another, without a copy of all in one array.
-        header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
+        if sum(values.nbytes for values in arrays.values()) > LARGEST_RECORD:
+            _write_sequence(file, arrays)
+        else:
+            _write_record(file, arrays)
+
+
+def _write_record(file: BinaryIO, arrays: Arrays) -> None:
+    """Write ``arrays`` as the fields of one record."""
+    record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
+    # The header is numpy's. The values follow it one after another, without a copy of all in one array.
+    header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
+    npy.write_array_header_2_0(file, header)
+
+    # Byte 6 is the version of the format. Version 3 differs from 2 in the header's encoding, UTF-8, and
+    # numpy 1.24 takes a header of version 2 apart into tokens, which takes longer than the rest of the reading.
+    file.seek(6)
+    file.write(b"\3")
+    file.seek(0, os.SEEK_END)
+
+    # By ``write``, whose error has a number; numpy's ``tofile`` gives none.
+    for values in arrays.values():
+        file.write(np.ascontiguousarray(values).data)
+
+
+def _write_sequence(file: BinaryIO, arrays: Arrays) -> None:
+    """Write the names of ``arrays`` as an array, and behind it each of them."""
+    for values in (np.array(list(arrays)), *arrays.values()):
+        header = {"descr": npy.dtype_to_descr(values.dtype), "fortran_order": False, "shape": values.shape}
         npy.write_array_header_2_0(file, header)
-
-        # Byte 6 is the version of the format. Version 3 differs from 2 in the header's encoding, UTF-8, and
-        # numpy 1.24 takes a header of version 2 apart into tokens, which takes longer than the rest of the reading.
-        file.seek(6)
-        file.write(b"\3")
-        file.seek(0, os.SEEK_END)
-
-        # By ``write``, whose error has a number; numpy's ``tofile`` gives none.
-        for values in arrays.values():
-            file.write(np.ascontiguousarray(values).data)
+        file.write(np.ascontiguousarray(values).data)
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
@@ -125,8 +146,29 @@ def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = 
     try:
         # numpy refuses headers of more than 10,000 letters, since a hostile one could stop it; this one is ours.
         record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
+        names = record.dtype.names
+        arrays: Any = record
+        # Without fields it is the array of names of a sequence.
+        if names is None:
+            arrays = _mapped_sequence(path)
+            names = tuple(arrays)
         if wanted is None:
-            wanted = record.dtype.names or ()
-        return {name: np.array(record[name], copy=copy) for name in wanted}
-    except (OSError, ValueError) as error:
+            wanted = names
+        return {name: np.array(arrays[name], copy=copy) for name in wanted}
+    except (OSError, ValueError, KeyError) as error:
         raise OSError(f"{path} cannot be read: {error}") from error
+
+
+def _mapped_sequence(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that ``_write_sequence`` wrote, as parts of the file."""
+    content = np.memmap(path, np.uint8, mode="r")
+    mapped: dict[str, np.ndarray] = {}
+    with path.open("rb") as file:
+        for name in npy.read_array(file).tolist():
+            npy.read_magic(file)
+            shape, _, dtype = npy.read_array_header_2_0(file)
+            start = file.tell()
+            stop = start + math.prod(shape) * dtype.itemsize
+            mapped[name] = content[start:stop].view(dtype).reshape(shape)
+            file.seek(stop)
+    return mapped
