@@ -156,6 +156,9 @@ def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks)
     ("arguments", "text"),
     [
         (("run", "nowhere.toml"), "nowhere.toml: No such file"),
+        # As by a variable of a shell that is not set.
+        (("validate", ""), "Is a directory; a case file (TOML) is needed"),
+        (("schema", ""), "Is a directory; a case file (TOML) is needed"),
         (("run", "--set", "time.end"), "write section.key=value"),
         (("run", "--set", "time.sample_interval=0.01"), "too coarse for the bands"),
         (("run", "--set", "lattice.cell.masses=[1.0, -1.0]"), "lattice.cell"),

@@ -106,7 +106,8 @@ class CaseFile(Section):
     @classmethod
     def load(cls, path: str | Path | None = None, overrides: Iterable[str] = ()) -> Self:
         """The case in file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
-        if not path:
+        # Not for an empty name, which an unset variable of a shell gives: a built-in case is not what is meant.
+        if path is None:
             return cls.from_table(cls.builtin_table, overrides, "built-in case")
         return cls.from_table(read_toml(path), overrides, str(path))
 

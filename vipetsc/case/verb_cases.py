@@ -92,6 +92,6 @@ def disorder_of(
 
 def _table(path: str | Path | None) -> tuple[Table, str]:
     """The table of a case file and what it is called; the built-in one without a file."""
-    if path:
-        return read_toml(path), str(path)
-    return Case.builtin_table, "built-in case"
+    if path is None:
+        return Case.builtin_table, "built-in case"
+    return read_toml(path), str(path)

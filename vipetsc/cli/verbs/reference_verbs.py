@@ -42,7 +42,10 @@ def schema_of(path: str | None) -> dict[str, Any]:
     from vipetsc.case.keys import json_schema
     from vipetsc.case.parts import module_names, with_parts
 
-    table, problems = with_parts(read_toml(path) if path else {})
+    given: dict[str, Any] = {}
+    if path is not None:
+        given = read_toml(path)
+    table, problems = with_parts(given)
     if problems:
         raise CaseError(problems, str(path))
     return json_schema(module_names(table))
