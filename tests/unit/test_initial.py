@@ -277,18 +277,24 @@ def test_an_orbit_that_a_branch_does_not_hold_is_refused(branch, key, message):
         case_with(initial={"kind": "file", "path": str(branch)} | key)
 
 
-def test_a_state_of_other_dimensions_is_refused(tmp_path):
-    """Displacements of cells with one mass each have an axis for the mass, too; without it there is no state."""
+@pytest.mark.parametrize(
+    ("displacement", "velocity"),
+    [("cell", "cell"), ("cell dof", "cell"), ("cell dof", "cell row"), ("row dof", "row dof")],
+)
+def test_a_state_of_other_dimensions_is_refused(tmp_path, displacement, velocity):
+    """Displacement and velocity are over cells and masses, also where each cell has one mass; else it is no state."""
     path = tmp_path / "state.h5"
-    data = {"cell": variable("cell", [1, 2, 3], "1", "cell")}
-    data |= {name: variable("cell", [1e-3, 0.0, 0.0], "m", name) for name in ("displacement", "velocity")}
+    sizes = {"cell": 3, "dof": 4, "row": 2}
+    data = {dim: variable(dim, np.arange(1, size + 1), "1", dim) for dim, size in sizes.items()}
+    for name, dims in (("displacement", displacement.split()), ("velocity", velocity.split())):
+        data[name] = variable(dims, np.ones([sizes[dim] for dim in dims]), "m", name)
     write_netcdf(path, xr.Dataset(data))
     with pytest.raises(CaseError, match=r"state\.h5 contains no state: its displacement .* not over \(cell, dof\)"):
         case_with(initial={"kind": "file", "path": str(path), "frequency": 100.0})
 
 
 def test_a_branch_without_orbits_is_named_whole(tmp_path):
-    """The message has the whole path of an empty branch, also if words of the message are part of the path."""
+    """Messages have the whole path of a branch, also if words of a message are part of it; a period is needed."""
     path = tmp_path / "a branch that has orbits.h5"
     put_branch(path)
     with xr.open_dataset(path, group="states") as states:
@@ -296,6 +302,9 @@ def test_a_branch_without_orbits_is_named_whole(tmp_path):
     names = {name: f"states/{name}" for name in (*empty.variables, *empty.dims)}
     write_netcdf(path, empty.rename(names))
     with pytest.raises(ValueError, match=r"a branch that has orbits\.h5 contains no state: it is empty"):
+        State.read(path)
+    write_netcdf(path, empty.rename(names).drop_vars("states/period"))
+    with pytest.raises(ValueError, match=r"a branch that has orbits\.h5 contains no state: it lacks states/period"):
         State.read(path)
 
 

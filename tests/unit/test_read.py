@@ -120,6 +120,7 @@ def test_other_files_are_refused(tmp_path, folder):
         open_ensemble(folder)
 
 
+@pytest.mark.filterwarnings("error")
 def test_members_are_selected_by_the_values_of_swept_keys(folder):
     """Members are selected by values of swept keys, single or together; a value that no member has is named."""
     ensemble = open_ensemble(folder)

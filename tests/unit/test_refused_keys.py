@@ -126,6 +126,20 @@ def test_a_further_drive_needs_a_wave(first):
     assert key == "drive.more[2].wavenumber" and "the frequency there is 0" in remedy
 
 
+def test_a_further_drive_may_stand():
+    """A run lasts until the wave of the first drive has crossed the lattice: that of a further one need not travel."""
+    standing = {"wavenumber": "pi", "band": 1}
+    table = {
+        "lattice": {"preset": "diatomic", "cells": 24},
+        "contacts": {"sites": 0},
+        "drive": {"more": [standing]},
+        "time": {"sample_interval": 1e-5},
+    }
+    assert Case.from_table(table).drive.more[0].frequency > 0
+    key, remedy = problem_of(table | {"drive": standing})
+    assert key == "drive.wavenumber" and "never crosses" in remedy
+
+
 def test_a_burst_without_springs_needs_its_frequency():
     table = unsprung_table() | {"drive": {"amplitude": 1.0}}
     with pytest.raises(CaseError) as error:
