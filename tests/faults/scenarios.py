@@ -175,6 +175,15 @@ bounds = [3e-4, 5e-3]
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
 # A run of 101 samples then has several chunks.
 SAMPLES_A_CHUNK = 20
+# Attributes of HDF5 files in which two outcomes of one command differ, and why.
+OF_ONE_CALL = {
+    "date": "when the file was written",
+    "ranks": "which team of a sweep, of two ranks or one, was free for a member",
+    "cpu_seconds": "time that the call took",
+    "sources": "hashes of files with a date in them",
+}
+# Attributes that are addresses within the file. The dimensions of datasets, which they say, are compared by name.
+ADDRESSES = {"DIMENSION_LIST", "REFERENCE_LIST"}
 
 # The steps that remain in the tiny paper, and the changes that shorten them.
 PAPER = {
@@ -311,8 +320,8 @@ def unreadable(folder: Path) -> list[str]:
 def difference(wanted: Path, found: Path) -> str:
     """Return the difference between two outcomes of the same case, in words; "" if they agree.
 
-    The function compares the names of files, every bit of datasets, tables and claims, and the numbers of summaries
-    except durations.
+    The function compares the names of files, every bit of datasets, tables and claims, the attributes of HDF5 files
+    except those in ``OF_ONE_CALL``, and the numbers of summaries except durations.
     """
     names_wanted = {str(path.relative_to(wanted)) for path in wanted.rglob("*")}
     names_found = {str(path.relative_to(found)) for path in found.rglob("*")}
@@ -323,18 +332,21 @@ def difference(wanted: Path, found: Path) -> str:
         before = _content(wanted / name)
         after = _content(found / name)
         if before != after:
-            return f"{name}: {[key for key in before if before[key] != after.get(key)][:5]}"
+            keys = sorted(before.keys() | after.keys())
+            return f"{name}: {[key for key in keys if before.get(key) != after.get(key)][:5]}"
     return ""
 
 
 def _content(path: Path) -> dict:
     """Return the content of a file that must be the same; pictures have none."""
     found: dict = {}
-    if path.name == "modes.h5":
-        found = _digits(path)
-    elif path.suffix == ".h5":
+    if path.suffix == ".h5":
+        values_of = _bits
+        if path.name == "modes.h5":
+            values_of = _digits
         with h5py.File(path) as file:
-            file.visititems(lambda name, item: found.update({name: _bits(item)}))
+            found = _attributes("", file)
+            file.visititems(lambda name, item: found.update(_attributes(name, item) | values_of(name, item)))
     elif path.suffix == ".csv" or path.name == "claims.json":
         found["text"] = path.read_bytes()
     elif path.suffix == ".jsonl":
@@ -346,36 +358,58 @@ def _content(path: Path) -> dict:
             else:
                 found[row.get("id") or row["linear"]] = (row.get("status"), row.get("measures"))
     elif path.name == "summary.json":
-        numbers = json.loads(path.read_text())["statistics"]
-        found = {key: value for key, value in numbers.items() if not key.endswith("_seconds")}
+        found = _timeless(json.loads(path.read_text())["statistics"])
     return found
 
 
-def _digits(path: Path) -> dict:
-    """Return linear modes to six digits: their solver on three ranks adds in the order in which messages arrive."""
-    found = {}
-    with h5py.File(path) as file:
-        # Residuals are rounding errors.
-        for name in file.keys() - {"residual"}:
-            values = file[name][...]
-            if values.dtype.kind == "f":
-                largest = np.abs(values).max() or 1.0
-                # The sum makes -0 a 0, whose bytes differ.
-                found[name] = (np.round(values / largest, 6) + 0.0).tobytes()
-            else:
-                found[name] = values.tolist()
+def _timeless(statistics: dict) -> dict:
+    """Return the ``statistics`` of a run without its durations."""
+    return {key: value for key, value in statistics.items() if not key.endswith("_seconds")}
+
+
+def _attributes(name: str, item: h5py.Dataset | h5py.Group) -> dict:
+    """Return the attributes of the group or dataset ``name`` that must be the same, and the dimensions of a dataset.
+
+    The file itself has the name "".
+    """
+    found: dict = {}
+    for key, value in item.attrs.items():
+        if key in OF_ONE_CALL or key in ADDRESSES:
+            continue
+        if key == "statistics":
+            found[f"{name}@{key}"] = _timeless(json.loads(value))
+        else:
+            found[f"{name}@{key}"] = _content_of(np.asarray(value))
+    if isinstance(item, h5py.Dataset):
+        found[f"{name}@dimensions"] = [[scale.name for scale in axis.values()] for axis in item.dims]
     return found
 
 
-def _bits(item: h5py.Dataset | h5py.Group) -> object:
-    """Return the shape and the bytes of a dataset, None for a group."""
-    if not isinstance(item, h5py.Dataset):
-        return None
+def _bits(name: str, item: h5py.Dataset | h5py.Group) -> dict:
+    """Return the content of the dataset ``name``, or that it is a group."""
+    if isinstance(item, h5py.Dataset):
+        return {name: _content_of(item[...])}
+    return {name: "group"}
 
-    values = item[...]
+
+def _content_of(values: np.ndarray) -> tuple:
+    """Return the type, the shape and the bytes of an array."""
     # The bytes of an array of texts are addresses.
     content = values.tolist() if values.dtype == object else values.tobytes()
-    return values.shape, content
+    return str(values.dtype), values.shape, content
+
+
+def _digits(name: str, item: h5py.Dataset | h5py.Group) -> dict:
+    """Return linear modes to six digits: their solver on three ranks adds in the order in which messages arrive."""
+    # Residuals are rounding errors.
+    if not isinstance(item, h5py.Dataset) or name == "residual":
+        return {}
+    values = item[...]
+    if values.dtype.kind != "f":
+        return {name: values.tolist()}
+    largest = np.abs(values).max() or 1.0
+    # The sum makes -0 a 0, whose bytes differ.
+    return {name: (np.round(values / largest, 6) + 0.0).tobytes()}
 
 
 def copy(source: Path, target: Path) -> None:

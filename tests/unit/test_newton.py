@@ -87,6 +87,22 @@ def test_a_null_vector_that_cannot_be_computed_raises():
     assert meets_the_circle(newton)
 
 
+@pytest.mark.parametrize("make", [dense.values[0], krylov.values[0]], ids=["dense", "krylov"])
+@pytest.mark.parametrize("asked", ["", "l2"])
+def test_there_is_no_line_search_that_no_option_asks_for(make, asked, petsc_options, tmp_path):
+    """Steps are not searched along unless an option asks for it, and the solver leaves no option of its own behind."""
+    if asked:
+        petsc_options(nnm_snes_linesearch_type=asked)
+    newton = make()
+    assert meets_the_circle(newton)
+    assert PETSc.Options().getAll().get("nnm_snes_linesearch_type", "") == asked
+
+    viewer = PETSc.Viewer().createASCII(str(tmp_path / "solver"))
+    newton._snes.view(viewer)
+    viewer.destroy()
+    assert f"type: {asked or 'basic'}" in (tmp_path / "solver").read_text()
+
+
 def test_an_error_that_petsc_makes_of_it_does_not_hide_it(petsc_options):
     """An exception of the equations is raised, not the PETSc error that follows from it."""
     petsc_options(nnm_snes_error_if_not_converged=True)

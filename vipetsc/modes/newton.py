@@ -58,11 +58,16 @@ class BorderedNewton(ABC, Generic[E]):
         snes.setConvergenceTest(self._test)
         self._configure(snes.getKSP())
 
+        # A line search would change which arc a step ends on; step control is the continuation's business. Its kind is
+        # set by an option alone, which must not stay in the database: files of results state the options given.
         options = PETSc.Options("nnm_")
-        if not options.hasName("snes_linesearch_type"):
-            # A line search would change which arc a step ends on; step control is the continuation's business.
-            options["snes_linesearch_type"] = "basic"
-        snes.setFromOptions()
+        line_search = "snes_linesearch_type"
+        if options.hasName(line_search):
+            snes.setFromOptions()
+        else:
+            options[line_search] = "basic"
+            snes.setFromOptions()
+            options.delValue(line_search)
 
         # Data of one call of ``solve``: PETSc passes vectors and matrices alone to the callbacks.
         self._equations: E
