@@ -18,6 +18,7 @@ from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompli
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.problem import FlowError
 from vipetsc.modes.response.condensation import stops_of
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -238,6 +239,28 @@ def test_a_curve_that_has_used_up_its_points_tells_their_number():
     (curve,) = follow_all(case, None, MPI.COMM_SELF)
     assert len(curve.regular()) == 3
     assert curve.ending == "3 points reached: increase nfrc.points and resume to continue"
+
+
+def test_a_drive_that_moves_no_contact_has_no_unit_of_amplitude_and_a_motion_at_rest():
+    """A force on masses that nothing joins to the contacts moves none: over the frequency these stay at rest."""
+    spring = {"stiffness": 1.5, "next_cell": True}
+    cell = {"masses": [1.0] * 3, "springs": [spring | {"start": mass, "end": mass} for mass in (1, 2, 3)]}
+    table = {
+        "lattice": {"cells": 2, "cell": cell | {"contact": [1, 2]}, "damping": {"mass": 0.06}},
+        "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 0.8},
+        "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "cell": 1, "mass": 3},
+        "time": {"end": 10.0},
+    }
+    nfrc = {"source": "force", "harmonics": 11}
+    over_amplitude = NfrcCase.from_table(table | {"nfrc": nfrc | {"over": "amplitude", "range": [0.1, 1.0]}})
+    with pytest.raises(FlowError, match="the drive moves no contact"):
+        SteadyStates(over_amplitude, 1.0, 1.0)
+
+    nfrc |= {"over": "frequency", "range": [0.5, 2.0], "fixed": [0.2]}
+    states = SteadyStates(NfrcCase.from_table(table | {"nfrc": nfrc}), 1.0, 0.2)
+    measured = states.measured(first_state(states).xi)
+    assert measured.largest.tolist() == [0.0]
+    assert measured.truncation == 0.0
 
 
 def test_a_pressed_contact_is_refused_a_loss():

@@ -226,7 +226,11 @@ class HarmonicBalance:
         g = np.abs(self.shifted.values(omega)[-1]).sum(axis=1)
         beyond = np.arange(self.order + 1, forces.shape[1])
         left_out = (g[:, None] * forces[:, beyond] * (highest / beyond) ** 2).sum(axis=1) * 4 / 3
-        return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())
+        size = np.abs(self.unpack(x)).sum(axis=1).max()
+        # At rest there is nothing to leave out.
+        if size == 0:
+            return 0.0
+        return float(left_out.max() / size)
 
     def energy(self, x: np.ndarray, omega: float, shift: np.ndarray) -> float:
         """Energy in J of a conservative motion at ``omega`` in rad/s.

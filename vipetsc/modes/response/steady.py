@@ -15,7 +15,7 @@ number of harmonics, as the loss is that of the harmonics kept. A force with the
 Re(i Om f* u)/2 at the displacement u of its mass. Fractions are over this power, and T is what leaves to higher cells.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -112,6 +112,7 @@ class SteadyStates(SteadyEquations):
 
         Without one, as where all contacts are pressed at rest, it is the size of the linear motion: over the amplitude
         at the upper end of the range, over the frequency at its beginning, or the largest in it if there are springs.
+        Raises FlowError where the drive moves no pair.
         """
         for stops in self.forces.contacts:
             for gap in (stops.plus, stops.minus):
@@ -122,28 +123,33 @@ class SteadyStates(SteadyEquations):
         if has_springs and not over_amplitude:
             # The range of frequencies may have a resonance, at which motions are much larger than at its beginning.
             low, high = self.options.range
-            largest = max(
-                float(np.abs(self.linear_motion(omega).harmonics).max()) for omega in np.linspace(low, high, TRIED)
-            )
-            return self.options.fixed[0] * largest
-        omega = self.case.frequency
+            return self.options.fixed[0] * self._largest_motion(np.linspace(low, high, TRIED))
         amplitude = self.options.fixed[0]
         if over_amplitude:
             amplitude = self.options.range[1]
-        return float(amplitude * np.abs(self.linear_motion(omega).harmonics).max())
+        return amplitude * self._largest_motion([self.case.frequency])
 
     def _scale(self, clearance: float) -> float:
         """Unit of the parameter: half the range of frequencies, or the amplitude with a linear motion of 1 clearance.
 
-        The amplitude of a wave is in clearances already.
+        The amplitude of a wave is in clearances already. Raises FlowError where the drive moves no pair.
         """
         low, high = self.options.range
         if self.options.over == "frequency":
             return (high - low) / 2
         if self.wave:
             return 1.0
-        linear = self.linear_motion(self.case.frequency).harmonics
-        return float(clearance / np.abs(linear[:, 1]).max())
+        return clearance / self._largest_motion([self.case.frequency])
+
+    def _largest_motion(self, omegas: Iterable[float]) -> float:
+        """The largest elongation in m of linear motions at ``omegas`` in rad/s, for the amplitude 1.
+
+        Raises FlowError where all elongations are 0.
+        """
+        largest = max(float(np.abs(self.linear_motion(omega).harmonics).max()) for omega in omegas)
+        if largest == 0:
+            raise FlowError("the drive moves no contact and no nonlinear spring; drive another mass")
+        return largest
 
     def linear_motion(self, omega: float) -> LinearMotion:
         """The motion of the linear lattice for the amplitude 1 at ``omega`` in rad/s.
