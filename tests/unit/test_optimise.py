@@ -26,7 +26,7 @@ from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
 from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.sampler import CmaEs, smooth
+from vipetsc.studies.sampler import CmaEs, Nsga2, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
 TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
@@ -362,6 +362,23 @@ def test_a_start_that_is_not_the_case_is_a_design_too():
 
     assert search.designs[1].case.contacts.clearance == pytest.approx([1e-3] * 3)
     assert len(search.runs()) == 2
+
+
+@pytest.mark.parametrize("clearance", [(), (1.1e-3, 1.3e-3, 1.7e-3)])
+def test_the_start_that_a_sampler_asks_for_has_no_runs_of_its_own(clearance):
+    """NSGA-II has the start in its first generation: its values are those of the start to the bit, as are its runs."""
+    small = plan()
+    start = small.begin(clearance)
+    sampler = Nsga2(small.space.to_unit(start), step=0.2, seed=1, population=8, objectives=1)
+    search = OptimumSearch(small, Bowl(), sampler, start)
+    tried = len(search.designs)
+
+    assert search.tell_and_ask()
+
+    begun, asked = search.designs[tried - 1 : tried + 1]
+    assert asked.generation == 1
+    np.testing.assert_array_equal(asked.values, start)
+    assert case_id(asked.case) == case_id(begun.case)
 
 
 def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():

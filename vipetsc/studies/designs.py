@@ -10,6 +10,8 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.studies.objective import ObjectiveRuns
 from vipetsc.studies.sampler import Sampler, front, knee
 
+ROUNDED = 1e-12  # relative difference of values that differ by rounding alone
+
 
 @dataclass
 class Design:
@@ -41,6 +43,7 @@ class OptimumSearch:
         self.plan = plan
         self.objective = objective
         self.sampler = sampler
+        self.start = start
         self.designs = [Design(plan.begin(), 0, plan.base, [*objective.runs(plan.base).values()])]
         # The case itself is a design even where the search begins elsewhere: results are compared with it.
         first = self._design(start, 0)
@@ -84,9 +87,18 @@ class OptimumSearch:
         if generation:  # generation 0 is the case and the start, which the sampler did not ask for
             self._tell()
         points = self.sampler.ask()[:left]
-        self.asked = [self._design(self.plan.space.from_unit(point), generation + 1) for point in points]
+        self.asked = [self._design(self._values(point), generation + 1) for point in points]
         self.designs += self.asked
         return True
+
+    def _values(self, point: np.ndarray) -> np.ndarray:
+        """The values (variable,) at a ``point`` (variable,) of the unit cube that the sampler asks for."""
+        values = self.plan.space.from_unit(point)
+        # NSGA-II asks for the start, too. On the way into the cube and back its values are rounded, and would make
+        # another design with runs of its own.
+        if np.allclose(values, self.start, rtol=ROUNDED, atol=0.0):
+            return self.start
+        return values
 
     def _tell(self) -> None:
         """Give the sampler the losses of the designs that it asked for.
