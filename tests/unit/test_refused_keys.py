@@ -175,6 +175,19 @@ def test_a_drive_without_an_end_is_said_to_go_on():
     assert "burst, end" in dict(run_rows(small_case(), 1))
 
 
+def test_a_further_drive_is_shown_where_the_first_is_none():
+    """The table of ``validate``, the display in a notebook and the warnings have a drive beside a motion at t = 0."""
+    further = {"amplitude": 24.0, "frequency": 1000.0, "cycles": 6}
+    struck = {"kind": "velocity", "cell": 5, "velocity": 1e-9}
+    case = small_case(initial=struck, drive={"amplitude": 0.0, "more": [further]})
+    assert "burst, end" in dict(run_rows(case, 1))
+    page = case._repr_html_()
+    assert "24 N, 6 cycles" in page and "0 N, " not in page
+    fast = further | {"frequency": 1e5}
+    coarse = small_case(initial=struck, drive={"amplitude": 0.0, "more": [fast]}, time={"sample_interval": 2e-4})
+    assert any("fields and energies are aliased" in warning for warning in coarse.warnings())
+
+
 def test_beads_have_no_bands_and_no_waves():
     """The table of ``validate`` has no bands, gaps and waves for beads without springs."""
     rows = dict(run_rows(Case.from_table(unsprung_table()), 1))

@@ -153,6 +153,16 @@ def test_drives_superpose(engine, error):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_a_further_drive_acts_beside_a_weak_motion(engine):
+    """A first drive of amplitude 0 is none: others act as they do alone, however weak the motion at t = 0 is."""
+    alone = run_of(case_of(BURST, engine=engine))
+    struck = {"kind": "velocity", "cell": 8, "velocity": 1e-9}
+    beside = run_of(case_of({"amplitude": 0.0}, BURST, engine=engine, initial=struck))
+    assert relative_error(beside["displacement"].values, alone["displacement"].values) < 1e-6
+    assert ledger_error(beside) < 1e-9
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
     "drive",
     [

@@ -185,9 +185,9 @@ class Case(CaseFile):
         The sum is a bound, since waves of different drives may cancel.
         """
         scale = 0.0
-        if self.drive.amplitude:
+        for drive in drives:
             # A wall's drive is a displacement: its force is that times the stiffness of the spring to it.
-            for drive in drives:
+            if drive.waveform.amplitude:
                 scale += chain.wave_scale(drive.waveform, drive.cell, drive.mass) * (drive.stiffness or 1.0)
         if self.initial:
             scale = max(scale, self.initial.amplitude or 0.0)
@@ -258,7 +258,8 @@ class Case(CaseFile):
 
     def _repr_html_(self) -> str:
         """The case as a notebook shows it: its numbers, and its cell drawn."""
-        return case_html(self.name, self.model(), self.lattice.ends, [one.describe() for _, one in self.drive.every])
+        drives = [drive.describe() for _, drive in self.drive.every if drive.amplitude]
+        return case_html(self.name, self.model(), self.lattice.ends, drives)
 
     def warnings(self) -> list[str]:
         """Warnings of settings that are allowed but probably unintended."""

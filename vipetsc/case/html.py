@@ -64,10 +64,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
         ]
     if model.initial:
         rows.append(("begins with", model.initial.describe()))
-    drive = "none"
-    if model.is_driven:
-        drive = "; ".join(drives)
-    rows += [("drive", drive), ("end", f"{model.end:.5g} s, {model.samples} samples")]
+    rows += [("drive", "; ".join(drives) or "none"), ("end", f"{model.end:.5g} s, {model.samples} samples")]
     return html_table(name, rows, cell_svg(cell, pair))
 
 

@@ -68,6 +68,11 @@ class Model:
         return self.drive.amplitude != 0
 
     @property
+    def has_drive(self) -> bool:
+        """Whether any drive has an amplitude: the first may have none beside a motion at t = 0, and others one."""
+        return any(drive.waveform.amplitude != 0 for drive in self.drives)
+
+    @property
     def drive_cell(self) -> int:
         """The cell (0-based) of the first drive."""
         return self.drives[0].cell

@@ -212,7 +212,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
         yield f"output.window = [{first}, {last}] contains none of the contact sites"
 
     highest = max(drive.waveform.highest for drive in model.drives)
-    if model.is_driven and highest > np.pi / model.sample_interval:
+    if model.has_drive and highest > np.pi / model.sample_interval:
         interval = np.pi / highest
         yield (
             f"the drive contains up to {highest:.5g} rad/s, beyond the {np.pi / model.sample_interval:.5g} rad/s of"
