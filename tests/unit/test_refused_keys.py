@@ -188,6 +188,13 @@ def test_a_further_drive_is_shown_where_the_first_is_none():
     assert any("fields and energies are aliased" in warning for warning in coarse.warnings())
 
 
+def test_a_step_that_only_petsc_reads_is_no_error_of_the_warnings():
+    """PETSc reads hexadecimal numbers; the warning of fixed steps, which needs the number, is then left out."""
+    fixed = {"ts_adapt_type": "none"}
+    assert any("fixed steps of 16 s" in text for text in small_case(petsc=fixed | {"ts_dt": "16"}).warnings())
+    assert not any("fixed steps of 16 s" in text for text in small_case(petsc=fixed | {"ts_dt": "0x10"}).warnings())
+
+
 def test_beads_have_no_bands_and_no_waves():
     """The table of ``validate`` has no bands, gaps and waves for beads without springs."""
     rows = dict(run_rows(Case.from_table(unsprung_table()), 1))

@@ -10,6 +10,7 @@ import numpy as np
 
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
+from vipetsc.case.samples import is_number
 from vipetsc.case.schema import LatticeTable, OutputTable
 from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
@@ -231,8 +232,10 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     masses = model.chain.reduced_masses()
     laws = model.laws or (model.contact,) * len(masses)
     time = min(law.impact_time(speed, mass) for law, mass in {*zip(laws, masses, strict=True)})
-    # Options of PETSc are text in a case.
-    step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
+    step = DEFAULT_STEP / model.drive.frequency
+    # Options of PETSc are text in a case. PETSc reads some that are no numbers here, such as "0x10" and "default".
+    if is_number(petsc.get("ts_dt", "")):
+        step = float(petsc["ts_dt"])
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (
             f"ts takes fixed steps of {step:.3g} s, and a contact at {speed:.3g} m/s lasts {time:.3g} s: ts_dt ="
