@@ -30,12 +30,13 @@ RUNS = {"run", "propagator"}
 STUDIES = [column for column in COLUMNS if column.heading not in RUNS]
 LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring"}
 ENDS = {"free ends", "ring"}
+GRAINS = {"grains", "grains with resonators"}
 # Features that a verb accepts although they do not change its results. Linear modes have no drive and no dashpot, and
 # contacts act on them only if they are pressed at rest. The scattering law has one site on a ring of cells. An infinite
 # lattice has no ends, and the reduced model is one pair of masses. Steady states take the frequency of a burst as they
 # take that of a harmonic drive. The few points of branches touch one site or none.
 WITHOUT_INFLUENCE = {
-    "bands": {feature.name for feature in FEATURES} - LATTICE - {"preload"},
+    "bands": {feature.name for feature in FEATURES} - LATTICE - GRAINS - {"preload"},
     "law": ENDS | {"several in a cell"},
     "nfrc": {"harmonic"},
     "wave": {"harmonic"} | ENDS,

@@ -185,6 +185,18 @@ def _contacts(**changes: Any) -> Table:
     return {"contacts": changes}
 
 
+def _grains(cell: Table) -> Table:
+    """Changes after which contacts alone join the cells, and are pressed at rest."""
+    joining = {"pair": [1, 1], "next_cell": True, "sites": _all_but_the_last(BASE)}
+    pressed = {"side": "minus", "clearance": 0.0, "precompression": 2e-4, "restitution": 1.0}
+    return _lattice(cell=cell, ends="free") | _contacts(**joining, **pressed)
+
+
+def _all_but_the_last(table: Table) -> list[int]:
+    """The cells of a lattice that have a next cell."""
+    return list(range(1, table["lattice"]["cells"]))
+
+
 def _own_contacts(*contacts: tuple[int, float]) -> Table:
     """Changes after which the second mass of [nnm.own] has these ``contacts``, pairs of a host and a clearance in m."""
     pairs = [{"host": host, "resonator": 2, "clearance": clearance} for host, clearance in contacts]
@@ -206,6 +218,14 @@ FEW_SPRINGS: Table = {
     "nnm": {"points": 1, "harmonics": 21, "truncation": 1e-3},
 }
 SHORT_LATTICE: Table = TWELVE_CELLS | {"nfrc": {"points": 2, "harmonics": 3}}
+TWELVE_GRAINS: Table = _contacts(sites=_all_but_the_last(TWELVE_CELLS))
+# A pressed chain of equal grains softens: no breather begins at the upper edge of its band, 14,565 rad/s. A light grain
+# has a mode above it, at 16,818 rad/s, in which its two contacts move against each other; its breathers lie below that.
+LIGHT_GRAIN: Table = {
+    "lattice": {"cells": 8, "profiles": {"masses[1]": {"cells": [4], "value": 2e-3}}},
+    "contacts": {"sites": [1, 2, 3, 4, 5, 6, 7]},
+    "nnm": {"start_frequency": [16500.0], "start_sites": [3, -4]},
+}
 IN_CELL_6 = {"lattice": {"cells": 12, "profiles": {"springs[2].cubic": {"cells": [6], "value": 1e9}}}}
 IN_CELL_2 = {"lattice": {"cells": 4, "profiles": {"springs[2].cubic": {"cells": [2], "value": 1e9}}}}
 SECOND_DRIVE = {"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}
@@ -292,6 +312,17 @@ FEATURES: tuple[Feature, ...] = (
     Feature("mode at t = 0", _initial(kind="mode", number=3, amplitude=1e-5)),
     Feature("packet at t = 0", _initial(kind="packet", band=1, wavenumber=1.0, cell=12, width=2.0, amplitude=1e-5)),
     Feature("struck masses", _initial(kind="velocity", cell=5, velocity=0.1)),
+    Feature(
+        "grains",
+        _grains({"masses": [4e-3], "springs": []}),
+        # There are as many modes as grains.
+        scaled={"chain": TWELVE_GRAINS | {"nnm": {"modes": [2]}}, "condensed": LIGHT_GRAIN},
+    ),
+    Feature(
+        "grains with resonators",
+        _grains({"springs": [RESONATOR_SPRING]}),
+        scaled={"chain": TWELVE_GRAINS, "condensed": LIGHT_GRAIN},
+    ),
 )
 """The features of a case, in the order of the chapter."""
 
