@@ -5,6 +5,7 @@ import pytest
 
 from tests.conftest import run_of, small_case
 from vipetsc import Case
+from vipetsc.figures.modal import MovedEnergies
 from vipetsc.lattice import modes
 from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.studies.analysis import analyse
@@ -91,6 +92,28 @@ def test_transfers_close_the_ledger_of_every_cluster(builtin):
     cluster = analysis["bands/cluster_of_episode"].values - 1
     assert np.all(analysis["bands/cluster_begin"].values[cluster] <= run["impacts/onset"].values)
     assert np.all(run["impacts/separation"].values <= analysis["bands/cluster_end"].values[cluster])
+
+
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_what_contacts_that_are_closed_at_first_and_last_dissipate_is_that_of_the_log(engine):
+    """A contact that is closed when the run begins or ends has energy of its own, which is not dissipated."""
+    cell = {"masses": [1e-3], "springs": [{"start": 1, "end": 1, "stiffness": 1.1e3, "next_cell": True}]}
+    contacts = {"law": "bilinear", "stiffness": 4e4, "restitution": 0.5, "sites": [1, 2], "pair": [0, 1]}
+    contacts |= {"side": "plus", "clearance": 0.0}
+    initial = {"kind": "mode", "number": 1, "amplitude": 5e-4}
+    table = {"lattice": {"cells": 2, "cell": cell}, "contacts": contacts, "initial": initial}
+    run = run_of(Case.from_table(table | {"time": {"end": 3.6e-3, "engine": engine}}))
+    contact = run["energy/contact"].values
+    analysis = analyse(run, ("modal", "transfers"))
+
+    moved = MovedEnergies.of(run, analysis, parts=[0])
+
+    # The contacts are closed at first, and at last.
+    assert contact[0] > 0
+    assert contact[-1] > 0
+    lost = moved.energy[:, -1].sum()
+    assert lost == pytest.approx(run["energy/dissipated"].values[-1], rel=1e-9)
+    assert -analysis["bands/transfer"].values.sum() == pytest.approx(lost + contact[-1] - contact[0], rel=1e-9)
 
 
 def test_work_of_the_drive_is_no_transfer():
