@@ -17,6 +17,7 @@ from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Contact
 from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_of
+from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
@@ -99,6 +100,35 @@ def test_a_pressed_mass_has_its_exact_period(law):
         assert last.energy > 30 * opening
         # The branch grazes once, at the potential energy at which the contact opens.
         assert [p.energy for p in opened] == pytest.approx([opening], rel=1e-10)
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_branch_that_begins_beside_its_range_of_energies_comes_into_it(direction):
+    """A branch whose first motion has too little energy goes on up, and one with too much goes on down.
+
+    A Hertz contact softens as it opens: a motion that has the lowest energy by its linear mode has less.
+    """
+    own = {
+        "masses": [MASS],
+        "springs": [{"start": 0, "end": 1, "stiffness": SPRING}],
+        "contacts": [{"host": 0, "resonator": 1, "clearance": 0.0}],
+    }
+    contacts = {"law": "hertz", "stiffness": STOP, "side": "minus", "precompression": DEPTH}
+    low = 2e-3
+    high = 4e-3
+    nnm = {"system": "own", "own": own, "modes": [1], "energy": [low, high], "direction": direction}
+    if direction == "down":
+        nnm |= {"start_energy": 1.5 * high}
+    (branch,) = follow_all(NnmCase.from_table({"contacts": contacts, "nnm": nnm}), None, MPI.COMM_SELF)
+
+    energies = [point.energy for point in branch.regular()]
+    assert branch.ending.startswith("left the energy range")
+    if direction == "up":
+        assert energies[0] < low
+        assert energies[-1] > high
+    else:
+        assert energies[0] > high
+        assert energies[-1] < low
 
 
 def test_a_bilinear_contact_is_linear_until_it_opens():
