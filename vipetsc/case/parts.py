@@ -95,7 +95,16 @@ def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     names = module_names(table)
     if not names:
         return table
-    return table | {"plugins": table["plugins"] | {"modules": [plugins.located(name, folder) for name in names]}}
+    return table | {"plugins": table["plugins"] | {"modules": [_located(name, folder) for name in names]}}
+
+
+def _located(name: str, folder: Path) -> str:
+    """The ``name`` of a module as `vipetsc.plugins.located` gives it; as it is if no file can have this name."""
+    try:
+        return plugins.located(name, folder)
+    # A name that is too long, links that lead to each other, or a NUL. The import of the module reports it.
+    except (OSError, RuntimeError, ValueError):
+        return name
 
 
 def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
