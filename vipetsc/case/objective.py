@@ -128,7 +128,7 @@ def measured_problems(
         yield from _problems_of_responses(objective, at, responses)
         return
     if not wave_bands(base.lattice.unit_cell()) and _is_of_bands(objective, base):
-        remedy = "only contacts join the cells, so that there are no bands; a measure of points, of contacts or of all"
+        remedy = "only contacts join the cells, so that there are no bands; use a measure of points or of contacts"
         yield Problem(f"{at}.measure", objective.measure, remedy)
         return
     if objective.is_of_runs:
