@@ -131,6 +131,10 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     best = int(found["comparison/number"][1])
     # The objective needs responses alone, so that there are no runs.
     assert "5 designs, 5 frequency responses; 0 designs failed" in summary
+    # The titles of the table are divided by blanks, and each number ends where its title does.
+    titles, *rows = summary.splitlines()[-3:]
+    assert titles.split()[:3] == ["design", "number", "1:"]
+    assert {len(row) for row in rows} == {len(titles)}
     assert found["value"][best, 0] == found["value"].min()
 
     follow_all(NfrcCase.load(folder / "best.toml"), tmp_path, MPI.COMM_SELF)

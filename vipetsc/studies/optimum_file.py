@@ -211,8 +211,12 @@ def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
 
     shown = SHOWN if plan.options.measures_runs else ()
     columns = [*data["objective"].values, *(name.partition("_")[0] for name in shown)]
-    lines.append(f"  {'design':<8}{'number':>7}" + "".join(f"{name:>24}" for name in columns))
+    # The name of an objective may be longer than its numbers; two blanks divide it from the column before.
+    widths = [max(len(name) + 2, 24) for name in columns]
+    titles = [f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)]
+    lines.append(f"  {'design':<8}{'number':>7}" + "".join(titles))
     for compared, number in zip(data["compared"].values, data["comparison/number"].values, strict=True):
         row = [*data["value"].values[number], *(data[name].values[number] for name in shown)]
-        lines.append(f"  {compared:<8}{number:>7}" + "".join(f"{value:>24.6g}" for value in row))
+        values = [f"{value:>{width}.6g}" for value, width in zip(row, widths, strict=True)]
+        lines.append(f"  {compared:<8}{number:>7}" + "".join(values))
     return "\n".join(lines)
