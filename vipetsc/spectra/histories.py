@@ -19,7 +19,8 @@ RESOLVED = 0.8
 # of two sines the transmission of the one with 1 to 100 % of the other's amplitude errs by 1e-4 (rms); with 0.1 in
 # place of 0.2 it errs by 6e-4, with 0.05 by 2e-2, with 0.4, which leaves less of the record, by 5e-5.
 FADING = 0.2
-# Fraction of a mean square below which the part in a range of frequencies is rounding.
+# Fraction of a mean square below which a range of frequencies is taken not to be excited. What bursts of 1 s and 4 s
+# have there are tails of their spectra: with half or twice the number one range of 20 Hz more or less counts.
 SILENT = 1e-12
 
 

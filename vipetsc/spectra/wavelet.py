@@ -16,6 +16,8 @@ from scipy import fft
 
 from vipetsc.spectra.pooling import block_means
 
+# Of waves of 48 cells the first bin then has 99.7 % of the energy, and a line of 300 cells is padded to 1280. With half
+# of it these are 99.9 % and 2250, with twice 78 % and 800. The other bins change by 2e-4 of the energy at most.
 LOWEST = np.pi / 60
 """Lowest node in rad per cell; wavenumbers below it belong to the first bin."""
 

@@ -29,8 +29,11 @@ MISFIT = 1e-8
 # The lower half of its eight nodes.
 NODES = np.exp(-1j * np.pi / 8 * np.array([1, 3, 5, 7]))
 # Relative step of a central difference, which is taken for a complex compliance: half a circle is not enough for it.
+# With a pole at the relative distance d it errs by (STEP/d)^2, and rounding by about 1e-16 d/STEP: together by 1e-9 at
+# most at d = 0.1, and by 4e-6 on the resonance of a mode with a loss factor of 1e-3.
 STEP = 1e-6
-# The order 0 has no frequency of its own to scale a circle by: this fraction of the highest order's is taken.
+# The order 0 has no frequency of its own to scale a circle by: this fraction of the highest order's is taken. Its
+# derivative is multiplied by the order, so that any number serves.
 LEAST_RATE = 1e-3
 # Relative detuning of a frequency at which the compliance has a pole: a few units in the last place.
 DETUNING = 1e-15

@@ -31,7 +31,8 @@ from vipetsc.modes.system import ContactPair, System
 # out-of-phase branches up to 100 J (116 points with Hertz's law, 141 with the bilinear one) take up to 12 % more Newton
 # steps with values from 0.01 to 0.2.
 NEAR_GRAZING = 0.05
-# Lower bound of |y| in the derivative of w by y, 2 D |y|, which vanishes at the touch itself.
+# Lower bound of |y| in the derivative of w by y, 2 D |y|, which vanishes at the touch itself. The smallest gap beside 0
+# is a rounding error of 1e-16 of D, with a y of 1e-8: the bound acts at the touch alone.
 SMALLEST_ROOT = 1e-9
 
 
