@@ -15,7 +15,7 @@ from vipetsc.studies.linear_run import LinearRun
 FORWARD, BACKWARD = 0, 1  # directions: from the drive to the site and on, and the other
 LEAST = 0.02  # least loss 1-T of the driven wave at which the efficiency U/(1-T) is judged: below, it is 0 over 0
 NEAR = 5  # cells from the site within which energy counts as near it: evanescent waves have decayed beyond
-# Relative differences of the efficiency that are within its scatter: in the built-in lattice it is 0.43 to 0.49 from
+# Relative differences of the efficiency that are within its scatter: in the built-in lattice it is 0.42 to 0.46 from
 # the onset to z = 1.3.
 FLAT = 0.1
 # Half the width in log z over which the efficiency is averaged: a design has to bear such an error of a clearance.
