@@ -381,8 +381,12 @@ class ImpactTracker:
         return sites
 
     def restore(self, table: np.ndarray) -> None:
-        """Go back to a checkpoint, the ``table`` (site,) of dtype ``TRACKED`` of all sites by their numbers."""
+        """Go back to a checkpoint, the ``table`` (site,) of dtype ``TRACKED`` of all sites by their numbers.
+
+        The log is empty then: checkpoints are made where its episodes have been taken.
+        """
         self._may_be_open = True
+        self.tracks.closed[:] = 0
         numbered = self.tracks.sites["number"] >= 0
         sites = table[self.tracks.sites["number"][numbered]]
         self.tracks.sites[numbered] = sites

@@ -56,7 +56,8 @@ they have a mass in, must be solved for together: they are a group, and on a ran
 that owns a cell within r of a cluster advances it, from the same numbers to the same bits, so that ranks communicate
 only by one exchange of ``HaloRegions`` per step. ``engine`` weighs a step's cost against the size of its
 clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and failures at a block's
-end, to which a rank that cannot follow its contacts goes on without them.
+end, to which a rank that cannot follow its contacts goes on without them. After a failure all go back to a state that
+they have saved, and from there to the first step that failed: a run ends in the same way on any number of ranks.
 
 **7. Dashpots** have the matrix C. With M u'' = -K u - C u' + f free motion has all powers of s, each with a matrix P_k
 for displacements and Q_k for velocities: with P_0 = 1, Q_0 = 0 (``rows``)

@@ -32,8 +32,9 @@ from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.parallel import StopRequest, on_every_rank
 
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
-"""Steps done and the last one to do; of a failure its step (beyond the last one if there is none), its cluster (-1 if
-the state is not finite), its time in s."""
+"""Steps done and the last one to do. Of a failure: 2 n if the state after n steps is not finite, 2 n + 1 if a cluster
+could not be followed through the step after them, ``NEVER`` if there is none; that cluster, else -1; its time in s."""
+NEVER = np.iinfo(np.int64).max
 
 
 class States(NamedTuple):
@@ -52,6 +53,14 @@ class States(NamedTuple):
     parts: int
     sample_interval: float
     progress: np.ndarray
+
+
+class Saved(NamedTuple):
+    """What a rank can go back to: the ``steps`` done, its ``state`` (component,), the checkpoint of its ``forces``."""
+
+    steps: int
+    state: np.ndarray
+    forces: dict[str, np.ndarray]
 
 
 class StepTables(NamedTuple):
@@ -121,10 +130,9 @@ def take_steps(
             # Behind the drives' works the ledger has the losses of the owned sites.
             own_sites = dofs.ledger[samples.lattice.drives.rows.size :]
             is_finite = take_sample(state, k, samples, clusters.contacts, own_sites)
-            if not is_finite and progress.failed > progress.last:
-                progress.failed = steps
-                progress.cluster = -1
-        failed = progress.failed <= progress.last
+            if not is_finite and progress.failed == NEVER:
+                progress.failed = 2 * steps
+        failed = progress.failed < NEVER
         if steps == progress.last or (failed and halo.scatter == 0):
             break
 
@@ -144,10 +152,12 @@ def take_steps(
                 continue
             followed, tracks = follow_contacts(clusters, step.by_pairs, dofs, c, tracks, begin)
             if not followed:
-                progress.failed = steps
-                progress.cluster = c
-                progress.time = begin + clusters.state[c].position * clusters.interval
-                break
+                # The others are followed all the same: ranks that do not feel this one follow theirs, too.
+                if progress.failed == NEVER:
+                    progress.failed = 2 * steps + 1
+                    progress.cluster = c
+                    progress.time = begin + clusters.state[c].position * clusters.interval
+                continue
             first = dofs.first[c]
             apply_impulses(dofs, first, clusters.moments[first : dofs.first[c + 1]], next_cells)
             if lost.size > 0 and step.by_forces.leader[c] >= 0:
@@ -155,8 +165,8 @@ def take_steps(
                 lost[step.by_forces.leader[c]] += loss
 
         # Among others a rank that failed must keep their pace. One alone stays at the step that failed, for its state
-        # to be shown, and takes no sample there again: its clusters have gone a part of that step.
-        if progress.failed <= progress.last and halo.scatter == 0:
+        # to be shown, and takes no sample there again: its clusters have gone through that step, as far as they can.
+        if progress.failed < NEVER and halo.scatter == 0:
             break
         progress.steps += 1
     return error, tracks.log
@@ -206,6 +216,7 @@ class Propagator(OpeningEngine):
             sample_interval=model.sample_interval,
             progress=np.zeros(1, PROGRESS),
         )
+        self._saved: Saved | None = None
         self.state = self._states[0]
         self.time = 0.0
 
@@ -224,12 +235,36 @@ class Propagator(OpeningEngine):
         A stop on request is at the last sample. Raises RuntimeError where PETSc fails to exchange cells.
         """
         sys.audit("vipetsc.step")
+        parts = self._record.parts
+        comm = self._layout.comm
+        # The log has no episode then: it has just been taken, or nothing has happened yet.
+        if comm.size > 1 and self._saved is None:
+            state = self._components[self.steps % 2].copy()
+            self._saved = Saved(steps=self.steps, state=state, forces=self._forces.checkpoint())
+        self._go_to((samples.number + len(samples.work) - 1) * parts, samples)
+
+        # The earliest failure of a rank, and any rank's request, count on all.
+        status = np.array([self._record.progress["failed"][0], -int(self._stop.requested)])
+        comm.Allreduce(MPI.IN_PLACE, status, MPI.MIN)
+        failed, stop = status.tolist()
+        taken = len(samples.work)
+        stalled = None
+        if failed < NEVER:
+            stalled = self._first_reason()
+            # One rank stands at the failure. Several have gone on to the block's end.
+            if self._saved is not None:
+                self._repeat(self._saved, failed, samples)
+            taken = self.steps // parts - samples.number + 1
+        self.state = self._states[self.steps % 2]
+        self.time = self._time_after(self.steps)
+        return FillResult(samples=taken, stopped=bool(stop), stalled=stalled)
+
+    def _go_to(self, last: int, samples: Samples) -> None:
+        """Go on to the step ``last`` and take the ``samples`` on the way; all ranks must call it."""
         forces = self._forces
         progress = self._record.progress[0]
-        parts = self._record.parts
-        last = (samples.number + len(samples.work) - 1) * parts
         progress["last"] = last
-        progress["failed"] = last + 1
+        progress["failed"] = NEVER
         progress["cluster"] = -1
         tracks = forces.tracker.tracks
         with PROPAGATOR:
@@ -240,24 +275,32 @@ class Propagator(OpeningEngine):
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")
         forces.tracker.tracks = tracks._replace(log=log)
 
-        # The earliest failure of a rank, and any rank's request, count on all.
-        comm = self._layout.comm
-        status = np.array([progress["failed"], -int(self._stop.requested)])
-        comm.Allreduce(MPI.IN_PLACE, status, MPI.MIN)
-        failed, stop = status.tolist()
-        self.state = self._states[self.steps % 2]
-        self.time = self._time_after(min(failed, self.steps))
-        if failed > last:
-            return FillResult(samples=len(samples.work), stopped=bool(stop))
-
+    def _first_reason(self) -> str:
+        """The reason of the first failure; all ranks must call it."""
+        progress = self._record.progress[0]
+        cluster = int(progress["cluster"])
         reason = "the state is not finite"
-        acting = forces.describe(int(progress["cluster"]))
+        acting = self._forces.describe(cluster)
         if acting:
             reason = f"{acting} at {progress['time']:.9g} s"
-        # Of ranks that fail in one step the first: all have the same reason then, on any number of ranks.
-        _, reason = min(comm.allgather((int(progress["failed"]), reason)), key=lambda of_rank: of_rank[0])
-        taken = failed // parts - samples.number + 1
-        return FillResult(samples=taken, stopped=bool(stop), stalled=reason)
+        # Of several clusters in one step the first of the lattice counts, as on one rank, which follows them in order.
+        place = int(progress["failed"]), self._forces.first_cell(cluster)
+        _, reason = min(self._layout.comm.allgather((place, reason)))
+        return reason
+
+    def _repeat(self, saved: Saved, failed: int, samples: Samples) -> None:
+        """Go back to what was ``saved`` and on to the failure ``failed`` of ``PROGRESS``; all ranks must call it.
+
+        As on one rank, the engine then stands at the beginning of the step that failed, its contacts at the end.
+        """
+        self._components[saved.steps % 2] = saved.state
+        self._record.progress["steps"] = saved.steps
+        self._forces.restore(self._layout.comm.allgather(saved.forces))
+        steps, in_contact = divmod(failed, 2)
+        self._go_to(steps, samples)
+        if in_contact:
+            self._go_to(steps + 1, samples)
+            self._record.progress["steps"] = steps
 
     def _time_after(self, steps: int) -> float:
         """Time in s after so many ``steps``, summed as in ``take_steps``."""
@@ -265,6 +308,8 @@ class Propagator(OpeningEngine):
         return steps // record.parts * record.sample_interval + steps % record.parts * self.series.interval
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
+        # Steps that are repeated from before would log these episodes once more.
+        self._saved = None
         return self._forces.take_episodes(unfinished)
 
     def statistics(self) -> dict[str, Any]:
@@ -295,6 +340,7 @@ class Propagator(OpeningEngine):
 
     def _begin_after(self, steps: int, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go to the state of ``checkpoints``, as if after so many ``steps``."""
+        self._saved = None
         self._layout.restore(checkpoints, self._components[steps % 2])
         self._record.progress["steps"] = steps
         self.state = self._states[steps % 2]

@@ -231,6 +231,12 @@ class Forces:
         numbers = self._numbers[self.dofs.first[c] :][: self.dofs.sites[c]]
         return (numbers + 1).tolist()
 
+    def first_cell(self, c: int) -> int:
+        """The first cell, from 0, in which cluster ``c`` has a DoF; -1 of -1. It grows with ``c``."""
+        if c < 0:
+            return -1
+        return int(self._cells[self.dofs.first[c] : self.dofs.first[c + 1]].min())
+
     def describe(self, c: int) -> str:
         """The contacts and the nonlinear springs of cluster ``c`` in words; empty of -1, or if there are none."""
         if c < 0:
