@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 
 from tests.breathers import BREATHER_CELLS as CELLS
 from tests.breathers import BREATHER_FREQUENCY, breather_chain
+from tests.conftest import StopAt
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
@@ -20,6 +21,8 @@ from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting.arc_limits import ArcLimits
+from vipetsc.parallel import StoppedError
 
 DOFS = 4
 PERIOD = 2 * np.pi / BREATHER_FREQUENCY
@@ -172,6 +175,34 @@ def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
     assert len(substeps) == 1
     assert (substeps[0].w > -depth).all()
     assert substeps[0].weights.sum() == pytest.approx(arc.closed, rel=1e-12)
+
+
+def test_an_arc_in_pieces_has_the_bits_of_the_whole_and_can_be_left():
+    """An arc in which requests to stop are looked at after each step has the same bits; a request ends it.
+
+    A longer arc than an attempt of Newton's method may take is refused.
+    """
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    start = irregular_motion((5,))
+    whole = flow.arc(start, PERIOD)
+    assert whole.episodes > 0
+    flow.limits = ArcLimits(every=1)
+    looks = StopAt(10**6)
+    with flow.limits.stopped_by(looks), flow.limits.attempt():
+        parts = flow.arc(start, PERIOD)
+    assert looks.left == 10**6 - whole.steps
+    assert parts.steps == whole.steps
+    np.testing.assert_array_equal(parts.end, whole.end)
+    np.testing.assert_array_equal(parts.departures, whole.departures)
+    np.testing.assert_array_equal(parts.move(start[None]), whole.move(start[None]))
+
+    with flow.limits.stopped_by(StopAt(whole.steps // 2)), flow.limits.attempt(), pytest.raises(StoppedError):
+        flow.arc(start, PERIOD)
+    with flow.limits.attempt(longest=whole.steps):
+        assert flow.arc(start, PERIOD).steps == whole.steps
+        # Before its first step, after which the request would be looked at.
+        with flow.limits.stopped_by(StopAt(0)), pytest.raises(FlowError, match=f"more than {whole.steps} steps"):
+            flow.arc(start, 2 * PERIOD)
 
 
 def test_an_orbit_without_a_tape_has_no_variations():

@@ -21,7 +21,7 @@ from vipetsc.identification.motion_steps import DONE, integrate
 from vipetsc.identification.precision import EXACT, Tolerances
 from vipetsc.lattice import Chain, UnitCell, Waveform, nonlinear_places
 from vipetsc.lattice.chain import Ends
-from vipetsc.modes.shooting.dop853 import STAGES
+from vipetsc.modes.shooting.dop853_step import STAGES
 
 # Errors are relative to the largest value so far, and to this fraction of the linear wave's size at least. Derivatives
 # by a clearance are zero up to an onset, after which their acceleration grows, by Hertz's law, as the root of the time.

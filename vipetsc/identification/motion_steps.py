@@ -14,7 +14,7 @@ from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shor
 from vipetsc.contact.tracker import Tracks, switch_sites, with_room
 from vipetsc.dynamics.drives import select_piece
 from vipetsc.identification.motion_rates import Lattice, MotionState, difference, jerk, observe, rates_of
-from vipetsc.modes.shooting.dop853 import E3, E5, STAGES, A, B
+from vipetsc.modes.shooting.dop853_step import E3, E5, STAGES, A, B
 
 # None of the numbers of steps below is sharp. For two sites in 12 cells at 400 N, with derivatives by the clearance and
 # the restitution (166 contacts with Hertz's law, 441 with the bilinear one), each was halved and doubled, SAFETY set

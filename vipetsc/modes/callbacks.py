@@ -16,6 +16,10 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.modes.problem import FlowError
+from vipetsc.parallel import StoppedError
+
+# Errors that all ranks of a solver raise, or none.
+OF_ALL_RANKS = FlowError, StoppedError
 
 
 class CallbackErrors:
@@ -31,7 +35,8 @@ class CallbackErrors:
     def keep(self, callback: Callable[..., None]) -> Callable[..., None]:
         """The function to give to PETSc in place of ``callback(solver, x, result, ...)``.
 
-        A FlowError of the callback must be raised by all ranks or by none; any other exception may be one rank's own.
+        All ranks or none must raise a FlowError or a StoppedError in the callback; any other exception may be one
+        rank's own.
         After the first failure the callback is not called again, since its arguments would follow from NaN; the results
         are NaN.
         """
@@ -42,7 +47,7 @@ class CallbackErrors:
                     return callback(solver, x, result, *others)
                 except BaseException as error:
                     self._first = error
-                    if x.comm.size > 1 and not isinstance(error, FlowError):
+                    if x.comm.size > 1 and not isinstance(error, OF_ALL_RANKS):
                         raise
             if isinstance(result, PETSc.Vec):
                 result.set(np.nan)

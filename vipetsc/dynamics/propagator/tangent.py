@@ -215,12 +215,16 @@ class TangentPropagator(Propagator):
         clusters.history["duration"] = 1.0
         self._is_placed = True
 
-    def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
+    def run(
+        self, samples: int, look: Callable[[np.ndarray], None] | None = None, pause: Callable[[int], int] | None = None
+    ) -> np.ndarray:
         """Advance to the sample number ``samples``, at least 1; returns the cells there.
 
         The sample n is the state at the time n ``model.sample_interval``, which is a whole number of steps, with n = 0
         at the start. Cells are states (2 mass, owned cell). ``look``, which some ranks may not have, is called with
-        those of the samples 1 to ``samples``. All ranks must call ``run``. Raises StalledError, on all ranks, where the
+        those of the samples 1 to ``samples``. Without it ``pause``, which all ranks have or none, is called with the
+        number of the present sample, 0 at first, and returns that of the sample at which it is called next; what it
+        raises on all ranks ends the run. All ranks must call ``run``. Raises StalledError, on all ranks, where the
         engine stalls, and where the orbit needs more rows than the tape has; ValueError for fewer samples than 1;
         RuntimeError before ``place``, and for a second orbit.
         """
@@ -232,11 +236,16 @@ class TangentPropagator(Propagator):
             raise RuntimeError("the engine has no state to begin with: call place before run")
         self._has_begun = True
         tape = self._forces.clusters.tape
-        # Where no rank has a state to show the engine goes to the last sample at once.
-        numbers = range(samples, samples + 1)
-        if self._layout.comm.allreduce(look is not None, MPI.LOR):
-            numbers = range(1, samples + 1)
-        for number in numbers:
+        shows_each = self._layout.comm.allreduce(look is not None, MPI.LOR)
+        number = 0
+        while number < samples:
+            # Where no rank has a state to show the engine goes to the next pause, or to the last sample, at once.
+            goal = samples
+            if shows_each:
+                goal = number + 1
+            elif pause:
+                goal = min(pause(number), samples)
+            number = goal
             # ``fill`` goes on to the sample ``number``, all ranks alike; without records there is nothing to fill.
             result = self.fill(unrecorded_samples(self._model, self._layout, goal=number))
             # A full tape goes on to count the rows that it lacks; one without rows counts none.

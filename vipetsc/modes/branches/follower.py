@@ -166,7 +166,8 @@ class Follower:
                 if branch.failure_below is not None:
                     self._resume_below(branch, problem)
             else:
-                start = method.start(problem, job, self.stop)
+                with method.stopped_by(problem, self.stop):
+                    start = method.start(problem, job, self.stop)
                 if method.has_lower_part:
                     below = self._stored_or_new(_name_below(branch))
                     branch.failure_below = self._grow_below(below, problem, start)

@@ -33,7 +33,7 @@ class Growth:
 
     ``write(branch)`` writes a branch as far as it has come. ``listener(branch, point)``, if there is one, is called on
     rank 0 after each regular point; what it raises is raised on all ranks. A ``stop`` ends the branch at its next
-    point.
+    point, or within a step that takes long.
     """
 
     method: Method[Any]
@@ -86,7 +86,13 @@ class Growth:
             branch.points = [self.method.assess(problem, continuation.point)]
 
         try:
-            why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
+            with self.method.stopped_by(problem, self.stop):
+                why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
+        except StoppedError:
+            # A step in which the branch was stopped is left out, and repeated by a resumed branch.
+            self.write(branch)
+            last = branch.regular()[-1]
+            raise StoppedError(f"stopped on request after point {last.index}; continue with --resume") from None
         finally:
             # Jumps are pairs of neighbouring points so different that the continuation may have changed to another
             # branch. They are recorded also if the branch fails or is stopped. When it is resumed they are found again,
@@ -148,15 +154,14 @@ class Growth:
                 return why_ended
 
             # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
-            stopped = self.stop.agreed(self.comm) and not continuation.finished
+            if self.stop.agreed(self.comm) and not continuation.finished:
+                raise StoppedError
             # One rank's clock decides for all: writing is collective.
             is_due = self.comm.bcast(time.monotonic() - saved > SAVE_EVERY)
             # A branch that has ended is written later, as complete: after a kill it would go on beyond its end.
-            if stopped or (is_due and not continuation.finished):
+            if is_due and not continuation.finished:
                 self.write(branch)
                 saved = time.monotonic()
-            if stopped:
-                raise StoppedError(f"stopped on request after point {assessed.index}; continue with --resume")
             one_before_last = last
             last = point
         return None

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Generic, NamedTuple
 
 from mpi4py import MPI
@@ -74,6 +75,13 @@ class Method(ABC, Generic[S]):
     @abstractmethod
     def start(self, problem: PeriodicProblem[S], job: int, stop: StopRequest | None = None) -> S:
         """The first point of a branch; StoppedError is raised where that takes long and a ``stop`` is requested."""
+
+    def stopped_by(self, problem: PeriodicProblem[S], stop: StopRequest) -> AbstractContextManager[None]:
+        """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
+
+        Here none is: the block has no effect.
+        """
+        return nullcontext()
 
     @abstractmethod
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:

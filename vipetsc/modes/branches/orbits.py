@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import cast
 
@@ -27,6 +28,7 @@ from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.maps import MAPS, ShootingMap
 from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.shooting_equations import ShootingEquations
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
@@ -57,6 +59,15 @@ class NnmMethod(Method[Point]):
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps to the end of the ranges."""
         return guarded_steps(problem, self.options, start, done)
+
+    def stopped_by(self, problem: PeriodicProblem[Point], stop: StopRequest) -> AbstractContextManager[None]:
+        """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
+
+        That of shot orbits is; the block has no effect on others.
+        """
+        if isinstance(problem, ShootingEquations):
+            return problem.limits.stopped_by(stop)
+        return super().stopped_by(problem, stop)
 
     @property
     def direction(self) -> int:

@@ -24,7 +24,7 @@ from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, StartError
+from vipetsc.modes.problem import ContinuationError, StartError
 from vipetsc.modes.shooting.charts import Chart
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
@@ -145,15 +145,13 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
         """The product (n,) of the residual's derivative at ``xi`` with a ``change`` (n + 1,) of the unknowns."""
         problem = self.problem
         arc = self.arc(xi)
+        # A product takes as many steps as the arc itself.
+        problem.limits.count(arc.steps)
         step = self.chart.to_changes(xi, change)
         start = problem.flow.scatter(problem.start(step[:-1])[None])
         moved = problem.flow.gather(arc.move(start))[0]
         rate = problem.map.fraction * problem.end_rate(arc)
         return (moved[problem.zero] + rate * step[-1]) / self.unit
-
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
-        return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
         """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own.
@@ -166,6 +164,7 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
 class LatticeShooting(ShootingEquations[LatticeArc]):
     """Periodic orbits of the lattice ``chain`` and its ``system``, on all ranks of ``comm`` together."""
 
+    newton: KrylovNewton
     has_half_traces = False
     guards = frozenset({"turn_relative"})
 
@@ -174,6 +173,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
     ) -> None:
         super().__init__(system, shooting_map, tolerance)
         self.flow = LatticeFlow(chain, [pair.stops for pair in system.contacts], comm)
+        self.limits = self.flow.limits
         layout = self.flow.layout
         # The last part ends with the period, the one unknown that belongs to no cell.
         cuts = [*(layout.ranges[:, 0] * layout.dofs).tolist(), system.dofs + 1]

@@ -27,6 +27,8 @@ from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.departures import union_length
 from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting.arc_limits import ArcLimits
+from vipetsc.parallel import StoppedError
 
 # Errors allowed in a contact's substep, relative to its speed: below the 1e-12 to which orbits of lattices are
 # corrected.
@@ -34,6 +36,8 @@ RTOL = 1e-13
 # Errors are relative to the largest speed at the start of the orbit. The scale is at least this fraction of the speed
 # that the largest displacement would have in the fastest linear mode, since an orbit may start at rest.
 SLOWEST = 0.1
+# Steps between two looks at requests to stop, times cells: a fraction of a second.
+CELLS_BETWEEN_LOOKS = 1_000_000
 
 
 @dataclass(eq=False)
@@ -41,7 +45,7 @@ class LatticeArc:
     """A piece of an orbit of ``duration`` seconds between the blocks ``start`` and ``end``.
 
     ``departures`` (number, 2) are begin and end in s of each time that a contact is closed, or open if it is pressed at
-    rest; ``closed`` is the time in s with a contact closed.
+    rest; ``closed`` is the time in s with a contact closed; ``steps`` counts the linear steps.
     """
 
     duration: float
@@ -49,6 +53,7 @@ class LatticeArc:
     end: np.ndarray
     departures: np.ndarray
     closed: float
+    steps: int
     engine: TangentPropagator
 
     @property
@@ -78,6 +83,7 @@ class LatticeFlow:
         if any(plus != minus for plus, minus in gaps):
             self._gaps = gaps
         self.layout = Layout(self._model(1.0, 1), comm)
+        self.limits = ArcLimits(every=max(CELLS_BETWEEN_LOOKS // chain.cells, 1), comm=comm)
         self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
 
     def _model(self, duration: float, samples: int) -> Model:
@@ -106,11 +112,13 @@ class LatticeFlow:
 
         Raises FlowError on all ranks.
         """
-        engine, end = self._run(start, duration, self.steps(duration))
+        self.limits.refuse(self._omega * duration / LARGEST_OMEGA_H)
+        steps = self.steps(duration)
+        engine, end = self._run(start, duration, steps)
         contacts = engine.contacts()
         closed = union_length(np.concatenate(self.comm.allgather(contacts.closed_substeps)))
         departures = np.concatenate(self.comm.allgather(contacts.departures))
-        return LatticeArc(duration, start, end, departures, closed, engine)
+        return LatticeArc(duration, start, end, departures, closed, steps, engine)
 
     def steps(self, duration: float, largest: float = LARGEST_OMEGA_H) -> int:
         """The steps of an arc of ``duration`` seconds, each at most ``largest`` radians of the fastest motion."""
@@ -149,8 +157,12 @@ class LatticeFlow:
         u, v = np.split(largest, 2)
         try:
             engine.place(start, max(float(v.max()), SLOWEST * self._omega * float(u.max())))
-            end = engine.run(steps, look)
-        # Raised on all ranks; any other error may be one rank's own, and is not caught.
+            end = engine.run(steps, look, self.limits.check)
+            self.limits.check(steps)
+        # These are raised on all ranks; any other error may be one rank's own, and is not caught.
+        except StoppedError:
+            engine.destroy()
+            raise
         except StalledError as error:
             engine.destroy()
             raise FlowError(f"the orbit of {duration:.6g} s stops: {error}") from error

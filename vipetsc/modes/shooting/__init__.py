@@ -20,6 +20,8 @@ contact change h(u) = |w| - D = 0 the slope f' jumps, and S passes it with the s
 g-/+ being y' before and after it. Contact forces are continuous, g+ = g-: the saltation is the identity if the step
 ends exactly on the change and each step uses one f'. ``landing`` searches each step for its first change.
 
+``arc_limits`` bounds the steps of an arc in an attempt of Newton's method.
+
 **Stability.** In mass-normalised coordinates S is symplectic, and the arc's mirror image needs no integration: from
 rest to rest in T/2 the monodromy matrix R S^-1 R S, R = diag(I, -I), has the diagonal block I + 2 B^T C, whose
 eigenvalues are the half-traces c = (mu + 1/mu)/2 of the multipliers. For a quarter the map over T/2 with the sign

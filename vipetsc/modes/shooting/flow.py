@@ -17,6 +17,7 @@ import numpy as np
 from vipetsc.compiled import inlined, kernel, njit
 from vipetsc.contact.law import ELASTIC, elastic_force_and_slope, elastic_records
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope, spring_laws
+from vipetsc.modes.shooting.arc_limits import ArcLimits
 from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
@@ -32,6 +33,8 @@ ONSET = 1
 SEPARATION = -1
 # A step below this fraction of the arc's duration means that the flow is stuck: for a flow's ``_advance``.
 SMALLEST_STEP = 1e-15
+# Steps between two looks at requests to stop, times the entries of a state with its variations: a fraction of a second.
+ENTRIES_BETWEEN_LOOKS = 5_000_000
 
 
 class CompiledSystem(NamedTuple):
@@ -224,9 +227,21 @@ def switch(step: FlowStep, change: Change) -> int:
     return SEPARATION
 
 
+class Advance(NamedTuple):
+    """What a flow's ``_advance`` gives: the ``state`` (2n, 1 + 2n) at the end, of the orbit and its variations.
+
+    ``events`` and ``closed`` are those of ``Arc``; ``steps`` is the number of steps that were tried.
+    """
+
+    state: np.ndarray
+    events: np.ndarray
+    closed: float
+    steps: int
+
+
 @dataclass(frozen=True, eq=False)
 class Arc:
-    """A piece of an orbit of ``duration`` seconds.
+    """A piece of an orbit of ``duration`` seconds, for which the flow has tried so many ``steps``.
 
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
@@ -243,6 +258,7 @@ class Arc:
     episodes: int
     closed: float
     away_at_start: np.ndarray
+    steps: int
 
     def spans(self) -> Iterator[tuple[float, float]]:
         """Begin and end in s of every episode; those that go on at the start begin at 0, the last may end with the arc.
@@ -280,6 +296,7 @@ class Flow(ABC):
         )
         self.omega = float(system.linear_modes()[0][-1])
         n = system.dofs
+        self.limits = ArcLimits(every=max(ENTRIES_BETWEEN_LOOKS // (2 * n * (1 + 2 * n)), 1))
         self._variations = np.eye(2 * n, 1 + 2 * n, k=1)  # at the start of an arc, behind the column of the orbit
         self._away = np.where(system.is_pressed, SEPARATION, ONSET)
 
@@ -294,7 +311,8 @@ class Flow(ABC):
         """
         y = self._variations.copy()
         y[:, 0] = start
-        y, events, closed = self._advance(y, duration, period)
+        advance = self._advance(y, duration, period)
+        events = advance.events
 
         # Contacts that are not at the start as they are at rest, and changes away from what they are at rest. A w is a
         # difference of two displacements, so that this product has the bits of ``close``, by which the flow began.
@@ -307,12 +325,13 @@ class Flow(ABC):
         return Arc(
             duration=duration,
             start=start,
-            end=y[:, 0].copy(),
-            sensitivity=y[:, 1:].copy(),
+            end=advance.state[:, 0].copy(),
+            sensitivity=advance.state[:, 1:].copy(),
             events=events,
             episodes=episodes,
-            closed=closed,
+            closed=advance.closed,
             away_at_start=is_away,
+            steps=advance.steps,
         )
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
@@ -326,5 +345,5 @@ class Flow(ABC):
         return np.array(states)
 
     @abstractmethod
-    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """State and variations (2n, 1 + 2n) after ``duration``, the arc's ``events`` and ``closed``; ``y`` is lost."""
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
+        """Advance state and variations ``y`` (2n, 1 + 2n) by ``duration`` seconds, within ``limits``; ``y`` is lost."""

@@ -16,7 +16,7 @@ from vipetsc.compiled import allocating, kernel
 from vipetsc.dynamics.propagator.linear_system import solve_in_place
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.shooting import flow
-from vipetsc.modes.shooting.flow import CompiledSystem, Flow, close, restore
+from vipetsc.modes.shooting.flow import Advance, CompiledSystem, Flow, close, restore
 from vipetsc.modes.shooting.landing import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.system import System
 
@@ -45,7 +45,7 @@ class Tsrk(Flow):
         # The closed contacts for ``_rates``, which PETSc calls with the state alone; set at the beginning of an arc.
         self._record: flow.FlowStep
 
-    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
         step = self._record = flow.begin(self.compiled, y)
         self._set_tolerances(y[:, 0], period)
         dy = np.empty(self._shape)
@@ -53,7 +53,12 @@ class Tsrk(Flow):
         closed = 0.0
         t = 0.0
         h = 0.05 / self.omega
+        steps = 0
+        pause = self.limits.check(steps)
         while t < duration:
+            if steps == pause:
+                pause = self.limits.check(steps)
+            steps += 1
             length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
             if length < flow.SMALLEST_STEP * duration and length < duration - t:
                 raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
@@ -76,7 +81,8 @@ class Tsrk(Flow):
             if changed:
                 events.append((t, change.contact, change.side, flow.switch(step, change)))
                 self._adaptive.restartStep()
-        return y, np.array(events).reshape(-1, 4), closed
+        self.limits.check(steps)
+        return Advance(state=y, events=np.array(events).reshape(-1, 4), closed=closed, steps=steps)
 
     def _solver(self, adapt: str) -> PETSc.TS:
         ts = PETSc.TS().create(PETSc.COMM_SELF)
@@ -270,7 +276,7 @@ class Newmark(Flow):
 
     name = "newmark"
 
-    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
         count = max(round(STEPS * duration / period), 1)
         h = duration / count
         path = np.empty((count + 1, self.system.dofs))
@@ -290,7 +296,7 @@ class Newmark(Flow):
                 kind = flow.SEPARATION
             events.append(((i + 1) * h, c, side, kind))
         closed = float(np.any(after != 0, axis=1).sum() * duration / count)
-        return y, np.array(events).reshape(-1, 4), closed
+        return Advance(state=y, events=np.array(events).reshape(-1, 4), closed=closed, steps=count)
 
 
 class FiniteDifferences(Flow):
@@ -302,9 +308,10 @@ class FiniteDifferences(Flow):
     def __init__(self, flow: Flow, step: float = 1e-6) -> None:
         super().__init__(flow.system)
         self.flow = flow
+        self.limits = flow.limits
         self.step = step
 
-    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
         n = self.system.dofs
         rate = 2 * np.pi / period
         start = y[:, 0]
@@ -315,4 +322,5 @@ class FiniteDifferences(Flow):
             before = self.flow.arc(start - move, duration, period).end
             columns.append((beyond - before) / (2 * move.max()))
         arc = self.flow.arc(start, duration, period)
-        return np.column_stack([arc.end, *columns]), arc.events, arc.closed
+        state = np.column_stack([arc.end, *columns])
+        return Advance(state=state, events=arc.events, closed=arc.closed, steps=arc.steps)

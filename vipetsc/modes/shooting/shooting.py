@@ -9,7 +9,7 @@ from vipetsc.modes.grazing import grazing_contacts
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, Frame, SpecialKind
+from vipetsc.modes.problem import ContinuationError, Frame, SpecialKind
 from vipetsc.modes.shooting.charts import CHARTS, DenseChart, Relative
 from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.shooting.graze import Touch, graze
@@ -43,10 +43,6 @@ class DenseFrame(ShootingFrame[Arc]):
         """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
         return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
 
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
-        return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
-
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
         """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
         return self.tangent_towards(xi, self.tangent)
@@ -74,6 +70,7 @@ class Shooting(ShootingEquations[Arc]):
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
         super().__init__(flow.system, shooting_map, tolerance)
         self.flow = flow
+        self.limits = flow.limits
         # If nothing holds the system, its momentum stays 0 in an arc from rest to rest, whatever the start: one
         # equation is lost. The centre of mass is kept in its place instead. An arc that starts at the centre (u = 0)
         # has it there.

@@ -7,13 +7,15 @@ sensitivities, ``modes.lattice`` without a matrix.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from vipetsc.modes.departures import Departure, within_arc
+from vipetsc.modes.newton import BorderedNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, FlowError, SpecialKind, unit
+from vipetsc.modes.shooting.arc_limits import MOST_LONGER, ArcLimits
 from vipetsc.modes.shooting.charts import Chart, near_grazing
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.system import System
@@ -25,6 +27,10 @@ class AnyArc(Protocol):
     @property
     def duration(self) -> float:
         """Length of the arc in s."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps that the flow has tried."""
 
     @property
     def episodes(self) -> int:
@@ -86,9 +92,20 @@ class ShootingFrame(Generic[A]):
         """Newton's method from ``guess`` (n + 1,) for the orbit at an ``arclength`` along the tangent."""
         return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
 
-    @abstractmethod
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
+        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value.
+
+        It fails where it comes to an arc of ``MOST_LONGER`` times the steps of that at the guess. Raises StoppedError
+        in a block of ``ArcLimits.stopped_by``.
+        """
+        problem = self.problem
+        try:
+            with problem.limits.attempt():
+                longest = MOST_LONGER * self.arc(guess).steps
+        except FlowError as error:
+            return Attempt(converged=False, reason=str(error), history=[], xi=guess, left_domain=True)
+        with problem.limits.attempt(longest):
+            return problem.newton.solve(self, guess, row, value, problem.tolerance)
 
     @abstractmethod
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
@@ -133,13 +150,15 @@ class ShootingEquations(ABC, Generic[A]):
     """Periodic orbits of a ``system``: initial values x (n,) and a period.
 
     The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
-    the centre; for an orbit half of the state vanishes at its end. x are displacements in m for a map that starts at
-    rest, velocities in m/s for one that starts at the centre. Raises ValueError if the map needs an odd system and the
-    system is not.
+    the centre; for an orbit half of the state vanishes at its end. ``limits`` are those of the flow's arcs. x are
+    displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre. Raises
+    ValueError if the map needs an odd system and the system is not.
     """
 
     has_half_traces: bool
     guards: frozenset[str]
+    limits: ArcLimits
+    newton: BorderedNewton[Any]
 
     def __init__(self, system: System, shooting_map: ShootingMap, tolerance: float) -> None:
         if "centre" in (shooting_map.start, shooting_map.end) and not system.odd:

@@ -1,0 +1,197 @@
+"""Arcs of Newton's method: they end where they take far too long, and where a stop is requested."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets
+from vipetsc.case import NnmCase
+from vipetsc.lattice import Contact
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting import flow
+from vipetsc.modes.shooting.arc_limits import MOST_LONGER, ArcLimits
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.flow import Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.reference import FiniteDifferences, Tsrk
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import ContactPair, SmoothSpring, System
+from vipetsc.parallel import StoppedError, StopRequest
+
+pytestmark = pytest.mark.parallel(1)
+
+# Places of unknowns of two masses.
+AMPLITUDE = 1
+PERIOD = 2
+REASON = f"{MOST_LONGER} times those of the arc at the guess"
+
+
+def test_limits_act_within_an_attempt_alone():
+    """Outside an attempt no arc is too long, and no request is looked at."""
+    limits = ArcLimits(every=10)
+    stop = StopRequest()
+    stop.requested = True
+    with limits.stopped_by(stop):
+        assert limits.check(0) == 10
+        assert limits.check(10_000) == 10_010
+        with limits.attempt(longest=15):
+            # The look is due after 10 steps, which are those of several arcs together.
+            assert limits.check(0) == 10
+            assert limits.check(9) == 10
+            assert limits.check(0) == 1
+            with pytest.raises(StoppedError):
+                limits.check(1)
+    with limits.attempt(longest=15):
+        limits.check(0)
+        assert limits.check(10) == 16
+        with pytest.raises(FlowError, match="more than 15 steps"):
+            limits.check(16)
+    assert limits.check(0) > 0
+
+
+def two_masses(with_stop: bool = True) -> System:
+    """Two masses, the second one on a spring that hardens, with a stop between them or without one."""
+    springs = [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.5)]
+    stops = [ContactPair(0, 1, 0.1, Contact("hertz", 50.0))] * with_stop
+    return System.assemble([1.0, 1.0], springs, stops, [SmoothSpring.between(None, 1, cubic=0.5)])
+
+
+@pytest.mark.parametrize("kind", [Dop853Flow, Tsrk])
+def test_an_arc_in_pieces_has_the_bits_of_the_whole(kind):
+    """An arc in which a request is looked at after each step has the end, the changes and the steps of another one."""
+    start = np.array([0.5, -0.4, 0.0, 0.0])
+    one = kind(two_masses())
+    whole = one.arc(start, 20.0, 6.0)
+    assert len(whole.events) > 10
+    assert whole.steps > 100
+    one.limits = ArcLimits(every=1)
+    looks = StopAt(10**6)
+    with one.limits.stopped_by(looks), one.limits.attempt():
+        parts = one.arc(start, 20.0, 6.0)
+    assert looks.left == 10**6 - whole.steps
+    assert parts.steps == whole.steps
+    for name in ("end", "sensitivity", "events", "closed", "episodes"):
+        assert np.array_equal(getattr(parts, name), getattr(whole, name)), name
+
+
+def test_states_in_pieces_have_the_bits_of_the_whole():
+    """Samples of an orbit, each the end of an interval, are the same where each step is a piece of its own."""
+    one = Dop853Flow(two_masses())
+    start = np.array([0.5, -0.4, 0.0, 0.0])
+    whole = one.states(start, 0.7, 12, 6.0)
+    one.limits = ArcLimits(every=1)
+    assert np.array_equal(one.states(start, 0.7, 12, 6.0), whole)
+    # Samples are states of the orbit.
+    assert one.arc(start, 8.4, 6.0).end == pytest.approx(whole[-1], abs=1e-7)
+
+
+def make_differences(system: System) -> Flow:
+    """Central differences of the compiled flow."""
+    return FiniteDifferences(Dop853Flow(system))
+
+
+@pytest.mark.parametrize(
+    ("make", "unknown"), [(Dop853Flow, AMPLITUDE), (make_differences, AMPLITUDE), (Dop853Flow, PERIOD), (Tsrk, PERIOD)]
+)
+def test_a_bad_newton_step_ends_the_attempt(make, unknown, monkeypatch):
+    """A step of Newton's method to 2,000 times the amplitude or the period fails after few steps of the flow.
+
+    A spring that hardens makes a motion of large amplitude fast.
+    """
+    problem = Shooting(make(two_masses(with_stop=False)), MAPS["quarter"], tolerance=1e-10)
+    start = linear_start(problem, 1, 0.1)
+    frame = problem.frame_at("relative", start.x, start.period)
+    first = problem.arc(start.x, start.period).steps
+    guess = frame.xi + np.array([0.0, 1e-3, 0.0])
+    row = np.array([1.0, 0.0, 0.0])
+
+    # With a column of the derivative that is too small, as next to a singular matrix, the step is as much too long.
+    matrix = np.vstack([frame.jacobian(guess), row])
+    step = np.linalg.solve(matrix, np.append(-frame.residual(guess), 0.0))
+    wrong = np.ones(3)
+    wrong[unknown] = step[unknown] / 2000.0
+    right = problem.jacobian
+    monkeypatch.setattr(problem, "jacobian", lambda arc: right(arc) * wrong)
+    counts = []
+    check = ArcLimits.check
+
+    def noted(limits: ArcLimits, steps: int) -> int:
+        counts.append(steps)
+        return check(limits, steps)
+
+    monkeypatch.setattr(ArcLimits, "check", noted)
+    attempt = frame.solve(guess, row, row @ guess)
+
+    assert attempt.left_domain
+    assert attempt.reason == f"an arc of more than {MOST_LONGER * first} steps, {REASON}"
+    assert max(counts, default=0) <= MOST_LONGER * first + 1
+    # With the right derivative the method converges: each attempt has limits of its own.
+    monkeypatch.setattr(problem, "jacobian", right)
+    assert frame.solve(guess, row, row @ guess).converged
+
+
+OWN = {
+    "masses": [1.0, 1.0],
+    "springs": [{"start": 0, "end": 1, "stiffness": 1.0}, {"start": 1, "end": 2, "stiffness": 1.0}],
+    "smooth": [{"start": 0, "end": 1, "cubic": 0.5}],
+}
+
+
+def followed(folder: Path, stop: StopRequest | None = None, **nnm: Any) -> Branch[Any]:
+    """The lower branch of two masses in ``folder``, begun or continued."""
+    folder.mkdir(exist_ok=True)
+    nnm = {"modes": [1], "start_energy": 0.1, "points": 8, "first_step": 0.05} | nnm
+    case = NnmCase.from_table({"name": "x", "nnm": {"system": "own", "own": OWN} | nnm})
+    (branch,) = follow_all(case, folder, MPI.COMM_SELF, resume=True, stop=stop)
+    return branch
+
+
+class StopWithin(StopRequest):
+    """A request to stop that is granted within an arc, after so many ``looks``, of which it counts ``seen``."""
+
+    def __init__(self, looks: float = np.inf) -> None:
+        self.looks = looks
+        self.seen = 0
+
+    def agreed(self, comm: MPI.Comm) -> bool:
+        self.seen += 1
+        return self.seen > self.looks
+
+
+@pytest.mark.parametrize(("direction", "first_part"), [("up", "in-phase"), ("both", "in-phase-down")])
+def test_a_branch_that_is_stopped_within_an_arc_goes_on_to_the_same_bits(tmp_path, monkeypatch, direction, first_part):
+    """Requests are looked at after each step of the flow: the branch keeps its last point, and goes on from there."""
+    monkeypatch.setattr(flow, "ENTRIES_BETWEEN_LOOKS", 1)
+    bounds = {"direction": direction, "energy": [0.05, 50.0]}
+    never = StopWithin()
+    whole = followed(tmp_path / "whole", never, **bounds)
+    assert never.seen > 50 * len(whole.points)
+
+    endings = []
+    for looks in (20, 0.4 * never.seen, 0.3 * never.seen):
+        stopped = followed(tmp_path / "parts", StopWithin(looks), **bounds)
+        endings.append(stopped.ending)
+        assert not stopped.complete
+        # The second request comes in the first part of the branch that is followed, whose points are kept.
+        if len(endings) == 2:
+            assert 1 < len(read_branch(tmp_path / "parts" / f"branch-{first_part}.h5").points) < len(whole.points)
+    # The first request comes in the search for the start.
+    assert endings[0] == "stopped on request; continue with --resume"
+    assert all(ending.startswith("stopped on request after point") for ending in endings[1:])
+    resumed = followed(tmp_path / "parts", **bounds)
+
+    assert resumed.ending == whole.ending
+    names = {path.name for path in (tmp_path / "whole").iterdir()}
+    assert names == {path.name for path in (tmp_path / "parts").iterdir()}
+    (name,) = (name for name in names if name.endswith("h5"))
+    assert_same_bits(datasets(tmp_path / "whole" / name), datasets(tmp_path / "parts" / name))
