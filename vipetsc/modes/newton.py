@@ -12,6 +12,9 @@ from vipetsc.modes.problem import Attempt, FlowError
 
 # A Newton step below this, in unknowns of order one, is rounding.
 STEP_TOLERANCE = 1e-14
+# A Newton step from a residual within rounding that leaves more than this fraction of it cannot make it smaller: but
+# for rounding, a step from so small a residual would leave its square.
+STAGNANT = 0.25
 # PETSc's reason for a residual that is not finite; 3.25 has renamed it.
 NOT_FINITE = next(
     value
@@ -40,9 +43,9 @@ E = TypeVar("E", bound=Equations)
 class BorderedNewton(ABC, Generic[E]):
     """Solves residual(xi) = 0 (size - 1,) and row . xi = value; a subclass chooses matrices and vectors.
 
-    It ends at a residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where rounding allows no more, or
-    after ``max_newton`` steps. Options of PETSc have the prefix ``nnm_``. An exception of the equations passes through,
-    except FlowError: the attempt has then not converged.
+    It ends at a residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within
+    its ``rounding``, or after ``max_newton`` steps. Options of PETSc have the prefix ``nnm_``. An exception of the
+    equations passes through, except FlowError: the attempt has then not converged.
     """
 
     def __init__(self, size: int, max_newton: int = 7) -> None:
@@ -73,13 +76,20 @@ class BorderedNewton(ABC, Generic[E]):
         self._equations: E
         self._row: tuple[np.ndarray, float]
         self._tolerance = 0.0
+        self._rounding = 0.0
         self._history: list[float] = []
 
-    def solve(self, equations: E, guess: np.ndarray, row: np.ndarray, value: float, tolerance: float) -> Attempt:
-        """Newton's method from ``guess`` (size,) to a residual of ``tolerance`` on the plane row . xi = value."""
+    def solve(
+        self, equations: E, guess: np.ndarray, row: np.ndarray, value: float, tolerance: float, rounding: float = 0.0
+    ) -> Attempt:
+        """Newton's method from ``guess`` (size,) to a residual of ``tolerance`` on the plane row . xi = value.
+
+        ``rounding`` is the largest norm that rounding may leave of the residual at a solution.
+        """
         self._equations = equations
         self._row = row, value
         self._tolerance = tolerance
+        self._rounding = rounding
         self._history = []
         self._xi.setArray(self._local(guess))
         try:
@@ -130,6 +140,8 @@ class BorderedNewton(ABC, Generic[E]):
         # Before the first step PETSc gives 0 for its norm.
         if iteration and step <= STEP_TOLERANCE:
             return reasons.CONVERGED_SNORM_RELATIVE
+        if iteration and STAGNANT * self._history[-2] < residual <= self._rounding:
+            return reasons.CONVERGED_FNORM_RELATIVE
         # The floor is for a guess that is almost exact, whose residual the first step may multiply by more than 1e3.
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL

@@ -21,6 +21,10 @@ from vipetsc.modes.shooting.stability import HalfTraceAbove, half_traces, multip
 # A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
 # this of the level, on either side, a change of sign is rounding and no special point.
 LEAST_CROSSING = 1e-6
+# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``). Those of two masses, of
+# chains and of pressed contacts with r from 7 to 2,400 are up to 3.6 times that in the map of half a period, 6 times
+# in that of the whole, and 0.7 times in that of a quarter.
+ROUNDING = 8
 # If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
 # and the tangent is not unique.
 DEGENERATE = 1e-12
@@ -60,8 +64,8 @@ class Shooting(ShootingEquations[Arc]):
     """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
 
     Newton's method solves the n equations and one more linear row in the unknowns of a chart; it ends at a scaled
-    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where rounding allows no more, or after
-    ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
+    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within its
+    ``rounding``, or after ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
     """
 
     has_half_traces = True
@@ -86,6 +90,16 @@ class Shooting(ShootingEquations[Arc]):
     def end(self, arc: Arc) -> np.ndarray:
         """The state (2n,) at an arc's end."""
         return arc.end
+
+    def rounding(self, period: float) -> float:
+        """The largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
+
+        Let the fastest mode be r times as fast as the orbit. A step of the flow is a radian of that mode or less, and
+        rounds its velocity, which may be r times that of the orbit, to eps r. The mode sums the errors of some r steps
+        as a random walk, to eps r^(3/2) of the orbit's velocity.
+        """
+        ratio = self.flow.omega_ref(period) * period / (2 * np.pi)
+        return float(ROUNDING * np.finfo(float).eps * ratio**1.5)
 
     def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
         """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""

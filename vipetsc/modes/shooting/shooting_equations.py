@@ -105,7 +105,8 @@ class ShootingFrame(Generic[A]):
         except FlowError as error:
             return Attempt(converged=False, reason=str(error), history=[], xi=guess, left_domain=True)
         with problem.limits.attempt(longest):
-            return problem.newton.solve(self, guess, row, value, problem.tolerance)
+            rounding = problem.rounding(self.chart.period)
+            return problem.newton.solve(self, guess, row, value, problem.tolerance, rounding)
 
     @abstractmethod
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
@@ -198,6 +199,10 @@ class ShootingEquations(ABC, Generic[A]):
     @abstractmethod
     def _integrate(self, start: np.ndarray, period: float) -> A:
         """The arc from a state ``start`` (2n,) over the map's fraction of the ``period``."""
+
+    def rounding(self, period: float) -> float:
+        """The largest scaled residual that rounding may leave of an orbit of a ``period`` in s; 0 if it is unknown."""
+        return 0.0
 
     @abstractmethod
     def end(self, arc: A) -> np.ndarray:

@@ -28,6 +28,6 @@ def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Poi
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
     attempt = frame.solve(frame.xi, row, row @ frame.xi)
     if not attempt.converged:
-        why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy"
+        why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy or increase nnm.tolerance"
         raise StartError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
     return frame.measures(attempt)
