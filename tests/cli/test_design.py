@@ -118,7 +118,7 @@ def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_p
     (bare / "design.h5").write_bytes(b"nothing")
     broken = in_process("plot", bare)
     assert broken.returncode == 2
-    assert "cannot be opened as a search" in broken.stderr
+    assert "cannot be opened as a design" in broken.stderr
 
 
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
