@@ -166,6 +166,25 @@ def test_engines_log_the_same_impacts_of_a_stop_without_clearance():
     assert first["indentation"] == pytest.approx(second["indentation"], rel=1e-6)
 
 
+def test_the_front_of_a_wave_is_no_impact_on_a_stop_with_loss():
+    """Both engines log one impact, from rest: the front of a strike 6 and 16 cells away, 1e-26 m/s or less, is none.
+
+    The site near the strike is pressed later, the other one never.
+    """
+    runs = []
+    for engine in ("ts", "propagator"):
+        case = sprung_case(engine, restitution=0.6, approach_floor=1e-3, stiffness=1e7, sites=[3, 13])
+        struck = {"kind": "velocity", "cell": 19, "velocity": 0.3}
+        end = {"end": 4e-3, "sample_interval": 1e-4}
+        runs.append(run_complete(case.varied(drive={"amplitude": 0.0}, initial=struck, time=end)))
+    for run in runs:
+        assert run["impacts/site"].values.tolist() == [2]
+        assert run["impacts/approach_velocity"].values.tolist() == [0.0]
+    first, second = runs
+    assert first["impacts/onset"].values == pytest.approx(second["impacts/onset"].values, rel=1e-6)
+    assert first["impacts/indentation"].values == pytest.approx(second["impacts/indentation"].values, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_with_a_floor_a_touching_stop_dissipates_alike_in_both_engines():
     lossy = {"restitution": 0.7, "approach_floor": 0.5}

@@ -18,10 +18,9 @@ does change in it is found beyond its switching point at the start of the one af
 
 **Rest.** A site whose stop has no clearance can come to the stop again before it has left the tolerance of its last
 landing: the front of a wave passes through all magnitudes below that tolerance, and each of its roots would be landed
-on and switched. Such a landing leads nowhere, and so does a change at the very start that is none. The first one in a
-step may be an accident of rounding. From the second one on (``may_rest``) the site is to rest instead: the advance ends
-with ``RESTS`` in place of ``CHANGED``, because any mode that the site could be switched to would ask for the next such
-landing at once. ``vipetsc.contact`` says what force a site at rest has and when it leaves.
+on and switched. Such a site is to rest: the advance ends with ``RESTS`` in place of ``CHANGED``. So is one with a
+change at the very start of a substep, but the first in a step may be an accident of rounding: it rests from the second
+one on (``may_rest``). ``vipetsc.contact`` says what force a site at rest has and when it leaves.
 """
 
 import numpy as np
@@ -72,8 +71,8 @@ MOST_AGES = 1.5
 NEW = 1e-7
 # Longest substep, as a fraction of the step, that is taken without a search for changes.
 BLIND = 1e-7
-# Shortest substep, as a fraction of the step, that is rejected for its error, cut at a kink, or halved because a
-# contact both begins and ends in it. A shorter one is taken as it is: that ends the search for an allowed length.
+# Shortest substep, as a fraction of the step, that is rejected for its error, or halved because a contact both begins
+# and ends in it; the shortest that a cut at a kink leaves. That ends the search for an allowed length.
 SHORTEST = 1e-9
 # Order by which the substep follows its error: the last coefficients fall as h^6 and h^7, and the error is their sum
 # times the substep's length. Of the orders 7 and 8 the higher one changes the length less.
@@ -90,23 +89,43 @@ LANDING_GOAL = 1e-4
 
 
 @kernel
-def _advance_freely(cluster: Cluster) -> int:
-    """Go to the first onset, or to the end of the step, while no force acts."""
+def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
+    """Whether a ``site`` that can rest has stayed within the tolerance of a landing in a substep of that ``length``."""
+    # Without a length nothing was tried: the site is where it was.
+    end = cluster.site_motion[site]
+    if length > 0.0:
+        end = trial.site_motion[site]
+    seconds = length * cluster.interval
+    return stays_landed(cluster.contacts[site], cluster.site_motion[site], end, seconds, trial.sums.bernstein[0])
+
+
+@kernel
+def _advance_freely(cluster: Cluster) -> tuple[int, int]:
+    """Go to the first onset, or to the end of the step, while no force acts; returns what ``advance_cluster`` does."""
     state = cluster.state[0]
     remaining = 1.0 - state.position
-    # The distance to the first onset in units of H, 2 if there is none.
-    first = 2.0
+    first = 2.0  # the distance to the first onset in units of H, 2 if there is none
+    site = -1
     for i in range(cluster.contacts.size):
-        first = min(first, first_onset(cluster.taylor[i], cluster.contacts[i], remaining))
+        onset = first_onset(cluster.taylor[i], cluster.contacts[i], remaining)
+        if onset < first:
+            first = onset
+            site = i
     if first > remaining:
         state.position = 1.0
-        return DONE
+        return DONE, -1
 
+    trial = cluster.trial
+    evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
     shift(cluster.taylor, first, cluster.taylor)
     state.position += first
-    evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
+    evaluate_site_motion(cluster, cluster.taylor, trial.site_motion)
+    rests = _has_stayed(cluster, trial, site, first)
+    copy(trial.site_motion, cluster.site_motion)
     state.landings += 1
-    return CHANGED
+    if rests:
+        return RESTS, site
+    return CHANGED, -1
 
 
 @inlined
@@ -246,17 +265,6 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     return Substep(kind, taken), landed, change.site
 
 
-@kernel
-def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
-    """Whether a ``site`` that can rest has stayed within the tolerance of a landing in a substep of that ``length``."""
-    start = cluster.site_motion[site]
-    # Without a length nothing was tried: the site is where it was.
-    end = start
-    if length > 0.0:
-        end = trial.site_motion[site]
-    return stays_landed(cluster.contacts[site], start, end, length * cluster.interval, trial.sums.bernstein[0])
-
-
 @inlined
 def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) -> bool:
     """Set the next substep's length by the error of the one ``taken``, its length; whether the error is allowed."""
@@ -328,9 +336,8 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
 
     Returns how it ended, and a site or -1. ``DONE``: at the step's end. ``CHANGED``: the cluster stands on a change of
     modes, and the caller switches the sites whose switching functions say so; the site is one that changes again before
-    it has moved from where it last landed. ``RESTS``: that site is to rest instead. Without ``may_rest`` this is
-    returned only after such a change was met twice, the first time at the substep's very beginning. ``FAILED``: no
-    progress.
+    it has moved from where it last landed. ``RESTS``: that site is to rest instead. At a substep's very beginning this
+    needs ``may_rest``, or a second such change. ``FAILED``: no progress.
     """
     state = cluster.state[0]
     room = cluster.trial
@@ -339,7 +346,6 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
     room.force[:] = 0.0
     room.w[:] = 0.0
     room.v[:] = 0.0
-    # Whether the next substep is to be taken without a search for changes.
     blind = False
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
@@ -347,7 +353,7 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
             return DONE, -1
         trial = select_active(cluster)
         if trial.active.size == 0:
-            return _advance_freely(cluster), -1
+            return _advance_freely(cluster)
 
         evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
         substep = _choose_substep(cluster, trial)
@@ -374,10 +380,9 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
         if site >= 0 and not _has_stayed(cluster, trial, site, substep.length):
             site = -1
 
-        # A change at the very start at which the switching function does not rise is none: the next substep is taken
-        # without a search, and so short that no change is missed.
-        blind = substep.length == 0.0 and not landed
-        if blind and site >= 0:
+        # A change at the very start at which the switching function does not rise is none: the next substep is blind.
+        leads_nowhere = substep.length == 0.0 and not landed
+        if leads_nowhere and site >= 0:
             if may_rest:
                 return RESTS, site
             may_rest = True
@@ -386,8 +391,10 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
             _take(cluster, losses, trial, substep)
-        if landed and may_rest and site >= 0:
-            return RESTS, site
+        # A substep that was rejected is repeated without a search, too.
+        blind = leads_nowhere
         if landed:
+            if site >= 0 and (may_rest or substep.length > 0.0):
+                return RESTS, site
             return CHANGED, site
     return FAILED, -1
