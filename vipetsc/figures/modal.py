@@ -1,8 +1,8 @@
 """The energies of a run's linear modes: their steps at impacts, and the energy that each site transferred.
 
-Without contacts each mode of the lattice keeps its energy. The modes are put together by the pass band or gap in which
-their frequencies lie (*parts* of the spectrum). A *cluster* is a group of contact episodes between the same samples,
-whose transfers cannot be told apart.
+Without contacts, drives and dashpots each mode of the lattice keeps its energy. The modes are put together by the pass
+band or gap in which their frequencies lie (*parts* of the spectrum). A *cluster* is a group of contact episodes between
+the same two samples of the run, whose transfers cannot be told apart.
 """
 
 from typing import Any, NamedTuple, Self
@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 
-# Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy of all modes: a
-# line of less would be flat.
+# Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy that all
+# modes have together: a line of less would be flat.
 LEAST = 1e-4
 # Sites of the matrix: its rows are then a letter high. Of more, those with the largest transfers are shown.
 MOST_ROWS = 24

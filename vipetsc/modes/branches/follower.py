@@ -31,8 +31,9 @@ and where it ends, a growing branch is written whole. What is in the folder, and
     failed at the start                     none              no points                   tried again
     complete                                none              both parts, complete        read
 
-A branch with one part has the states of the part above. A kill at any time leaves one of these states. ``Branch``
-explains ``ending``, ``complete`` and ``findings``.
+A branch with one part has the states of the part above. A kill leaves one of these states, or a whole branch next to
+the part below that it already contains, which the same command then removes. ``Branch`` explains ``ending``,
+``complete`` and ``findings``.
 
 **Failures.** A part that has failed goes on from its last point when the branch is resumed. In between the steps, the
 bounds, and the numbers of points and of Newton steps in the case may have been changed, but not the physics. If the
