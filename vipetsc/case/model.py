@@ -63,13 +63,13 @@ class Model:
         return self.drives[0].waveform
 
     @property
-    def is_driven(self) -> bool:
-        """Whether the first drive has an amplitude."""
+    def first_drive_acts(self) -> bool:
+        """Whether the first drive has an amplitude: it may have none next to a motion at t = 0."""
         return self.drive.amplitude != 0
 
     @property
-    def has_drive(self) -> bool:
-        """Whether any drive has an amplitude: the first may have none beside a motion at t = 0, and others one."""
+    def is_driven(self) -> bool:
+        """Whether any drive has an amplitude."""
         return any(drive.waveform.amplitude != 0 for drive in self.drives)
 
     @property

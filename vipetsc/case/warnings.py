@@ -76,7 +76,7 @@ def wave_warnings(model: Model) -> Iterator[str]:
     """Warnings of evanescent and slow waves."""
     cell = model.chain.cell
     drive = model.drive
-    if not model.is_driven or not cell.joins_cells:
+    if not model.first_drive_acts or not cell.joins_cells:
         return
 
     waves = waves_at(cell, drive.frequency)
@@ -142,7 +142,7 @@ def length_warnings(model: Model) -> Iterator[str]:
     drive = model.drive
     cells = model.chain.cells
     waves = waves_at(model.chain.cell, drive.frequency)
-    if model.is_driven and waves:
+    if model.first_drive_acts and waves:
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
         wavelength = 2 * pi / max(kappa, 1e-300)
         if wavelength * WAVELENGTHS > cells:
@@ -166,7 +166,7 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     chain = model.chain
     drive = model.drive
     at = model.drive_cell
-    if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
+    if chain.ends == "periodic" or not (model.first_drive_acts and waves_at(chain.cell, drive.frequency)):
         return
     # The wave should not return to the sites; without sites, to the recorded window, or to the driven cell.
     name = "cell"
@@ -213,7 +213,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
         yield f"output.window = [{first}, {last}] contains none of the contact sites"
 
     highest = max(drive.waveform.highest for drive in model.drives)
-    if model.has_drive and highest > np.pi / model.sample_interval:
+    if model.is_driven and highest > np.pi / model.sample_interval:
         interval = np.pi / highest
         yield (
             f"the drive contains up to {highest:.5g} rad/s, beyond the {np.pi / model.sample_interval:.5g} rad/s of"

@@ -50,6 +50,24 @@ def given_first_step(default: float) -> float:
     return default
 
 
+def set_from_options(solver: PETSc.TS | PETSc.SNES, name: str, default: str) -> None:
+    """Let a ``solver`` take its options from PETSc's database, with a ``default`` for the option ``name``.
+
+    It is for choices that PETSc takes from options alone. The default does not stay in the database, where the next
+    solver of the process would find it, and files of results, which state the options given.
+    """
+    database = PETSc.Options()
+    if database.hasName(name):
+        solver.setFromOptions()
+        return
+
+    database[name] = default
+    try:
+        solver.setFromOptions()
+    finally:
+        database.delValue(name)
+
+
 @contextmanager
 def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
     """Set ``options`` of a case within the block."""

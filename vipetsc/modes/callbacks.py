@@ -36,9 +36,8 @@ class CallbackErrors:
         """The function to give to PETSc in place of ``callback(solver, x, result, ...)``.
 
         All ranks or none must raise a FlowError or a StoppedError in the callback; any other exception may be one
-        rank's own.
-        After the first failure the callback is not called again, since its arguments would follow from NaN; the results
-        are NaN.
+        rank's own. After the first failure the callback is not called again, since its arguments would follow from NaN;
+        the results are NaN.
         """
 
         def call(solver: object, x: PETSc.Vec, result: PETSc.Vec | PETSc.Mat, *others: object) -> None:

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from vipetsc.dynamics.options import set_from_options
 from vipetsc.modes.callbacks import CallbackErrors
 from vipetsc.modes.problem import Attempt, FlowError
 
@@ -61,16 +62,8 @@ class BorderedNewton(ABC, Generic[E]):
         snes.setConvergenceTest(self._test)
         self._configure(snes.getKSP())
 
-        # A line search would change which arc a step ends on; step control is the continuation's business. Its kind is
-        # set by an option alone, which must not stay in the database: files of results state the options given.
-        options = PETSc.Options("nnm_")
-        line_search = "snes_linesearch_type"
-        if options.hasName(line_search):
-            snes.setFromOptions()
-        else:
-            options[line_search] = "basic"
-            snes.setFromOptions()
-            options.delValue(line_search)
+        # A line search would change which arc a step ends on; step control is the continuation's business.
+        set_from_options(snes, "nnm_snes_linesearch_type", "basic")
 
         # Data of one call of ``solve``: PETSc passes vectors and matrices alone to the callbacks.
         self._equations: E

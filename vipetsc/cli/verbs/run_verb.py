@@ -195,7 +195,7 @@ def _drive_rows(case: Case) -> Rows:
         rows.append(("waves at Om", "; ".join(waves) or "none: the frequency is in a gap"))
 
     run_end = f"{model.end:.6g} s"
-    if not model.has_drive:
+    if not model.is_driven:
         return [*rows, ("end", run_end)]
     noun = "drive"
     if all(drive.kind == DEFAULT for _, drive in case.drive.every):

@@ -2,10 +2,12 @@ r"""Compiled motion of variations along an orbit, by the same exact steps: sec. 
 
 **9. Variations.** A variation dy is the difference to a neighbouring orbit, to first order. It moves through a step by
 
-    dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2):
+    dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
 
-see ``tangent``, where the method, its letters and the terms of onset and separation are explained. ``move_variations``
-applies these lines, and ``linearise`` computes J, for one step and cluster, from the substeps on the orbit's tape.
+with the exact linear step P, the series a of a cluster's free motion, the moments mu of its forces and the approach
+velocities q of its contacts. ``tangent`` explains why only q is varied at onsets, and why substeps keep their lengths.
+``move_variations`` applies these lines, and ``linearise`` computes J, for one step and cluster, from the substeps on
+the orbit's tape.
 
 **J.** Column j of J is what becomes of a unit of the j-th of the numbers (a, q): all unit vectors are carried through
 the step together. Where the tape has nothing, series are shifted. In a substep the collocation of sec. 3 is linearised
@@ -160,7 +162,10 @@ def _end_of_substep(rows: np.ndarray, begin: int) -> int:
 # Not a ``kernel``: it returns views to a function that counts references to them.
 @njit(error_model="numpy")
 def _select_closed(cluster: Cluster, rows: np.ndarray) -> Trial:
-    """The workspace for variations in a substep whose closed sites are those of ``rows``: nothing else acts."""
+    """The workspace for variations in a substep whose closed sites are those of ``rows``.
+
+    Nothing else acts on variations: drives do not depend on the motion, and nonlinear springs are refused.
+    """
     room = cluster.trial
     active = room.active[: rows.size]
     for a in range(active.size):
@@ -249,7 +254,8 @@ def linearise(
 def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, number: int, cells: np.ndarray) -> None:
     """Add to ``cells`` (2 dof, cell) what the forces of variation ``j`` in cluster ``c`` leave there.
 
-    ``variations.taylor`` has the series of its free motion; ``number`` is that of the matrix.
+    ``variations.taylor`` has the series of its free motion; ``variations.approach`` is updated. ``number`` is that of
+    the matrix.
     """
     first = dofs.first[c]
     stop = dofs.first[c + 1]

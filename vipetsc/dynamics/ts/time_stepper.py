@@ -8,6 +8,7 @@ from petsc4py import PETSc
 from vipetsc.case import Model
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.options import set_from_options
 from vipetsc.dynamics.ts.right_hand_side import register
 
 # Work and losses do not decide the step.
@@ -54,16 +55,8 @@ class TimeStepper:
         self.context_address = int(context.ctypes.data)
         self._onset = context["onset"]
 
-        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides. PETSc takes
-        # the norm from its options alone, where it must not stay for the next time stepper of the process.
-        options = PETSc.Options()
-        norm = "ts_adapt_wnormtype"
-        if options.hasName(norm):
-            ts.setFromOptions()
-        else:
-            options[norm] = "infinity"
-            ts.setFromOptions()
-            options.delValue(norm)
+        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
+        set_from_options(ts, "ts_adapt_wnormtype", "infinity")
 
     def try_step(self, time: float, h: float, after_onset: bool) -> StepOutcome:
         """Try a step of ``h`` s from the state at ``time`` in s; a rejected one is undone.

@@ -145,7 +145,7 @@ class CondensedMethod(NnmMethod):
             high = min((band.low for band in bands if band.low > omega), default=np.inf) / (2 * np.pi)
             bounds = [max(low, options.frequency[0]), min(high, options.frequency[1])]
             options = options.model_copy(update={"frequency": bounds})
-        return guarded_steps(problem, options, start, done)
+        return guarded_steps(problem, options, done)
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
         """The point with its largest multiplier, its loss, and the multipliers of Floquet if they are asked for."""

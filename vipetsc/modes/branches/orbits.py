@@ -58,7 +58,7 @@ class NnmMethod(Method[Point]):
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps to the end of the ranges."""
-        return guarded_steps(problem, self.options, start, done)
+        return guarded_steps(problem, self.options, done)
 
     def stopped_by(self, problem: PeriodicProblem[Point], stop: StopRequest) -> AbstractContextManager[None]:
         """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
@@ -103,14 +103,10 @@ class NnmMethod(Method[Point]):
                 branch.findings.append(f"{NOT_PASSED} {energy:g} J")
 
 
-def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, start: Point, done: int) -> GuardedSteps:
-    """Steps by [nnm] of a branch that has ``done`` points after its start, and goes on from the point ``start``."""
-    # The first motion has the energy asked for by its linear mode alone: springs and pressed contacts that are not
-    # linear change it. A branch that begins outside the range may therefore come into it.
-    low, high = control.energy
-    energies = [min(low, start.energy), max(high, start.energy)]
+def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:
+    """Steps by [nnm] of a branch that has ``done`` points after its start."""
     # ``points`` limits the whole branch, so that one that is resumed ends where an unbroken one would.
-    remaining = control.model_copy(update={"points": max(control.points - done, 0), "energy": energies})
+    remaining = control.model_copy(update={"points": max(control.points - done, 0)})
     # The problems of normal modes say when contacts act, which the method's type does not tell.
     return GuardedSteps(cast(OrbitProblem, problem), remaining)
 
@@ -214,4 +210,4 @@ class ShootingMethod(NnmMethod):
 
     def _crossing_rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Steps by [nnm] in the relative chart: the crossing branch has its own contacts at the start of its arc."""
-        return guarded_steps(problem, self.crossing_options, start, done)
+        return guarded_steps(problem, self.crossing_options, done)

@@ -138,8 +138,8 @@ class ResponseMethod(Method[Response]):
     def _isola(self, states: SteadyStates | StatesOverKey, first: Response, name: str) -> CrossingBranch:
         """The isolated curve of that ``name`` through the ``first`` state, along its tangent."""
 
-        def rule(problem: PeriodicProblem[Response], begin: Response, done: int) -> ClosingSteps:
-            return ClosingSteps(states, max(self.case.nfrc.points - 1 - done, 0), first, begin)
+        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> ClosingSteps:
+            return ClosingSteps(states, max(self.case.nfrc.points - 1 - done, 0), first)
 
         return CrossingBranch(name, lambda: (states, first), rule)
 

@@ -91,8 +91,8 @@ class StepRule(Protocol[S]):
     def judge(self, before: S, after: S, geometry: Geometry) -> Verdict:
         """The verdict on a step from the point ``before`` to ``after`` that has converged."""
 
-    def end(self, point: S) -> tuple[S, str] | None:
-        """The last point of the branch and how it ended, if it ends at ``point``; else None.
+    def end(self, before: S, point: S) -> tuple[S, str] | None:
+        """The last point of the branch and how it ended, if it ends at ``point``, the one after ``before``; else None.
 
         The last point may differ from ``point``, as where a rule moves it to the end of a range that it has passed.
         """
@@ -147,10 +147,13 @@ class GuardedSteps:
         why, remedy = GUARDED[guard]
         return Verdict(accepted=False, step=after.step * factor, why=why, remedy=remedy)
 
-    def end(self, point: Point) -> tuple[Point, str] | None:
+    def end(self, before: Point, point: Point) -> tuple[Point, str] | None:
         """The point itself, where it has left the range of energies or of frequencies."""
         low, high = self.control.energy
-        if not low <= point.energy <= high:
+        # The first motion has the energy asked for by its linear mode alone: springs and pressed contacts that are not
+        # linear change it. A branch may therefore begin outside the range and come into it.
+        comes_nearer = before.energy < point.energy < low or high < point.energy < before.energy
+        if not (low <= point.energy <= high or comes_nearer):
             return point, f"left the energy range {low:g} to {high:g} J"
         low, high = self.control.frequency
         if not low <= point.frequency <= high:
@@ -229,8 +232,9 @@ class Continuation(Generic[S]):
 
     def __iter__(self) -> Iterator[S]:
         for _ in range(self.rule.points):
+            before = self.point
             self.point = self.passed = self._next()
-            end = self.rule.end(self.point)
+            end = self.rule.end(before, self.point)
             if end is not None:
                 self.point, self.ending = end
                 self.finished = True

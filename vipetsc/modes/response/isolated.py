@@ -140,27 +140,23 @@ class ClosingSteps(TurningSteps):
     """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or at an end of the range.
 
     It has come back where t . (xi - xi_first), with the tangent t at the first state, turns positive from one state to
-    the next, and the state is not farther from the first one than a step. ``begin`` is the state from which the steps
-    go on: the first one, or a later one of a curve that is resumed.
+    the next, and the state is not farther from the first one than a step.
     """
 
-    def __init__(self, states: Equations, points: int, first: Response, begin: Response) -> None:
+    def __init__(self, states: Equations, points: int, first: Response) -> None:
         super().__init__(states, points)
         self.first = first
-        self._side = self._beyond(begin)
 
-    def end(self, point: Response) -> tuple[Response, str] | None:
+    def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
         """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
-        before = self._side
-        self._side = self._beyond(point)
         is_near = np.linalg.norm(point.xi - self.first.xi) <= point.step
-        if before < 0 <= self._side and is_near:
+        if self._beyond(before) < 0 <= self._beyond(point) and is_near:
             first = self.first
             last = Response(
                 xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
             )
             return last, CLOSED
-        return super().end(point)
+        return super().end(before, point)
 
     def _beyond(self, point: Response) -> float:
         """How far a state is beyond the first one along that one's tangent, in units of the unknowns."""

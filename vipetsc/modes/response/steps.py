@@ -75,7 +75,7 @@ class TurningSteps:
         # An accepted turn is at most TURN, so that the quotient is at least 1/2, but for rounding.
         return Verdict(accepted=True, step=min(after.step * max(growth, 0.5), self.states.options.largest_step))
 
-    def end(self, point: Response) -> tuple[Response, str] | None:
+    def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
         """The state on the end of the range, where ``point`` has passed it."""
         states = self.states
         scale = states.parameter.scale

@@ -43,9 +43,9 @@ def _take_orbit(orbit: Stepper, stepper: Stepper) -> None:
 def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
     """Repeat the step of length ``h`` at time ``t`` so that it ends on a ``change``.
 
-    Returns the new length, and whether there is a change at its end; otherwise the gap has a largest value there, not
-    above zero. The ``orbit``, a stepper without variations, makes the attempts. The ``stepper`` makes one step, of the
-    length that is found, with the variations.
+    Returns the new length, and whether there is a change at its end; otherwise the gap (``landing``) has a largest
+    value there, not above zero. The ``orbit``, a stepper without variations, makes the attempts. The ``stepper`` makes
+    one step, of the length that is found, with the variations.
     """
     step = orbit.step
     _take_orbit(orbit, stepper)
