@@ -21,12 +21,16 @@ from numba.core.lowering import Lower
 
 @register_default(types.NamedTuple)
 class _TupleModel(TupleModel):
-    """A named tuple as numba represents it, except that one with arrays is passed by its address."""
+    """A named tuple as numba represents it, except that one of this package with arrays is passed by its address.
+
+    Numba has one model for the named tuples of the whole process: those of other programs must keep its own.
+    """
 
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind)
         # A few numbers are passed faster in registers.
-        self._by_address = any(isinstance(part, types.Array | types.NamedTuple) for part in kind)
+        ours = kind.instance_class.__module__.split(".")[0] == __package__
+        self._by_address = ours and any(isinstance(part, types.Array | types.NamedTuple) for part in kind)
 
     def get_argument_type(self) -> Any:
         """The type, or tuple of types, of the tuple as an argument."""

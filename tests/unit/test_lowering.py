@@ -30,6 +30,10 @@ class Outer(NamedTuple):
     name: int
 
 
+# Only the package's own tuples are passed by address.
+Inner.__module__ = Outer.__module__ = "vipetsc"
+
+
 def outer(value: float, name: int) -> Outer:
     """Return a tuple whose numbers are ``value`` and its double."""
     return Outer(inner=Inner(np.array([value, 2.0 * value]), scale=value), counts=np.zeros(1, np.int64), name=name)
