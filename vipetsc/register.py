@@ -196,7 +196,7 @@ def waveform(
     """Register the decorated function as ``drive.waveform = name``.
 
     The function takes the resolved drive and a number for each of the ``parameters``; it returns a waveform of
-    ``vipetsc.lattice.drive``, such as ``spline`` and ``ramped`` build it.
+    ``vipetsc.lattice.drive``, such as ``sampled`` and ``ramped`` build it.
 
     Parameters
     ----------

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from tests.conftest import run_of
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.waveforms import waveform_of
+from vipetsc.lattice.drive import sampled
 
 ENGINES = ("ts", "propagator")
 BURST = {"amplitude": 3.0, "cycles": 3, "frequency": 900.0, "mass": 2, "cell": 4}
@@ -102,7 +103,11 @@ def test_a_burst_from_a_file_is_the_burst_to_the_splines_error(engine, tmp_path)
         path = tmp_path / f"{count}.csv"
         time = np.linspace(0, burst.duration, count + 1)
         np.savetxt(path, np.column_stack([time, burst.force(time)]), "%.17g", ",", header="t, F")
-        sampled = BURST | {"amplitude": 1.0, "waveform": "samples", "samples": {"file": str(path)}}
+        sampled = BURST | {
+            "amplitude": 1.0,
+            "waveform": "samples",
+            "samples": {"file": str(path), "interpolation": "spline"},
+        }
         del sampled["cycles"]
 
         run = run_of(case_of(sampled, engine=engine))
@@ -111,6 +116,47 @@ def test_a_burst_from_a_file_is_the_burst_to_the_splines_error(engine, tmp_path)
 
     assert 3.7 < np.log2(errors[0] / errors[1]) < 4.2
     assert errors[1] < 2e-8
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("interpolation", "momentum"), [("monotone", 1e-4), ("linear", 1e-4), ("spline", None)])
+def test_a_short_blow_between_long_samples_has_its_momentum(engine, interpolation, momentum):
+    """A triangle of 1 N and 0.2 ms strikes a mass of 1 kg on 1e4 N/m; a spline through it is large, and says so."""
+    samples = {"time": [0.0, 0.1, 0.1001, 0.1002, 0.2], "value": [0.0, 0.0, 1.0, 0.0, 0.0]}
+    if interpolation != "monotone":
+        samples["interpolation"] = interpolation
+    spring = {"start": 1, "end": 1, "stiffness": 5000.0, "next_cell": True}
+    case = Case.from_table(
+        {
+            "lattice": {"cells": 1, "cell": {"masses": [1.0], "springs": [spring]}},
+            "contacts": {"sites": []},
+            "drive": {"waveform": "samples", "amplitude": 1.0, "samples": samples},
+            "time": {"end": 0.4, "samples": 2001, "engine": engine},
+        }
+    )
+    run = run_of(case)
+    assert ledger_error(run) < 1e-8
+    if momentum is None:
+        assert case.model().drive.peak > 1e4
+        assert f"at most {case.model().drive.peak:.6g} N" in case.drive.describe()
+        return
+
+    assert case.model().drive.peak == pytest.approx(1.0, rel=1e-2)
+    assert np.abs(run["velocity"].values).max() == pytest.approx(momentum, rel=1e-4)
+
+
+@pytest.mark.parametrize("interpolation", ["monotone", "linear"])
+def test_between_samples_a_force_stays_between_their_values(interpolation):
+    """Times of all spacings, values that jump: nothing lies beyond the two neighbouring samples."""
+    random = np.random.default_rng(5)
+    times = np.cumsum(10 ** random.uniform(-6, 0, 60))
+    values = random.choice([-1.0, 0.0, 1.0, 5.0], 60)
+    wave = sampled(2.0, times, values, frequency=1.0, interpolation=interpolation)
+    for i in range(59):
+        between = wave.force(np.linspace(times[i], times[i + 1], 50)[:-1])
+        assert between.min() >= 2 * values[i : i + 2].min() - 1e-9
+        assert between.max() <= 2 * values[i : i + 2].max() + 1e-9
+        assert between[0] == pytest.approx(2 * values[i])
 
 
 def test_samples_travel_with_the_case(tmp_path):

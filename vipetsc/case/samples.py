@@ -13,6 +13,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.io.names import readable, resolved_path
+from vipetsc.lattice.drive import Interpolation
 
 # The resolved case holds the samples, and so does every result: so many are 5 MB of text and 0.6 s to read.
 MOST_SAMPLES = 100_000
@@ -21,7 +22,7 @@ MOST_SAMPLES = 100_000
 class SamplesTable(Section):
     """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``.
 
-    The samples of a file are filled in, with its ``sha256``.
+    The samples of a file are filled in, with its ``sha256``. ``interpolation``: how they are joined.
     """
 
     file: str | None = None
@@ -29,6 +30,7 @@ class SamplesTable(Section):
     sha256: str | None = None
     time: list[Finite] = Field([], max_length=MOST_SAMPLES)
     value: list[Finite] = Field([], max_length=MOST_SAMPLES)
+    interpolation: Interpolation = "monotone"
 
 
 def with_samples(table: Table) -> tuple[Table, list[Problem]]:

@@ -112,14 +112,16 @@ def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
             continue
         # The band that holds most of the energy, not the largest line: one line of noise may be larger than a broad
         # spectrum.
-        frequency, content = spectrum(samples.time, samples.value)
+        frequency, content = spectrum(samples.time, samples.value, samples.interpolation)
         energy = np.cumsum(content**2)
         least, most = np.interp([1 - MOST_ENERGY, MOST_ENERGY], energy / energy[-1], frequency)
         span = samples.time[-1] - samples.time[0]
         about = f"{path}.samples: {100 * MOST_ENERGY:.0f} % of their energy lies"
         waves = f"the waves of this lattice ({lowest:.4g} to {highest:.4g} rad/s)"
         if FAR * most < lowest:
-            hint = _fitting_unit(main_frequency(samples.time, samples.value), span, lowest, highest)
+            hint = _fitting_unit(
+                main_frequency(samples.time, samples.value, samples.interpolation), span, lowest, highest
+            )
             yield f"{about} below {most:.3g} rad/s, far below {waves}; are the times, up to {span:.4g} s, in s?{hint}"
         elif least > FAR * highest:
             yield (

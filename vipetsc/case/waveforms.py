@@ -16,7 +16,7 @@ from vipetsc.case.parts import PartName
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.lattice import ToneBurst, Waveform
-from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
+from vipetsc.lattice.drive import impulse, main_frequency, ramped, sampled
 from vipetsc.plugins import call
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 from vipetsc.wording import counted
@@ -96,7 +96,14 @@ def _build_samples(drive: "OneDrive") -> Waveform:
     # After the last sample a wall stays where it is, and a force is 0.
     hold = drive.end is not None
     samples = drive.samples
-    return spline(drive.amplitude, samples.time, samples.value, frequency=_given(drive.frequency), hold=hold)
+    return sampled(
+        drive.amplitude,
+        samples.time,
+        samples.value,
+        frequency=_given(drive.frequency),
+        interpolation=samples.interpolation,
+        hold=hold,
+    )
 
 
 def _given(value: float | None) -> float:
@@ -107,7 +114,7 @@ def _given(value: float | None) -> float:
 
 def _samples_frequency(drive: "OneDrive", highest: float) -> float:
     assert drive.samples
-    return main_frequency(drive.samples.time, drive.samples.value)
+    return main_frequency(drive.samples.time, drive.samples.value, drive.samples.interpolation)
 
 
 def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
@@ -139,8 +146,12 @@ def _describe_chirp(drive: "OneDrive") -> str:
 
 
 def _describe_samples(drive: "OneDrive") -> str:
-    count = len(drive.samples.time) if drive.samples else 0
-    return f"{count} samples, interpolated by a cubic spline"
+    assert drive.samples
+    samples = drive.samples
+    # A spline may lie far beyond the samples: the largest value shows it.
+    largest = waveform_of(drive).peak
+    unit = "m" if drive.end else "N"
+    return f"{len(samples.time)} samples ({samples.interpolation}), at most {largest:.6g} {unit}"
 
 
 WAVEFORMS = {

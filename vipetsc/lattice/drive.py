@@ -4,9 +4,9 @@ A waveform F(t), in N or in m, is a tone burst, or pieces one after another; x b
 
     F = (c_0 + c_1 x + ... + c_5 x^5) sin(p + w x + r x^2/2).
 
-Ramps are 10 s^3 - 15 s^4 + 6 s^5, s from 0 to 1: two derivatives are continuous. Samples are joined by the cubic
-spline without a knot at the second and the last but one (``not-a-knot``), whose error falls with the fourth power of
-their distance. A wall that moves by U(t) acts on the mass at the other end of a spring k as the force k U would.
+Ramps are 10 s^3 - 15 s^4 + 6 s^5, s from 0 to 1: two derivatives are continuous. Samples are joined in one of three
+ways (``Interpolation``). A wall that moves by U(t) acts on the mass at the other end of a spring k as the force k U
+would.
 """
 
 import hashlib
@@ -21,6 +21,13 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
 
 Envelope = Literal["paper", "hann"]
+Interpolation = Literal["monotone", "linear", "spline"]
+"""How samples are joined: by cubics that stay between neighbouring samples, by straight lines, or by a cubic spline.
+
+Monotone cubics (Fritsch and Carlson, SIAM J. Numer. Anal. 17 (1980) 238) have a continuous derivative. The spline has
+no knot at the second sample and at the last but one; its error for a smooth force falls with the fourth power of the
+distance of the samples, but between samples that are unevenly spaced or jump it exceeds them without a limit.
+"""
 COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
 PIECE = np.dtype([(name, float) for name in ("start", *COEFFICIENTS, "phase", "frequency", "rate")])
 """A piece of a waveform: its start in s, c_k in N/s^k, and of its sine p in rad, w in rad/s, r in rad/s^2."""
@@ -343,8 +350,15 @@ def impulse(amplitude: float, duration: float) -> Pieces:
     return Pieces.of(amplitude, frequency, duration, table)
 
 
-def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: float, hold: bool = False) -> Pieces:
-    """``amplitude`` times the cubic spline through ``values`` (sample,) at ``times`` (sample,), two or more.
+def sampled(
+    amplitude: float,
+    times: ArrayLike,
+    values: ArrayLike,
+    frequency: float,
+    interpolation: Interpolation = "monotone",
+    hold: bool = False,
+) -> Pieces:
+    """Return ``amplitude`` times the curve through ``values`` (sample,) at ``times`` (sample,), two or more.
 
     ``times`` in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
     waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps the last sample's value after
@@ -361,25 +375,33 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
         duration = np.inf
     table = _table(starts)
     # SciPy has the highest power first.
-    for k, column in enumerate(scipy.interpolate.CubicSpline(times, values).c[::-1]):
+    for k, column in enumerate(_joined(times, values, interpolation).c[::-1]):
         table[COEFFICIENTS[k]][: len(times) - 1] = column
     if hold:
         table["c0"][-1] = values[-1]
     return Pieces.of(amplitude, frequency, duration, table)
 
 
-def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
-    """The angular frequency in rad/s, not 0, at which the spectrum of ``values`` (sample,) at ``times`` is largest.
+def _joined(times: np.ndarray, values: np.ndarray, interpolation: Interpolation) -> scipy.interpolate.PPoly:
+    """Return the polynomials between samples ``values`` (sample,) at ``times`` (sample,)."""
+    if interpolation == "linear":
+        return scipy.interpolate.PPoly(np.array([np.diff(values) / np.diff(times), values[:-1]]), times)
+    if interpolation == "spline":
+        return scipy.interpolate.CubicSpline(times, values)
+    return scipy.interpolate.PchipInterpolator(times, values)
 
-    ``times`` (sample,) are in s and rise.
-    """
-    # A mean is no oscillation.
-    frequency, content = spectrum(times, values)
+
+def main_frequency(times: ArrayLike, values: ArrayLike, interpolation: Interpolation = "monotone") -> float:
+    """Return the angular frequency in rad/s, not 0, at which the ``spectrum`` of samples is largest."""
+    # A mean is not an oscillation.
+    frequency, content = spectrum(times, values, interpolation)
     return float(frequency[1 + np.argmax(content[1:])])
 
 
-def spectrum(times: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Angular frequencies (n,) in rad/s, and the transform's magnitude (n,) there, of samples joined by a spline.
+def spectrum(
+    times: ArrayLike, values: ArrayLike, interpolation: Interpolation = "monotone"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return angular frequencies (n,) in rad/s, and the magnitude (n,) of the transform of joined samples there.
 
     The samples are ``values`` (sample,) at the rising ``times`` (sample,) in s.
     """
@@ -390,5 +412,5 @@ def spectrum(times: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarra
     count = int(min(max(steps, 16), 2**20)) + 1
     even = np.linspace(times[0], times[-1], count)
     # Padded with zeros, the transform has four times as many frequencies as the record's length resolves.
-    content = np.abs(np.fft.rfft(scipy.interpolate.CubicSpline(times, values)(even), 4 * count))
+    content = np.abs(np.fft.rfft(_joined(times, values, interpolation)(even), 4 * count))
     return 2 * np.pi * np.arange(len(content)) / (4 * count * (even[1] - even[0])), content
