@@ -52,9 +52,9 @@ def rows_with(index, row):
     ("rows", "key", "part"),
     [
         (rows_with(7, "0.0070,nan"), "sensors[1].column", "sample 8 of 20 is not a finite number"),
-        (rows_with(7, "0.0070,"), "file", "row 8 is no row of numbers"),
+        (rows_with(7, "0.0070,"), "file", "line 9 has another number of fields"),
         (rows_with(7, "0.0074,1.0"), "time", "uneven: sample 8 is at 0.0074 s instead of 0.007 s"),
-        (rows_with(7, "0.007"), "file", "its lines have 1 or 2 fields"),
+        (rows_with(7, "0.007"), "file", "line 9 has another number of fields"),
         (["0.0,1.0"] * 20, "time", "must rise"),
         ([f"{1e-3 * k},0.0" for k in range(20)], "sensors[1].column", "zero at all times"),
         ([f"{1e-3 * k},1.0" for k in range(5)], "file", "leaves 5 samples"),

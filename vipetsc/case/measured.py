@@ -13,9 +13,9 @@ from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
-from vipetsc.case.samples import is_number
 from vipetsc.case.schema import Finite, Positive
 from vipetsc.io.names import resolved_path
+from vipetsc.io.tables import TableError, read_table
 from vipetsc.wording import counted
 
 # Lines of a table of text. Fields are split in Python: a million lines of two columns take 1.6 s and 300 MB.
@@ -112,7 +112,7 @@ def read_measured(record: RecordTable) -> Measured:
         raise MeasuredError("file", record.file, str(error.strerror or error)) from None
 
     read = _text_columns
-    if path.suffix.lower() in HDF5:
+    if path.suffix.lower() in HDF5 or h5py.is_hdf5(path):
         read = _hdf5_columns
     columns = read(path, record)
 
@@ -185,46 +185,18 @@ def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
 
 
 def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
-    """The columns of a ``record`` from a table of text, by their keys; the table may begin with a line of names."""
+    """Return the columns of a ``record`` from a table of text, by their keys."""
     try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, ValueError):
-        raise MeasuredError("file", record.file, "is not a table of text; HDF5 files end in .h5") from None
-    lines = [line for line in lines if line and not line.startswith("#")]
-    if not lines or len(lines) > MOST_ROWS:
-        raise MeasuredError("file", record.file, f"has {len(lines)} lines; a table has 1 to {MOST_ROWS}")
-
-    separator = next((mark for mark in (";", "\t", ",") if mark in lines[0]), None)
-    if separator in (";", "\t") and not any("." in line for line in lines[1:]):
-        # Where commas do not separate, they are those of decimals, except in names.
-        decimals = [line.replace(",", ".") for line in lines]
-        if not all(is_number(field) for field in decimals[0].split(separator)):
-            decimals[0] = lines[0]
-        lines = decimals
-    rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
-    names: list[str] = []
-    # Measuring programs write "nan" for a missing value: a first row with it is one of numbers, not of names.
-    if not all(is_number(field) for field in rows[0]):
-        names = rows.pop(0)
-
-    if not rows:
-        raise MeasuredError("file", record.file, "has no line of numbers")
-    # Fields are counted before the conversion to numbers, whose error would not say that a line lacks one.
-    widths = {len(row) for row in rows}
-    if len(widths) != 1:
-        raise MeasuredError("file", record.file, f"its lines have {' or '.join(map(str, sorted(widths)))} fields")
-    try:
-        table = np.array(rows, float)
-    except ValueError:
-        number, row = next((n, row) for n, row in enumerate(rows, 1) if not all(is_number(field) for field in row))
-        raise MeasuredError("file", record.file, f"row {number} is no row of numbers: {', '.join(row)}") from None
+        table = read_table(path, MOST_ROWS)
+    except (OSError, TableError) as error:
+        raise MeasuredError("file", record.file, str(error)) from None
 
     columns = {}
     for key, place in _wanted(record):
-        index = _index_of(place, names, key)
-        if not 0 <= index < table.shape[1]:
-            raise MeasuredError(key, place, f"the table has the columns 1 to {table.shape[1]}")
-        columns[key] = table[:, index]
+        index = _index_of(place, table.names, key)
+        if not 0 <= index < table.values.shape[1]:
+            raise MeasuredError(key, place, f"the table has the columns 1 to {table.values.shape[1]}")
+        columns[key] = table.values[:, index]
     return columns
 
 

@@ -1,6 +1,5 @@
 """Samples of a drive's waveform, from a case or from a file."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.io.names import readable, resolved_path
+from vipetsc.io.tables import read_table
 from vipetsc.lattice.drive import Interpolation
 
 # The resolved case holds the samples, and so does every result: so many are 5 MB of text and 0.6 s to read.
@@ -90,41 +90,12 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
             # The shape is checked before the data are read: a file may hold more than the memory.
             _check_shape(values.shape)
             rows = np.asarray(values, float)
+    elif h5py.is_hdf5(path):
+        raise ValueError("is an HDF5 file; give samples.dataset")
     else:
-        lines = _table_lines(path)
-        # A table may begin with a line of names. Measuring programs write "nan" for a missing value, which is no name.
-        if lines and not any(is_number(field) for field in lines[0]):
-            del lines[0]
-        try:
-            rows = np.array(lines, float)
-        except ValueError:
-            raise ValueError("is not a table of numbers; give time and value in two columns") from None
+        rows = read_table(path, MOST_SAMPLES).values
     _check_shape(rows.shape)
     return rows
-
-
-def is_number(field: str) -> bool:
-    """Whether a ``field`` of a table of text is a number; "nan" is one."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
-
-
-def _table_lines(path: Path) -> list[list[str]]:
-    """The fields of a table's lines without comments; of a table that is too long only its beginning."""
-    lines = []
-    # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
-    with path.open(encoding="utf-8-sig") as file:
-        for text in file:
-            fields = re.split(r"[,;\s]+", text.strip())
-            if fields[0] and not fields[0].startswith("#"):
-                lines.append(fields)
-            # Two more than samples are allowed: a line of names, and one line by which the table is too long.
-            if len(lines) == MOST_SAMPLES + 2:
-                break
-    return lines
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
-from vipetsc.case.samples import is_number
 from vipetsc.case.schema import LatticeTable, OutputTable
+from vipetsc.io.tables import is_number
 from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 from vipetsc.lattice.drive import main_frequency, spectrum
