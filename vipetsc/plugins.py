@@ -23,6 +23,15 @@ from vipetsc.register import PARTS, PartError, RegisteredPart
 
 GROUP = "vipetsc.plugins"  # of entry points
 NEVER_RESULTS = (register.FIGURE,)  # kinds of parts on which no number depends
+# Errors of a program rather than of its numbers: what is wrong with one run is wrong with all others. KeyError is among
+# them, since functions of modules ask by name for what runs contain. IndexError is not, since lists may be empty in one
+# run and not in the next. The second line has RuntimeErrors, which otherwise say that a run has failed.
+PROGRAMMING = (TypeError, AttributeError, NameError, ImportError, SyntaxError, KeyError)
+PROGRAMMING += (NotImplementedError, RecursionError)
+
+
+class PartFailure(PartError):
+    """A part whose function fails for the numbers of one run, and may succeed for others."""
 
 
 class PluginError(Exception):
@@ -69,11 +78,17 @@ def registered(kind: str) -> tuple[str, ...]:
 
 
 def call(part: RegisteredPart, function: Callable[..., Any], *arguments: Any) -> Any:
-    """The value of a ``function`` of a ``part``; raises PartError for whatever it raises."""
+    """Return the value of a ``function`` of a ``part``.
+
+    Raises PartError for errors of the program, and PartFailure for all others.
+    """
     try:
         return function(*arguments)
     except Exception as error:
-        raise PartError(f"the {part.kind} {part.name!r} of {part.file} fails: {_reason(error, part.file)}") from error
+        text = f"the {part.kind} {part.name!r} of {part.file} fails: {_reason(error, part.file)}"
+        if isinstance(error, PROGRAMMING):
+            raise PartError(text) from error
+        raise PartFailure(text) from error
 
 
 def is_file(name: str) -> bool:

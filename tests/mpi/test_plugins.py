@@ -1,12 +1,18 @@
-"""A module that only one rank cannot import ends all ranks, before anything is written."""
+"""A module that only one rank cannot import ends all ranks, and so does a mistake in a measure of a sweep."""
 
 from __future__ import annotations
+
+import json
 
 from mpi4py import MPI
 
 import pytest
 
+from vipetsc.case import Sweep
 from vipetsc.cli.main import main
+from vipetsc.register import PartError
+from vipetsc.studies.ensemble import FAILED
+from vipetsc.studies.sweep import run_sweep
 
 MODULE = """
 from mpi4py import MPI
@@ -61,3 +67,72 @@ def test_a_module_that_fails_on_one_rank_ends_all(folder, failing, verb, capfd):
     assert "cannot be imported: OSError: this rank cannot read its table" in messages[0]
     assert ("on rank 1: cannot" in messages[0]) == (failing == 1)
     assert not is_left
+
+
+MEASURE = """
+import numpy as np
+
+from vipetsc import register
+
+
+@register.measure("mine-{number}", unit="1", text="a number")
+def mine(record):
+    return {returned}
+"""
+SWEEP = {
+    "lattice": {"preset": "four-band", "cells": 12},
+    "contacts": {"sites": [4]},
+    "drive": {"cycles": 2},
+    "time": {"end": 0.01, "engine": "propagator"},
+    "sweep": {"measures": ["motion"], "drive": {"amplitude": [1.0, 2.0, 3.0, 4.0]}},
+}
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize(
+    ("number", "returned", "telling"),
+    [
+        (0, "record.run['energy/work'] + None", "TypeError"),
+        (1, "record.run.nothing", "AttributeError"),
+        (2, "record.run['no such variable']", "KeyError"),
+        (3, "undefined", "NameError"),
+        (4, "1j", "returns 1j"),
+        (5, "[1.0, 2.0]", "returns"),
+        (6, "np.array('a')", "returns"),
+    ],
+)
+def test_a_measure_with_a_mistake_ends_a_sweep_at_once(folder, ranks, number, returned, telling):
+    """A mistake in a function would fail every member: the first ends the sweep and names the part and its file."""
+    comm = MPI.COMM_WORLD
+    if comm.rank == 0:
+        (folder / "part.py").write_text(MEASURE.format(number=number, returned=returned))
+    comm.Barrier()
+    table = SWEEP | {"plugins": {"modules": [str(folder / "part.py")]}}
+    table["sweep"] = SWEEP["sweep"] | {"ranks": min(ranks, comm.size)}
+
+    with pytest.raises(PartError, match=f"'mine-{number}' of .*part.py .*{telling}"):
+        run_sweep(Sweep.from_table(table), folder / "out", comm)
+
+    comm.Barrier()
+    records = [path.read_text() for path in (folder / "out").glob("members*.jsonl")]
+    assert not any('"failed"' in text for text in records)
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks):
+    """A function that fails for the numbers of one run fails this member alone, also in a team of ranks."""
+    comm = MPI.COMM_WORLD
+    if comm.rank == 0:
+        returned = "[][0] if record.run.sizes['episode'] else 1.0"
+        (folder / "part.py").write_text(MEASURE.format(number=9, returned=returned))
+    comm.Barrier()
+    table = SWEEP | {"plugins": {"modules": [str(folder / "part.py")]}}
+    table["sweep"] = SWEEP["sweep"] | {"ranks": min(ranks, comm.size), "drive": {"amplitude": [1.0, 1e3, 2.0]}}
+
+    result = run_sweep(Sweep.from_table(table), folder / "out", comm)
+
+    assert result.count(FAILED) == 1
+    failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
+    assert "IndexError" in failed[0]["reason"]

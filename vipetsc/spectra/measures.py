@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from vipetsc.plugins import call, only, registered
-from vipetsc.register import MEASURE, PARTS, MeasurePart, reserve
+from vipetsc.register import MEASURE, PARTS, MeasurePart, PartError, reserve
 from vipetsc.spectra import histories
 from vipetsc.spectra.histories import History, SteadyAmplitude, SteadyDrive
 
@@ -155,8 +155,19 @@ def every_measure() -> dict[str, RunMeasure]:
     for name in registered(MEASURE):
         part = PARTS[MEASURE][name]
         assert isinstance(part, MeasurePart)
-        measures[name] = RunMeasure(name, part.unit, part.text, partial(call, part, part.function), power=part.power)
+        measures[name] = RunMeasure(name, part.unit, part.text, partial(_number_of_part, part), power=part.power)
     return measures
+
+
+def _number_of_part(part: MeasurePart, record: RunRecord) -> float | None:
+    """Return the number that a registered measure has of a ``record``; raises PartError if it is not a real number."""
+    value = call(part, part.function, record)
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.ndim or array.dtype.kind not in "biuf":
+        raise PartError(f"the measure {part.name!r} of {part.file} returns {value!r}; a number, or None, is needed")
+    return float(array)
 
 
 def _foreign(run: xr.Dataset) -> set[str]:

@@ -10,7 +10,9 @@ from mpi4py import MPI
 
 from vipetsc.io.errors import is_disk_full
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
+from vipetsc.plugins import PROGRAMMING, PartFailure
 from vipetsc.progress import Progress
+from vipetsc.register import PartError
 
 BLOCKS = 100  # that each team draws, at least: none then waits for the last longer than 1 % of the whole
 # Time in s that a rank whose job failed waits for the rest of its team to have failed as well. Ranks that fail together
@@ -28,6 +30,7 @@ class Ending(IntEnum):
     FAILED = 1
     STOPPED = 2
     FATAL = 3  # ends all jobs
+    PART = 4  # a part of a user's module is wrong: ends all jobs
 
 
 class JobEnd(NamedTuple):
@@ -48,7 +51,7 @@ class TaskPool:
     """Teams of ranks that draw jobs until none are left, or until some rank got a request to stop (``stopped``).
 
     ``busy`` is the time in s that this rank worked on them. A job may end in ``failures``; other exceptions end
-    all jobs, as a full disk does.
+    all jobs, as a full disk and errors of a program (``PROGRAMMING``) do.
     """
 
     def __init__(
@@ -71,7 +74,7 @@ class TaskPool:
         """Do all ``jobs``, begun in their order; returns how many were done. Collective.
 
         ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
-        the disk is full, or after an exception that is no failure.
+        the disk is full, or after an exception that is no failure; PartError if a part of a user's module is wrong.
         """
         reports = self.comm.allgather(self._draw_jobs(jobs, work, progress, fail))
         self.stopped = any(report.last.ending == Ending.STOPPED for report in reports)
@@ -79,6 +82,9 @@ class TaskPool:
             progress.close()
 
         def check() -> None:
+            for report in reports:
+                if report.last.ending == Ending.PART:
+                    raise PartError(report.last.reason)
             for report in reports:
                 if report.last.ending == Ending.FATAL and report.last.reason:
                     raise OSError(report.last.reason)
@@ -177,7 +183,10 @@ class TaskPool:
 
     def _judge(self, error: Exception) -> JobEnd:
         """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
-        if isinstance(error, self.failures) and not is_disk_full(error):
+        is_failure = isinstance(error, self.failures) and not isinstance(error, PROGRAMMING)
+        if isinstance(error, PartError) and not (isinstance(error, PartFailure) and is_failure):
+            return JobEnd(Ending.PART, str(error))
+        if is_failure and not is_disk_full(error):
             return JobEnd(Ending.FAILED, reason_of(error))
         if isinstance(error, OSError):
             return JobEnd(Ending.FATAL, str(error))
