@@ -80,7 +80,7 @@ def set_fits(root: Path, step: str, average: str = "energy_weighted", **values: 
     """Overwrite numbers of the fits of a finished sweep."""
     with h5py.File(root / step / "ensemble.h5", "r+") as file:
         for name, value in values.items():
-            file[f"fits/entropy/{average}/{name}"][...] = value
+            file[f"normalised_fits/entropy/{average}/{name}"][...] = value
 
 
 @pytest.fixture(scope="module")

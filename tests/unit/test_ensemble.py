@@ -197,16 +197,53 @@ def test_a_single_part_of_the_frequency_axis_has_one_name(tmp_path):
 
 @pytest.mark.parametrize("unit", ["N", "m"])
 def test_a_fit_has_the_unit_of_the_amplitude(unit):
-    """The amplitude of the peak and the factors of a fit are those of a force, or of a wall that moves by metres."""
+    """A fit has the units of the amplitude, of a force or of a wall that moves by metres, and of the measure."""
     amplitude = np.geomspace(1.0, 100.0, 12)
     data = {
         "amplitude": variable("amplitude", amplitude, unit, "drive.amplitude"),
         "ibtet": variable("amplitude", 1 / amplitude, "1", "transfer"),
+        "entropy/masked": variable("amplitude", 1 / amplitude, "bit", "entropy"),
     }
     fits = _fits(data, "amplitude")
 
-    assert fits["fits/ibtet/peak_amplitude"].attrs["units"] == unit
-    assert fits["fits/ibtet/factor"].attrs == {"units": "1", "long_name": f"factor of the log-log fit at 1 {unit}"}
+    expected = {
+        "fits/ibtet/peak_amplitude": unit,
+        "fits/ibtet/factor": "1",
+        "fits/entropy/masked/peak": "bit",
+        "fits/entropy/masked/factor_nonlinear": "bit",
+        "normalised_fits/entropy/masked/peak": "bit",
+        "normalised_fits/entropy/masked/factor": "1",
+    }
+    assert {name: fits[name].attrs["units"] for name in expected} == expected
+    assert unit in fits["fits/ibtet/factor"].attrs["long_name"]
+    assert "normalised_fits/ibtet/factor" not in fits
+
+
+@pytest.mark.parametrize("exponent", [-0.5, -0.2, -1.3])
+def test_the_exponent_of_an_entropy_does_not_depend_on_the_range_of_amplitudes(exponent):
+    """An entropy 2 A^b bit has the exponent b in two sweeps; that of the normalised values differs between them."""
+    found = {}
+    for highest in (100.0, 1000.0):
+        amplitude = np.geomspace(10.0, highest, 12)
+        data = {
+            "amplitude": variable("amplitude", amplitude, "N", "drive.amplitude"),
+            "entropy/joint": variable("amplitude", 2 * amplitude**exponent, "bit", "entropy"),
+        }
+        found[highest] = _fits(data, "amplitude")
+
+    for fits in found.values():
+        assert fits["fits/entropy/joint/exponent"].values == pytest.approx(exponent)
+        assert fits["fits/entropy/joint/exponent_nonlinear"].values == pytest.approx(exponent)
+        assert fits["fits/entropy/joint/factor"].values == pytest.approx(2.0)
+    normalised = [fits["normalised_fits/entropy/joint/exponent"].item() for fits in found.values()]
+    assert abs(normalised[0] - normalised[1]) > 0.1
+
+
+def test_a_curve_that_reaches_zero_behind_its_peak_has_no_fit():
+    """No power law reaches zero: an entropy that does is left without a fit."""
+    fit = fit_curve(np.geomspace(1.0, 8.0, 5), np.array([1.0, 3.0, 2.0, 0.0, 0.5]), normalise=False)
+    assert (fit["peak"], fit["points"]) == (3.0, 4)
+    assert np.isnan(fit["exponent"])
 
 
 def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:

@@ -398,7 +398,7 @@ def test_entropy_fits_are_the_ensembles(curves, entropy_figures, average, column
     lower = np.reshape(entropy_figures[f"calibrated-5pi-9-{average}"].axes, (2, 2))[1, column]
     row = select(curves, sites=sites, **CALIBRATED)
     names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
-    fit = {name: row[f"fits/entropy/{average}/{name}"].item() for name in names}
+    fit = {name: row[f"normalised_fits/entropy/{average}/{name}"].item() for name in names}
     thick = [line for line in lower.lines if line.get_linewidth() == 2]
     text = lower.texts[0].get_text()
 
@@ -415,7 +415,7 @@ def test_entropy_fits_are_the_ensembles(curves, entropy_figures, average, column
 
 def test_some_configuration_has_a_power_law(curves):
     # The test of the fits sees at least one power law.
-    assert np.isfinite(curves["fits/entropy/energy_weighted/factor"]).any()
+    assert np.isfinite(curves["normalised_fits/entropy/energy_weighted/factor"]).any()
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ class EntropyCurve(NamedTuple):
             amplitude=row[AMPLITUDE].values[valid],
             value=normalised(value),
             error=scale * row["entropy/error"].values[valid],
-            fit={name: float(row[f"fits/entropy/{average}/{name}"]) for name in FIT_VALUES},
+            fit={name: float(row[f"normalised_fits/entropy/{average}/{name}"]) for name in FIT_VALUES},
             band=band,
         )
 

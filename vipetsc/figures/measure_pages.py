@@ -178,7 +178,9 @@ def measures_of(ensemble: xr.Dataset) -> list[str]:
     names = []
     for name, variable in ensemble.data_vars.items():
         dims = set(map(str, variable.dims))
-        is_measure = not str(name).startswith(("statistics/", "fits/")) and name not in ABOUT_MEMBERS
+        is_measure = (
+            not str(name).startswith(("statistics/", "fits/", "normalised_fits/")) and name not in ABOUT_MEMBERS
+        )
         if is_measure and dims - {PART} == over_all and np.issubdtype(variable.dtype, np.number):
             names.append(str(name))
     return names

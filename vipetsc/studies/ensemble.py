@@ -24,7 +24,7 @@ from vipetsc.studies.linear_run import FITTED, MEASURES, MEMBERS, LinearRun, of_
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 # Members of a curve, and points from its peak on, for which a power law is fitted: two lie on one of any kind.
 LEAST_FITTED = 3
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
@@ -33,21 +33,25 @@ AMPLITUDE = "drive.amplitude"
 
 # Statistics of a member in the ensemble, in addition to the ``MEASURES`` of its analysis.
 STATISTICS = {name: REGISTRY[name].row for name in ("contact_episodes", "dissipated_fraction", "work", "ledger_error")}
-# Unit and text of what a fit consists of; {unit} stands for the unit of the amplitude.
+# Unit and text of what a fit consists of. {unit} stands for the unit of the amplitude, {measure} for that of the
+# measure, {fitted} for that of the values to which the law is fitted.
 FIT = {
     "peak_amplitude": ("{unit}", "amplitude of the largest value"),
-    "peak": ("1", "largest value, not normalised"),
+    "peak": ("{measure}", "largest value, not normalised"),
     "points": ("1", "number of points from the peak on"),
     "exponent": ("1", "exponent of the log-log fit"),
     "exponent_low": ("1", "lower end of its 95 % confidence interval"),
     "exponent_high": ("1", "upper end of its 95 % confidence interval"),
-    "factor": ("1", "factor of the log-log fit at 1 {unit}"),
+    "factor": ("{fitted}", "value of the log-log fit at 1 {unit}"),
     "r2_log_log": ("1", "adjusted R^2 of the log-log fit"),
     "exponent_nonlinear": ("1", "exponent of the nonlinear fit"),
-    "factor_nonlinear": ("1", "factor of the nonlinear fit at 1 {unit}"),
+    "factor_nonlinear": ("{fitted}", "value of the nonlinear fit at 1 {unit}"),
     "r2_nonlinear": ("1", "adjusted R^2 of the nonlinear fit"),
     "is_power_law": ("1", f"1 where the log-log fit is a power law: {FEWEST} points or more, adjusted R^2 not below 0"),
 }
+# Groups of the fits: of the values as they are, and, for entropies, of values scaled to [0.01, 1] as the paper does.
+FITS = "fits"
+NORMALISED_FITS = "normalised_fits"
 
 
 class LinearSource(NamedTuple):
@@ -309,22 +313,35 @@ def _fit_variables(results: Results, data: Variables) -> Variables:
 
 
 def _fits(data: Variables, along: str) -> Variables:
-    """Power laws over the amplitude, the coordinate ``along``, from the peak on.
+    """Power laws over the amplitude, the coordinate ``along``, from the peak on: in ``FITS`` and ``NORMALISED_FITS``.
 
-    Entropies are normalised to [0.01, 1] first, as the paper's.
+    A curve that is scaled to [0.01, 1] has another exponent, which depends on the range of amplitudes: the lowest value
+    that the sweep has becomes 0.01.
     """
     fits: Variables = {}
-    amplitude = data[along].values.astype(float)
-    unit = data[along].attrs["units"]
     for name in FITTED:
-        if name not in data:
-            continue
-        curves = data[name].transpose(..., *data[along].dims)
-        rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
-        for key, about in FIT.items():
-            table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
-            units, text = (part.format(unit=unit) for part in about)
-            fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, units, text)
+        if name in data:
+            fits |= _fits_of(data[name], data[along], f"{FITS}/{name}", normalise=False)
+            if name.startswith("entropy/"):
+                fits |= _fits_of(data[name], data[along], f"{NORMALISED_FITS}/{name}", normalise=True)
+    return fits
+
+
+def _fits_of(item: xr.Variable, along: xr.Variable, prefix: str, normalise: bool) -> Variables:
+    """Power laws of a measure, the ``item``, over the amplitudes ``along``, as variables ``prefix``/..."""
+    curves = item.transpose(..., *along.dims)
+    dims = [*map(str, curves.dims[:-1])]
+    amplitude = along.values.astype(float)
+    rows = [fit_curve(amplitude, curve, normalise) for curve in curves.values.reshape(-1, len(amplitude))]
+    units = {"unit": along.attrs["units"], "measure": item.attrs["units"], "fitted": item.attrs["units"]}
+    if normalise:
+        units["fitted"] = "1"
+
+    fits: Variables = {}
+    for key, about in FIT.items():
+        table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
+        unit, text = (part.format(**units) for part in about)
+        fits[f"{prefix}/{key}"] = variable(dims, table, unit, text)
     return fits
 
 
@@ -333,7 +350,8 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
 
     From the curve's peak on y = factor A^exponent, A the amplitude's size, by a straight line of log y over log A and
     by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first. A member without a drive, in a
-    lattice that begins in motion, is none of the curve's points: a power law has no value at A = 0.
+    lattice that begins in motion, is none of the curve's points: a power law has no value at A = 0. There is no fit of
+    a curve that is zero somewhere behind its peak.
     """
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve) & (amplitude != 0)
@@ -350,11 +368,11 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     row["peak"] = y[peak]
     row["points"] = len(y) - peak
     row["is_power_law"] = 0.0
-    if row["points"] < LEAST_FITTED:
-        return row
-
     if normalise:
         y = normalised(y)
+    if row["points"] < LEAST_FITTED or not (y[peak:] > 0).all():
+        return row
+
     line = power_law(x[peak:], y[peak:])
     # The paper gives both fits: the line weighs relative errors, the nonlinear fit the large values.
     curved = power_law(x[peak:], y[peak:], "nonlinear")

@@ -33,7 +33,7 @@ class EntropyDecay(AmplitudeCurve):
             self.value = np.full_like(self.value, np.nan)
 
         def fitted(name: str) -> float:
-            return float(members[f"fits/entropy/{average}/{name}"].item())
+            return float(members[f"normalised_fits/entropy/{average}/{name}"].item())
 
         self.points = int(np.nan_to_num(fitted("points")))
         self.r2 = fitted("r2_log_log")
@@ -59,7 +59,7 @@ def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: 
     ``wanted`` are coordinates of the sweep, as of `Evidence.select`. Raises MissingEvidence.
     """
     ensemble = evidence.ensemble(step)
-    if f"fits/entropy/{average}/points" not in ensemble or "sites" not in ensemble.coords:
+    if f"normalised_fits/entropy/{average}/points" not in ensemble or "sites" not in ensemble.coords:
         raise MissingEvidence(f"{step} holds no fits of the entropy over the numbers of sites")
     sites = ensemble["sites"].values.tolist()
     return [EntropyDecay(evidence.select(step, reading, **wanted, sites=n), average) for n in sites]
