@@ -11,8 +11,12 @@ from vipetsc.dynamics.options import set_from_options
 from vipetsc.modes.callbacks import CallbackErrors
 from vipetsc.modes.problem import Attempt, FlowError
 
-# A Newton step below this, in unknowns of order one, is rounding.
+# A Newton step below the first number, in unknowns of order one, is rounding: the residual cannot be made smaller. It
+# counts as a solution's up to the second number. Near an unstable equilibrium, where an orbit stays for a long time,
+# the derivative grows to 1e14, and a small step says nothing about the residual. On the paper's branches, whose
+# multipliers come up to 3e8, such residuals are below 4e-12.
 STEP_TOLERANCE = 1e-14
+LARGEST_RESIDUAL = 1e-9
 # A Newton step from a residual within rounding that leaves more than this fraction of it cannot make it smaller: but
 # for rounding, a step from so small a residual would leave its square.
 STAGNANT = 0.25
@@ -44,9 +48,9 @@ E = TypeVar("E", bound=Equations)
 class BorderedNewton(ABC, Generic[E]):
     """Solves residual(xi) = 0 (size - 1,) and row . xi = value; a subclass chooses matrices and vectors.
 
-    It ends at a residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within
-    its ``rounding``, or after ``max_newton`` steps. Options of PETSc have the prefix ``nnm_``. An exception of the
-    equations passes through, except FlowError: the attempt has then not converged.
+    It ends at a residual of ``tolerance``, or of ``LARGEST_RESIDUAL`` after a step below ``STEP_TOLERANCE``, where the
+    residual stagnates within its ``rounding``, or after ``max_newton`` steps. Options of PETSc have the prefix
+    ``nnm_``. An exception of the equations passes through, except FlowError: the attempt has then not converged.
     """
 
     def __init__(self, size: int, max_newton: int = 7) -> None:
@@ -131,7 +135,7 @@ class BorderedNewton(ABC, Generic[E]):
         if residual <= self._tolerance:
             return reasons.CONVERGED_FNORM_ABS
         # Before the first step PETSc gives 0 for its norm.
-        if iteration and step <= STEP_TOLERANCE:
+        if iteration and step <= STEP_TOLERANCE and residual <= LARGEST_RESIDUAL:
             return reasons.CONVERGED_SNORM_RELATIVE
         if iteration and STAGNANT * self._history[-2] < residual <= self._rounding:
             return reasons.CONVERGED_FNORM_RELATIVE

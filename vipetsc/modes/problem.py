@@ -60,7 +60,7 @@ class Attempt:
     @property
     def residuals(self) -> str:
         """The history as text."""
-        return " ".join(f"{r:.1e}" for r in self.history)
+        return " ".join(f"{r:.1e}" for r in self.history) or "none"
 
 
 S = TypeVar("S", bound=Solution)

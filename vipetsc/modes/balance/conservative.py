@@ -156,6 +156,17 @@ class ConservativeMotions:
         """No contact: at a touch the number of harmonics limits a branch, and not the length of its steps."""
         return []
 
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where a motion rests, over that of a harmonic motion of the same size.
+
+        A motion rests at the phases 0 and pi, of which the smaller value counts.
+        """
+        harmonics = self.balance(point.order).unpack(point.x).real
+        orders = np.arange(point.order + 1)
+        at_zero = np.abs(harmonics @ orders**2).max()
+        at_pi = np.abs(harmonics @ (orders**2 * (-1.0) ** orders)).max()
+        return float(min(at_zero, at_pi) / np.abs(harmonics).sum(axis=1).max())
+
     @property
     def highest_order(self) -> int:
         """The highest order that is taken: ``nnm.harmonics``, or the odd number below it."""

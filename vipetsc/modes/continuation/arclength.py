@@ -47,6 +47,13 @@ AIM_AGAIN = 0.8
 # Bounds of the factor of such a step.
 LEAST_FACTOR = 0.1
 MOST_FACTOR = 0.7
+#
+# Of an orbit that begins near an equilibrium the acceleration there, over that of a harmonic motion of the same size
+# and period, is small. Below the first number the branch ends at the equilibrium: one step on, the period of an orbit
+# that leaves an unstable equilibrium grows without bound, and the size of one about another equilibrium vanishes. Below
+# the second one the motion is the equilibrium itself, which solves the equations with any period.
+NEAR_EQUILIBRIUM = 1e-3
+CONSTANT = 1e-12
 
 
 class Geometry(NamedTuple):
@@ -134,7 +141,14 @@ class GuardedSteps:
         )
 
     def judge(self, before: Point, after: Point, geometry: Geometry) -> Verdict:
-        """Accept a step that strains no guard beyond its bound."""
+        """Accept a step that strains no guard beyond its bound, to a point that moves."""
+        if self.problem.acceleration(after) < CONSTANT:
+            return Verdict(
+                accepted=False,
+                step=after.step * FAILED_FACTOR,
+                why="Newton's method ends at an equilibrium, which has no period",
+                remedy="nnm.largest_step",
+            )
         size, guard = strain(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
             # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
@@ -148,7 +162,12 @@ class GuardedSteps:
         return Verdict(accepted=False, step=after.step * factor, why=why, remedy=remedy)
 
     def end(self, before: Point, point: Point) -> tuple[Point, str] | None:
-        """The point itself, where it has left the range of energies or of frequencies."""
+        """The point itself, where it has left the range of energies or of frequencies, or is almost an equilibrium."""
+        if self.problem.acceleration(point) < NEAR_EQUILIBRIUM:
+            return point, (
+                f"ends at an equilibrium: at E = {point.energy:.9g} J, f = {point.frequency:.6g} Hz the motion begins "
+                "where the forces almost balance"
+            )
         low, high = self.control.energy
         # The first motion has the energy asked for by its linear mode alone: springs and pressed contacts that are not
         # linear change it. A branch may therefore begin outside the range and come into it.

@@ -44,6 +44,12 @@ class OrbitProblem(PeriodicProblem[Point], Protocol):
         All ranks must call it. Raises FlowError if the arc cannot be integrated.
         """
 
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+
+        It is 0 at an equilibrium, and infinite where no rest of the orbit is known. All ranks must call it.
+        """
+
 
 class Strain(NamedTuple):
     """Largest change in a step over the bound of its ``guard``; 1 is the bound."""

@@ -263,6 +263,22 @@ class ShootingEquations(ABC, Generic[A]):
         """No contact: a subclass whose orbits have all masses on one rank may look for those that graze."""
         return []
 
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+
+        It is 0 at an equilibrium, and infinite for maps from centre to centre. Of two rests the smaller value counts.
+        All ranks must call it.
+        """
+        n = self.system.dofs
+        rests = []
+        if self.map.starts_at_rest:
+            rests.append(point.x)
+        if self.map.ends_at_rest and self.map.fraction < 1:
+            rests.append(self.end(self.arc(point.x, point.period))[:n])
+        accelerations = [np.abs(self.system.forces(u) / self.system.masses).max() for u in rests]
+        size = max((np.abs(u).max() for u in rests), default=1.0)
+        return float(min(accelerations, default=np.inf) / size * (point.period / (2 * np.pi)) ** 2)
+
     @abstractmethod
     def null_vector(self, start: Point) -> np.ndarray:
         """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
