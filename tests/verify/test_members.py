@@ -231,3 +231,44 @@ def test_all_members_say_alike_why_their_linear_run_failed(tmp_path, monkeypatch
 
     failed = json.loads((tmp_path / "out" / "index.json").read_text())["failed"]
     assert [row["reason"] for row in failed] == ["MemoryError: Unable to allocate 1.00 TiB"] * 3
+
+
+OVERLAPPING = {
+    "name": "overlap",
+    "lattice": {
+        "cells": 16,
+        "cell": {
+            "masses": [0.01, 0.004],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 6e3},
+                {"start": 2, "end": 2, "stiffness": 1.0, "next_cell": True},
+            ],
+            "contact": [1, 2],
+        },
+    },
+    "contacts": {"sites": [6], "clearance": 1e-4, "stiffness": 1e6},
+    "drive": {"cycles": 3, "frequency": 700.0, "amplitude": 20.0},
+    "time": {"end": 0.02},
+    "sweep": {"measures": ["transfer"], "lattice": {"cell": {"springs[3].stiffness": [1.0, 1000.0, 1.1]}}},
+}
+
+
+def test_members_whose_bands_overlap_differently_keep_their_parts():
+    """A soft spring leaves a gap between two bands, a stiff one makes them one: each member has the parts it has."""
+    plan = Sweep.from_table(OVERLAPPING)
+    ensemble = run_sweep(plan).dataset
+
+    parts = list(ensemble["bands/share"].attrs["parts"])
+    assert set(parts) == {"band 1", "gap 1", "band 2", "band 1+2", "above"}
+    assert parts[-1] == "above"
+    share = {part: ensemble["bands/share"].isel(part=number).values for number, part in enumerate(parts)}
+    for part, values in share.items():
+        own = [part in ("band 1+2", "above"), part in ("band 1", "gap 1", "band 2", "above")]
+        assert np.isfinite(values).tolist() == [own[1], own[0], own[1]]
+    for cut in (["band 1", "gap 1", "band 2", "above"], ["band 1+2", "above"]):
+        assert sorted(cut, key=parts.index) == cut
+    # The energies of a member's own parts are all of its energy; a closed contact has less than 1 % of it.
+    assert ensemble["bands/share"].sum("part").values == pytest.approx(1.0)
+    energy = ensemble["bands/modal_energy"].sum("part").values
+    assert energy == pytest.approx(ensemble["work"].values * (1 - ensemble["dissipated_fraction"].values), rel=1e-2)

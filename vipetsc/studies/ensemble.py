@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,10 +70,11 @@ class Results:
 
     ``status`` (member): how each ended, an index of ``STATUS``; ``reasons`` of those that failed by number; ``tables``
     (member, or member and a list, padded with NaN) of what was measured by name, for the first of equal members;
-    ``errors`` the largest sampling error of each measure; ``used`` tolerances, engines and options of the analysis;
-    ``linear`` runs by name; ``parts`` the names of the parts of the frequency axis, once for each way in which members
-    cut it; ``lines`` the places of the records in their files. ``first`` (member) is the number of the first member
-    that is equal. ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
+    ``errors`` the largest sampling error of each measure over the members; ``used`` tolerances, engines and options of
+    the analysis; ``linear`` runs by name; ``parts`` the names of the parts of the frequency axis by the number of a
+    member, since the bands of each may overlap differently; ``lines`` the places of the records in their files.
+    ``first`` (member) is the number of the first member that is equal. ``warnings`` by number are about the members,
+    ``damaged`` names lines that could not be used.
     """
 
     def __init__(self, plan: Sweep, folder: Path) -> None:
@@ -87,7 +88,7 @@ class Results:
         self.tables: dict[str, np.ndarray] = {}
         self.linear: dict[str, LinearRun] = {}
         self.lines: dict[str, Line] = {}
-        self.parts: set[tuple[str, ...]] = set()
+        self.parts: dict[int, tuple[str, ...]] = {}
         self.warnings: dict[int, list[str]] = {}
         self.damaged: list[str] = []
         self.cpu_seconds: dict[int, float] = {}
@@ -159,7 +160,7 @@ class Results:
     def _put(self, number: int | list[int], row: Record) -> None:
         """Enter the measures of a member, or of several equal ones, into the tables."""
         if row.get("parts"):
-            self.parts.add(tuple(row["parts"]))
+            self.parts |= dict.fromkeys(np.atleast_1d(number).tolist(), tuple(row["parts"]))
         if row.get("analysis"):
             self.used["analysis"].add(row["analysis"])
         for name, error in row.get("errors", {}).items():
@@ -263,15 +264,17 @@ def _measured_variables(results: Results) -> Variables:
     """``STATISTICS`` and the measures that some member has, with the coordinates that they need."""
     plan = results.plan
     dims = _dimensions(plan)
+    parts = _joined(results.parts.values())
     data: Variables = {}
     for name, (further, *texts) in _layout(results).items():
-        table = results.tables.get(name, np.full(plan.count, np.nan))[results.first]
-        if further == PART and len(results.parts) != 1:  # cells whose bands overlap differently have no common parts
-            continue
+        table = results.tables.get(name, np.full(plan.count, np.nan))
+        if further == PART and table.ndim > 1:
+            table = _over_parts(table, results.parts, parts)
+        table = table[results.first]
         if name in STATISTICS or table.ndim > 1 or not np.isnan(table).all():
             error: dict[str, Any] = {}
             if name in results.errors:
-                error["sampling_error"] = results.errors[name]
+                error["largest_sampling_error"] = results.errors[name]
             table = table.reshape(*plan.shape, *table.shape[1:])
             data[name] = variable((*dims, *further.split()), table, *texts, **error)
 
@@ -281,12 +284,38 @@ def _measured_variables(results: Results) -> Variables:
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
     for name in [name for name, item in data.items() if PART in item.dims]:
-        # There is one way to cut the axis here: with several no variable of parts has been entered.
-        data[name].attrs["parts"] = list(*results.parts)
+        data[name].attrs["parts"] = parts
         if PART not in data:
-            number = np.arange(1, data[name].shape[-1] + 1)
+            number = np.arange(1, len(parts) + 1)
             data["part"] = variable("part", number, "1", "part of the frequency axis")
     return data
+
+
+def _joined(cuts: Iterable[tuple[str, ...]]) -> list[str]:
+    """Return the names of all parts in ``cuts`` of the frequency axis, each behind the one that it follows in a cut.
+
+    Bands that overlap are one part ("band 1+2") for some members, and two parts and a gap for others.
+    """
+    joined: list[str] = []
+    # Sorted, since the file must not depend on the order in which members were simulated.
+    for cut in sorted(set(cuts)):
+        place = 0
+        for name in cut:
+            if name not in joined:
+                joined.insert(place, name)
+            place = joined.index(name) + 1
+    return joined
+
+
+def _over_parts(table: np.ndarray, cuts: Mapping[int, tuple[str, ...]], parts: list[str]) -> np.ndarray:
+    """Return a ``table`` (member, part of the member) over all ``parts``; NaN for those that a member does not have.
+
+    ``cuts`` are the names of the parts by the number of a member.
+    """
+    over_all = np.full((len(table), len(parts)), np.nan)
+    for number, cut in cuts.items():
+        over_all[number, [parts.index(name) for name in cut]] = table[number, : len(cut)]
+    return over_all
 
 
 def _layout(results: Results) -> dict[str, tuple[str, str, str]]:

@@ -15,8 +15,9 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 def over_samples(data: Variables, seed: str, names: Iterable[str]) -> Variables:
     """Mean, standard deviation and ``QUANTILES`` of the variables ``names`` in ``data`` over the dimension ``seed``.
 
-    They are called ``statistics/<name>/mean``, ``deviation`` and ``quantiles``, and are of the samples that did not
-    fail, whose number is ``statistics/samples``. The variance of n samples is divided by n - 1.
+    They are called ``statistics/<name>/mean``, ``deviation`` and ``quantiles``, and are of the samples that have a
+    value, whose number is ``statistics/<name>/samples``; ``statistics/samples`` is the number of those that did not
+    fail. The variance of n samples is divided by n - 1.
     """
     # A failed member has NaN in every measure; the number of contact episodes is one that all others have.
     episodes = data["contact_episodes"]
@@ -41,7 +42,9 @@ def _statistics(prefix: str, item: xr.Variable) -> Variables:
         mean = np.nanmean(item.values, axis=0)
         deviation = np.nanstd(item.values, axis=0, ddof=1)
         quantiles = np.nanquantile(item.values, QUANTILES, axis=0)
+    count = np.isfinite(item.values).sum(axis=0)
     return {
+        f"{prefix}/samples": variable(dims, count, "1", f"{text}: number of samples with a value"),
         f"{prefix}/mean": variable(dims, mean, units, f"{text}: mean over the samples"),
         f"{prefix}/deviation": variable(dims, deviation, units, f"{text}: standard deviation"),
         f"{prefix}/quantiles": variable(("quantile", *dims), quantiles, units, f"{text}: quantiles"),
