@@ -59,7 +59,10 @@ def test_the_builtin_case_lasts_until_the_wave_has_crossed():
     model = Case.load().model()
     assert model.speed == pytest.approx(428.7, abs=0.05)
     # The burst of 30 cycles, and 300 cells at the group velocity.
-    assert model.end == pytest.approx(2 * np.pi * 30 / 1023.2717 + 300 / 428.682, rel=1e-6)
+    crossed = 2 * np.pi * 30 / 1023.2717 + 300 / 428.682
+    # The last sample is the one before.
+    assert model.end == 4420 * model.sample_interval
+    assert crossed - model.sample_interval < model.end < crossed
     assert model.samples == 4421
     assert model.scale == pytest.approx(2.42261e-3, rel=1e-5)
 
@@ -189,6 +192,19 @@ def test_samples_are_counted_and_held_against_the_bands():
     """A number of samples that resolves the bands is taken; one that does not is refused."""
     assert "too coarse" in problems({"time": {"samples": 20}})["time.samples"]
     assert Case.from_table({"time": {"samples": 5000}}).model().samples == 5000
+
+
+@given(end=st.floats(0.5, 100.0), interval=st.floats(1e-3, 0.5) | st.just("auto"))
+def test_the_last_sample_is_at_the_end(end, interval):
+    """An interval that does not divide the end is shortened to one that does, and stays when the case is read again."""
+    case = Case.from_table(PLAIN | {"time": {"end": end, "sample_interval": interval}})
+    model = case.model()
+    assert model.end == end
+    assert (model.samples - 1) * model.sample_interval == pytest.approx(end, rel=1e-11)
+    if interval != "auto":
+        assert model.sample_interval <= interval * (1 + 1e-12)
+        assert model.samples - 2 < end / interval * (1 + 1e-12)
+    assert Case.from_toml(case.to_toml()) == case
 
 
 def test_automatic_sample_intervals_are_round():

@@ -169,6 +169,33 @@ HELD = {
 }
 
 
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+@pytest.mark.parametrize(("end", "interval"), [(1.7e-3, 0.9e-3), (1.2e-3, 0.7e-3), (1.5e-3, 4e-4)])
+def test_an_impact_between_the_last_whole_interval_and_the_end_is_seen(engine, end, interval):
+    """Two beads meet after 1 ms: the run lasts to its end, with its last sample there, and has the impact."""
+    case = Case.from_table(
+        {
+            "lattice": {"cells": 2, "ends": "free", "cell": {"masses": [2.05e-3]}},
+            "contacts": {
+                "law": "hertz",
+                "stiffness": 7.4e9,
+                "restitution": 0.9,
+                "damping": "exact",
+                "sites": [1],
+                "next_cell": True,
+                "side": "minus",
+                "clearance": 1e-3,
+            },
+            "initial": {"kind": "velocity", "cell": 1, "velocity": 1.0},
+            "time": {"end": end, "sample_interval": interval, "engine": engine},
+        }
+    )
+    run = simulated(case)[0]
+    assert run["time"].values[-1] == pytest.approx(end, rel=1e-12)
+    assert np.diff(run["time"].values) == pytest.approx(run["time"].values[1], rel=1e-9)
+    assert run["velocity"].values[-1, :, 0] == pytest.approx([0.05, 0.95], abs=2e-3)
+
+
 def test_a_mass_bounces_on_a_stop_as_in_closed_form(tmp_path):
     """Two masses that move in phase, each on a spring K with a stop, have 100 impacts at the onsets in closed form."""
     start = -5 * D

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from vipetsc.case.contacts import Gaps
 from vipetsc.case.drive import wave_speed
 from vipetsc.case.initial import InitialTable
@@ -85,5 +83,5 @@ class Model:
     @property
     def samples(self) -> int:
         """Number of uniform samples, the one at t = 0 included."""
-        # Where the end is a whole number of intervals, rounding must not lose the last sample.
-        return int(np.floor(self.end / self.sample_interval * (1 + 1e-12))) + 1
+        # The end is a whole number of intervals, apart from rounding.
+        return round(self.end / self.sample_interval) + 1

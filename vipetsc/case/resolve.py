@@ -36,6 +36,7 @@ REPLACES = {
 }
 # Samples of half a period of the top band's edge where no interval is given; one would just resolve the bands.
 SAMPLES_OF_HALF_PERIOD = 3
+WHOLE = 1e-12  # fraction by which a number of intervals differs from a whole one by rounding
 
 
 def with_default_preset(table: Table) -> Table:
@@ -369,7 +370,11 @@ def resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> Contact
 
 
 def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTable) -> TimeTable:
-    """The end and the sample interval in s of a lattice of ``cells`` cells under a resolved ``drive``."""
+    """Return the end and the sample interval in s of a lattice of ``cells`` cells under a resolved ``drive``.
+
+    The end is a whole number of intervals: a last interval that is shorter would spoil every spectrum. An end in s is
+    kept, and the interval shortened; the end that follows from the wave is moved to the sample before it.
+    """
     end = time.end
     if end == "traverse":
         # Until the last drive is over, and the wave of the first has crossed the lattice.
@@ -382,6 +387,14 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (SAMPLES_OF_HALF_PERIOD * pass_bands(cell)[-1].high))
+
+    count = end / interval
+    # A resolved case is resolved again when it is read: a number of intervals that is whole to rounding stays.
+    if abs(count - round(count)) > WHOLE * count:
+        if time.end == "traverse":
+            end = max(int(count), 1) * interval
+        else:
+            interval = end / int(np.ceil(count))
     return time.model_copy(update={"end": float(end), "sample_interval": float(interval), "samples": None})
 
 
