@@ -1,5 +1,7 @@
 """Bands, matrices, contacts and drives of lattices against closed forms, other computations and published numbers."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -344,3 +346,44 @@ def test_the_wave_of_a_long_ring_is_that_of_a_short_one(cells):
     assert ring.wave_scale(burst) == pytest.approx(short, rel=1e-6)
     # All cells of a ring are equivalent.
     assert ring.wave_scale(burst, cell=cells // 3) == pytest.approx(short, rel=1e-6)
+
+
+@pytest.mark.parametrize("masses", [2, 3, 7, 40])
+def test_a_chain_of_equal_masses_has_no_gaps_in_whatever_cells_it_is_counted(masses):
+    """Bands of a cell of n equal masses are one folded band, omega = 2 sin(q/2), and touch where it is folded.
+
+    Its waves have the speed cos(q/2) = (1 - omega^2/4)^(1/2) in masses/s, at the ends of the zone as elsewhere.
+    """
+    springs = [Spring(i, i + 1, 1.0) for i in range(masses - 1)]
+    cell = UnitCell((1.0,) * masses, (*springs, Spring(masses - 1, 0, 1.0, next_cell=True)), 0, 1)
+    bands = pass_bands(cell)
+    assert gaps(bands) == []
+    assert all(below.high == above.low for below, above in pairwise(bands))
+
+    for kappa in (0.0, 1.0, np.pi, -1.0):
+        point = bloch(cell, kappa)
+        expected = np.sqrt(np.maximum(1 - point.frequency**2 / 4, 0)) / masses
+        assert np.abs(point.group_velocity) == pytest.approx(expected, abs=1e-6)
+        # Vectors of bands that touch still solve the problem, and still are orthogonal.
+        moved = cell.stiffness_matrix(kappa) @ point.vectors
+        assert moved == pytest.approx(point.vectors * point.frequency**2, abs=1e-12)
+        assert point.vectors.conj().T @ point.vectors == pytest.approx(np.eye(masses), abs=1e-12)
+    # Bands are in the order that they have next to the ends.
+    inside = bloch(cell, [1e-3, np.pi - 1e-3]).group_velocity
+    assert bloch(cell, [0.0, np.pi]).group_velocity == pytest.approx(inside, abs=2e-3)
+
+    # At the fold, where the wave is of both bands, and a band's fastest waves.
+    fold = 2 * np.sin(np.pi / (2 * masses))
+    assert max(wave[2] for wave in waves_at(cell, bands[0].high)) == pytest.approx(np.sqrt(1 - fold**2 / 4) / masses)
+    assert max_group_velocity(cell, 2)[2] == pytest.approx(np.sqrt(1 - fold**2 / 4) / masses, rel=1e-6)
+
+
+@pytest.mark.parametrize("detuning", [1e-2, 1e-6, 2e-8])
+def test_a_small_gap_is_a_gap(detuning):
+    """Masses that differ a little open a gap from (2 k/m)^(1/2) to (2 k/M)^(1/2), however small."""
+    springs = (Spring(0, 1, 1.0), Spring(1, 0, 1.0, next_cell=True))
+    cell = UnitCell((1.0, 1.0 + detuning), springs, 0, 1)
+    ((low, high),) = gaps(pass_bands(cell))
+    assert high - low == pytest.approx(np.sqrt(2) - np.sqrt(2 / (1 + detuning)), rel=1e-4)
+    # At the edges of a gap waves stand.
+    assert bloch(cell, np.pi).group_velocity == pytest.approx([0, 0], abs=1e-8 / detuning)

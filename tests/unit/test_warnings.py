@@ -98,7 +98,7 @@ def test_a_drive_that_samples_do_not_show():
 
     burst = {"frequency": 1000.0, "cycles": 6}
     fast = {"waveform": "harmonic", "frequency": 4000.0, "cell": 2, "ramp": 0.01}
-    (sentence,) = warnings_of(drive=burst | {"more": [fast]}, time={"end": 0.04, "sample_interval": 8.5e-4})
+    (sentence,) = warnings_of(drive=burst | {"more": [fast]}, time={"end": 0.0408, "sample_interval": 8.5e-4})
     # The highest frequency is pi/8.5e-4 s = 3696 rad/s.
     assert "4000 rad/s, beyond the 3696 rad/s" in sentence
 

@@ -226,7 +226,10 @@ def _check_wave(cell: UnitCell, drives: DriveTable, time: TimeTable) -> Iterator
         key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
         value = getattr(drive, key)
         if not frequency > 0:
-            yield Problem(f"{path}.{key}", value, "the frequency there is 0; choose another wavenumber or band")
+            remedy = "the frequency there is 0; choose another wavenumber or band"
+            if drive.at is not None:
+                remedy = "the waves of this band are fastest at the frequency 0; give a frequency or a wavenumber"
+            yield Problem(f"{path}.{key}", value, remedy)
         elif drive is drives and time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
             remedy = f"the wave at {frequency:.6g} rad/s has group velocity 0 and never crosses the lattice"
             yield Problem(f"{path}.{key}", value, f"{remedy}; give time.end in s, or another wavenumber")

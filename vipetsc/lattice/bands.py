@@ -31,6 +31,12 @@ STILL = 1e-7
 # Smallest wavenumber at which group velocities are computed. The limit at 0 changes by 9e-8 of itself with half of it,
 # by 4e-7 with twice: at smaller ones rounding of omega^2 counts, at larger ones the curvature of the band.
 OFF_ZERO = 3e-4
+# At smaller wavenumbers omega^2 of the acoustic branch is below this fraction of the highest one: it is 2e-8 at most.
+SLOWLY = 1e-6
+# Bands touch where their omega^2 differ by less than this fraction of the highest one; rounding is 1e-14 of it.
+TOUCHING = 1e-12
+# Fraction of a frequency below which a gap is one of rounding. Two masses that differ by 1e-8 open a wider one.
+NO_GAP = 1e-9
 
 
 @dataclass(frozen=True)
@@ -56,32 +62,60 @@ class Band:
 
 
 def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
-    """Frequencies, eigenvectors and group velocities of ``cell`` at wavenumbers ``kappa`` (...) in rad per cell.
+    """Return frequencies, vectors and group velocities of ``cell`` at wavenumbers ``kappa`` (...) in rad per cell.
 
     Solves (K(kappa) - omega^2 M) u = 0 with u* M u = 1. The group velocity is d omega/d kappa = u* K' u / (2 omega)
     with K' = dK/d kappa, as follows from the derivative of u* K u = omega^2; where omega = 0 it is the limit from
-    kappa > 0.
+    kappa > 0. Where bands touch, the vectors are those of the bands next to that wavenumber, on the side of 0.
     """
     kappa = np.asarray(kappa, float)
     root = 1 / np.sqrt(cell.masses)
-    scale = root[:, None] * root
     squared, vectors = _eigenpairs(cell, kappa)
+    slope = _stiffness_slope(cell, kappa) * (root[:, None] * root)
+    _resolve_touching(kappa, squared, vectors, slope)
+    group_velocity = _group_velocity(squared, vectors, slope)
 
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
     near_zero = np.abs(kappa) < OFF_ZERO
-    off_zero = np.where(near_zero, OFF_ZERO, kappa)
-    # Frequencies and vectors stay those of the wavenumber itself: only the slope is taken next to it.
-    eigenvalue = squared.copy()
-    u = vectors.copy()
     if near_zero.any():
-        eigenvalue[near_zero], u[near_zero] = _eigenpairs(cell, OFF_ZERO)
-    stiffness_slope = _stiffness_slope(cell, off_zero)
-    eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
+        off_zero = np.asarray(OFF_ZERO)
+        limit = _group_velocity(*_eigenpairs(cell, off_zero), _stiffness_slope(cell, off_zero) * (root[:, None] * root))
+        is_slow = near_zero[..., None] & (squared < SLOWLY * squared[..., -1:])
+        group_velocity = np.where(is_slow, limit, group_velocity)
     return BlochPoint(
-        frequency=np.sqrt(np.maximum(squared, 0)),
-        vectors=vectors * root[:, None],
-        group_velocity=eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny))),
+        frequency=np.sqrt(np.maximum(squared, 0)), vectors=vectors * root[:, None], group_velocity=group_velocity
     )
+
+
+def _group_velocity(squared: np.ndarray, vectors: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return u* K' u / (2 omega) (..., band) of ``vectors`` (..., dof, band), with K' = ``slope`` (..., dof, dof)."""
+    eigenvalue_slope = np.einsum("...ij,...ij->...j", vectors.conj(), slope @ vectors).real
+    return np.asarray(eigenvalue_slope / (2 * np.sqrt(np.maximum(squared, np.finfo(float).tiny))))
+
+
+def _resolve_touching(kappa: np.ndarray, squared: np.ndarray, vectors: np.ndarray, slope: np.ndarray) -> None:
+    """Turn ``vectors`` of equal frequency to those of the bands that touch there.
+
+    Any combination of them solves the eigenvalue problem; those of the bands diagonalise the ``slope`` K'.
+    """
+    touching = np.diff(squared, axis=-1) <= TOUCHING * squared[..., -1:]
+    for point in np.argwhere(touching.any(axis=-1)):
+        at = tuple(point) if kappa.ndim else ()
+        # Bands that touch are consecutive, since frequencies are sorted.
+        begins = np.flatnonzero(np.append(True, ~touching[at]))
+        ends = np.append(begins[1:], squared.shape[-1])
+        for begin, end in zip(begins, ends, strict=True):
+            some = vectors[(*at, slice(None), slice(begin, end))]
+            turning = some.conj().T @ slope[at] @ some
+            # Bands that are flat, as those of loose masses, stay as they are.
+            if end - begin == 1 or np.abs(turning).max() <= FLAT * squared[at][-1]:
+                continue
+
+            # Next to the wavenumber, on the side of 0, the lowest band is the one that rises most towards it.
+            _, turned = np.linalg.eigh(turning)
+            if kappa[at] > 0:
+                turned = turned[:, ::-1]
+            some[:] = some @ turned
 
 
 def _eigenpairs(cell: UnitCell, kappa: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +168,8 @@ def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
 
 def _speed(cell: UnitCell, band: int, kappa: float) -> float:
     """Magnitude of the group velocity in cells/s of ``band`` (from 1) at ``kappa``."""
-    if cell.dofs <= MANY_MASSES or kappa < OFF_ZERO:
+    # Where bands may touch, at 0 and at pi, the vector of one band is not enough.
+    if cell.dofs <= MANY_MASSES or kappa < OFF_ZERO or kappa >= np.pi:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
     squared, vector = _eigenpair(cell, band, kappa)
     slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
@@ -174,13 +209,19 @@ def _maximum(function: Callable[[float], float], values: np.ndarray, kappa: np.n
 
 @lru_cache
 def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
-    """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
+    """Return the pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid.
+
+    Bands that touch have the same edge.
+    """
     grid = _grid(cell)
-    bands = []
+    bands: list[Band] = []
     for number, frequency in enumerate(grid.frequency.T, 1):
         _, high = _maximum(partial(_frequency, cell, number), frequency, grid.kappa)
         _, low = _maximum(partial(_frequency, cell, number, sign=-1), -frequency, grid.kappa)
-        bands.append(Band(number=number, low=max(-low, 0.0), high=high))
+        low = max(-low, 0.0)
+        if bands and abs(low - bands[-1].high) < NO_GAP * low:
+            low = bands[-1].high
+        bands.append(Band(number=number, low=low, high=high))
     return tuple(bands)
 
 
@@ -244,7 +285,14 @@ def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float]
             def difference(kappa: float, band: int = number) -> float:
                 return _frequency(cell, band, kappa) - frequency
 
-            root = scipy.optimize.brentq(difference, *grid.kappa[i : i + 2], xtol=1e-13)
+            begin, end = grid.kappa[i : i + 2]
+            before = difference(begin)
+            after = difference(end)
+            # At an edge of a band the grid's frequency and this one may differ by rounding, and have no change of sign.
+            if before * after > 0:
+                root = float(begin if abs(before) < abs(after) else end)
+            else:
+                root = scipy.optimize.brentq(difference, begin, end, xtol=1e-13)
             speed = _speed(cell, number, root)
             waves.append((number, root, speed))
     return tuple(waves)
