@@ -165,6 +165,15 @@ def test_the_ends_of_a_record_are_not_in_the_means(run):
     assert measured["bands/share"].values == pytest.approx((energy / energy.sum(axis=0)).mean(axis=1))
 
 
+def test_without_a_band_above_the_driven_one_the_transfer_is_left_out_by_name(run):
+    """Nothing can be transferred to a band above the highest: the analysis says so instead of a NaN without a word."""
+    case = Case.load(overrides=["lattice.cells=24", "contacts.sites=[9, 14]", "drive.cycles=3", "drive.band=4"])
+    measured = analyse(run.assign_attrs(case=case.to_toml()), ("bands",))
+    assert np.isnan(measured["ibtet"])
+    assert "ibtet: no pass band lies above" in measured.attrs["left_out"]
+    assert "ibtet" not in analyse(run, ("bands",)).attrs["left_out"]
+
+
 def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
     """On a ring the first site is the nearest one in either direction; spectra before and after it are left out."""
     # The drive at cell 3 is 6 cells from cell 9, and 5 cells, across the ends, from cell 22.

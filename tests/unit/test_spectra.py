@@ -15,10 +15,12 @@ from vipetsc.spectra import (
     block_means,
     dispersion,
     dispersions,
+    estimated_peak,
     front_arrival,
     ibtet,
     kinetic_energy,
     part_energies,
+    peak_arrival,
     ridge,
     taper,
     wavenumber_content,
@@ -246,9 +248,24 @@ def test_transfer_is_the_mean_fraction_after_arrival():
     assert np.isnan(ibtet(0 * energy, above))
 
 
-def test_a_front_has_arrived_at_a_hundredth_of_the_largest_value():
-    """The arrival is the first sample beyond 1 % of the maximum."""
-    assert front_arrival(np.array([0, 1e-4, 0.02, 1.0, 0.5])) == 2
+@pytest.mark.parametrize(("middle", "width", "size"), [(0.4, 0.1, 1.0), (0.6, 0.2, -3e-9), (0.9, 0.3, 1e5)])
+def test_front_and_peak_of_a_packet_arrive_when_its_formula_says(middle, width, size):
+    """A packet A exp(-((t - m)/s)^2) has its front at m - s sqrt(ln(100)/2), and its peak at m."""
+    time = np.linspace(0.0, 2.0, 4001)
+    velocity = size * np.exp(-(((time - middle) / width) ** 2))
+    front = middle - width * np.sqrt(np.log(100) / 2)
+
+    assert time[front_arrival(velocity**2)] == pytest.approx(front, abs=time[1])
+    assert time[peak_arrival(velocity)] == pytest.approx(middle, abs=time[1] / 2)
+    assert peak_arrival(np.stack([velocity, velocity[::-1]], axis=1)).tolist() == [
+        peak_arrival(velocity),
+        4000 - peak_arrival(velocity),
+    ]
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(100.0, 0.25), (0.0, 0.05)])
+def test_the_middle_of_a_burst_travels_at_the_group_velocity(speed, expected):
+    assert estimated_peak(duration=0.1, distance=20, speed=speed) == pytest.approx(expected)
 
 
 def test_taper_keeps_the_mean_square():

@@ -19,7 +19,8 @@ from vipetsc.spectra.fourier import (
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 
 if TYPE_CHECKING:
-    from vipetsc.spectra.band_energies import PartEnergies, Parts, front_arrival, ibtet, part_energies
+    from vipetsc.spectra.arrivals import estimated_peak, front_arrival, peak_arrival
+    from vipetsc.spectra.band_energies import PartEnergies, Parts, ibtet, part_energies
     from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
     from vipetsc.spectra.modal_energies import ModalParts, upper_fraction
     from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 # Modules with compiled kernels, which take half a second to load: a case that is only checked needs no more of this
 # package than the names of measures.
 COMPILED = {
-    "band_energies": ("PartEnergies", "Parts", "front_arrival", "ibtet", "part_energies"),
+    "arrivals": ("estimated_peak", "front_arrival", "peak_arrival"),
+    "band_energies": ("PartEnergies", "Parts", "ibtet", "part_energies"),
     "entropies": ("Entropy", "averages", "entropy", "local_entropy"),
     "modal_energies": ("ModalParts", "upper_fraction"),
     "wavelet": ("BINS", "Nodes", "filter_bank", "inverse", "padded_length", "partition", "transform"),

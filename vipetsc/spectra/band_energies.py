@@ -212,11 +212,6 @@ def _means_over_samples(energy: Cosines, last: int, samples: int, cells: int) ->
     return np.maximum(means @ amplitude, 0.0)
 
 
-def front_arrival(energy: np.ndarray) -> int:
-    """First sample at which ``energy`` (t) of one cell exceeds 1 % of its largest value."""
-    return int(np.argmax(energy > 0.01 * energy.max()))
-
-
 def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:
     """Inter-band targeted energy transfer: mean fraction of the energy in the parts ``above`` (part) the driven one.
 

@@ -11,8 +11,9 @@ X is often needed at every n-th cell alone. There, exp(i kappa x) is the same fo
 filtered spectrum is added up over these ("folded") before its inverse transform, which is n times shorter. The values
 of X are exact; only the sums over x have fewer cells.
 
-Averages are taken from the linear wave's arrival on. They are weighted by the energy, or leave out cells at rest: in a
-plain mean over all points these would count as much as the others, and the mean shows no trend with the amplitude.
+Averages are taken from the arrival of the linear wave's peak on. They are weighted by the energy, or leave out cells at
+rest: in a plain mean over all points these would count as much as the others, and the mean shows no trend with the
+amplitude.
 """
 
 from collections.abc import Iterator
@@ -75,10 +76,10 @@ def entropy(
 ) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
-    ``start`` is the sample of the linear wave's arrival at the first site. Every ``every``-th sample is transformed (a
-    snapshot), and every ``stride``-th cell averaged over; the largest weight of Eq. (d) is sought in the other samples
-    too. ``first`` are the entropies of the first snapshots if these are known already. Raises ValueError if ``start``
-    is no sample, or one is not finite.
+    ``start`` is the sample at which the linear wave's peak is at the first site. Every ``every``-th sample is
+    transformed (a snapshot), and every ``stride``-th cell averaged over; the largest weight of Eq. (d) is sought in the
+    other samples too. ``first`` are the entropies of the first snapshots if these are known already. Raises ValueError
+    if ``start`` is not a sample, or one is not finite.
     """
     nt = len(velocity)
     if not 0 <= start < nt:

@@ -326,7 +326,7 @@ def _of_points(kind: str, quantity: str) -> RunMeasure:
 
 IBTET_WHOLE = "inter-band energy transfer as in the paper: the mean includes the ends of the record"
 UPPER_FRACTION = "energy of the bands above the driven one at the end, over the drive's work"
-MEAN_FRACTION = "mean fraction of the energy in a pass band or gap after the wave's arrival"
+MEAN_FRACTION = "mean fraction of the energy in a pass band or gap after the front's arrival"
 STANDARD = (
     RunMeasure("contact_episodes", "1", "contact episodes", _contact_episodes, group="statistics"),
     RunMeasure(

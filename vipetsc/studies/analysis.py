@@ -101,8 +101,9 @@ def analyse(
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
-    paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
-    estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
+    paper's t_hat in s, when the peak of the linear wave is at the first site (``spectra.arrivals``); by default it is
+    estimated from the group velocity. Entropies are averaged from it on, energies of bands from the front of the run's
+    own wave on. ``options`` are the case's where none
     are given. ``case`` is the run's, where the caller has it, and ``opening`` the entropies of the snapshots with which
     a member of a sweep begins. Measures that the run does not allow (no sites, a single cell) are left out and named in
     the attribute ``left_out``; those that the stored samples and cells do not resolve are also named in the list
@@ -317,10 +318,10 @@ def _entropies(
     """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
     options = record.options
     time = record.time[:: stride * options.snapshot_stride]
-    reason = "the largest host velocity at the first site in the linear run"
+    reason = "the peak of the linear wave at the first site: the largest host velocity there"
     if arrival is None:
-        arrival = _estimated_arrival(record)
-        reason = "half the burst plus the travel time to the first site at the group velocity"
+        arrival = _estimated_peak(record)
+        reason = "half the burst plus the travel time to the first site at the group velocity, which estimates its peak"
     # A record that ends before keeps its last snapshot.
     start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
 
@@ -357,14 +358,13 @@ def _entropies(
     return values
 
 
-def _estimated_arrival(record: VelocityRecord) -> float:
-    """Time in s at which the middle of the burst reaches the first site at the group velocity."""
+def _estimated_peak(record: VelocityRecord) -> float:
+    """Return the time in s at which the middle of the burst reaches the first site at the group velocity."""
     chain = record.model.chain
     distance = 0
     if record.site is not None:
         distance = int(cells_between(record.site - 1, record.model.drive_cell, chain.cells, chain.ends))
-    # Cells that contacts alone join have no waves, and the speed 0: no travel time is known, and none is added.
-    return float(0.5 * record.model.drive.duration + distance / (record.model.speed or np.inf))
+    return spectra.estimated_peak(record.model.drive.duration, distance, record.model.speed)
 
 
 def _partition(record: VelocityRecord, every: int, maps: bool) -> dict[str, Any]:

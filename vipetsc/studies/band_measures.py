@@ -2,8 +2,8 @@
 
 The frequency axis is cut at the edges of the pass bands. E_p(t) in J is the kinetic energy of all cells in the velocity
 that is filtered to part p. The inter-band targeted energy transfer (ibtet) is the mean over time of the sum of E_p over
-the bands above the driven one, over the sum of E_p of all parts (``spectra.ibtet``). The mean begins when the wave
-arrives at the first site.
+the bands above the driven one, over the sum of E_p of all parts (``spectra.ibtet``). The mean begins when the front of
+the wave reaches the first site (``spectra.arrivals``).
 """
 
 from collections.abc import Collection
@@ -31,7 +31,7 @@ BANDS = {
     "bands/kinetic_energy": ("bands/band time cell", "J", "kinetic energy of a part in a cell"),
     "bands/above": ("bands/part", "1", "1 for a pass band above the driven one"),
     "bands/total": ("bands/sample", "J", "kinetic energy"),
-    "bands/share": ("bands/part", "1", "mean fraction of the energy in a part after the wave's arrival"),
+    "bands/share": ("bands/part", "1", "mean fraction of the energy in a part after the front's arrival"),
 }
 
 
@@ -47,7 +47,7 @@ class AveragingSpan(NamedTuple):
 
 
 def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
+    """Return the energies of the pass bands and gaps, and the inter-band transfer from the front's arrival on."""
     parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
     above = parts.above(record.model.drive.frequency)
     stride = record.options.band_stride
@@ -62,6 +62,8 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         mapped=bands.tolist() if "maps" in measures else (),
         sizes=record.sizes,
     )
+    if not above.any():
+        record.left_out.append("ibtet: no pass band lies above the driven one")
     energy = energies.total
     span = _span(record)
     total = energy[:, span.first : span.last].sum(axis=0)
@@ -96,7 +98,7 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
 
 
 def _span(record: VelocityRecord) -> AveragingSpan:
-    """Samples from the wave's arrival at the first site to the record's end, without the ends of the record."""
+    """Return the samples from the front at the first site to the record's end, without the ends of the record."""
     samples = len(record.time)
     if record.site is None:
         after = int(np.searchsorted(record.time, record.model.drive.duration))
@@ -106,7 +108,8 @@ def _span(record: VelocityRecord) -> AveragingSpan:
         # The nearest cell, since the one of the site may not have been kept.
         at = int(np.argmin(np.abs(record.cells - record.site)))
         first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
-        reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
+        cell = record.cells[at]
+        reason = f"the front is at the first site: the kinetic energy of cell {cell} first exceeds 1 % of its largest"
 
     # Near the record's ends, the filters miss the part of the wave beyond them.
     ends = int(np.ceil(ENDS * samples))

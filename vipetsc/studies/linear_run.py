@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 import vipetsc
+from vipetsc import spectra
 from vipetsc.case import Case, case_id
 from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
 from vipetsc.io.read import field_time
@@ -44,8 +45,9 @@ class LinearRun(NamedTuple):
     """A linear wave, the statistics of its run, and the measures of members without contact.
 
     ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
-    drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
-    at the first site. ``statistics`` are the run's; ``measures`` has what ``measured`` gives, by first site (cell).
+    drive's angular frequency. ``arrival`` (cell): time in s of the wave's peak (``spectra.arrivals``), the paper's
+    t_hat when taken at the first site. ``statistics`` are the run's; ``measures`` has what ``measured`` gives, by first
+    site (cell).
     """
 
     envelope: np.ndarray
@@ -72,7 +74,7 @@ class LinearRun(NamedTuple):
         host_velocity = run["velocity"].values[..., Case.of(run).model().chain.cell.host]
         wave = cls(
             envelope=np.sqrt(np.max(envelope_squares(run, blocks), axis=0)),
-            arrival=field_time(run)[np.argmax(np.abs(host_velocity), axis=0)],
+            arrival=field_time(run)[spectra.peak_arrival(host_velocity)],
             statistics=statistics | {"work": float(run["energy/work"][-1])},
             measures={},
         )
@@ -82,7 +84,7 @@ class LinearRun(NamedTuple):
         return wave
 
     def arrival_at(self, site: int) -> float | None:
-        """The paper's t_hat in s, when the wave is largest at the first ``site`` (cell); None for no site."""
+        """The paper's t_hat in s, when the peak is at the first ``site`` (cell); None for no site."""
         return float(self.arrival[site - 1]) if site else None
 
     def reached(self, case: Case) -> np.ndarray:
