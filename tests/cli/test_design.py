@@ -182,7 +182,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
         (folder / evidence).write_text("results")
         done = in_process("design", case, "--out", folder, "--force")
         assert done.returncode == 2
-        assert "of this kind" in done.stderr
+        assert "do not belong" in done.stderr
 
     search = tmp_path / "search"
     search.mkdir()
@@ -191,7 +191,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
     for verb in (("run",), ("nnm", "runs/examples/nnm-cubic.toml")):
         done = in_process(*verb, "--out", search, "--force")
         assert done.returncode == 2
-        assert "of this kind" in done.stderr
+        assert "do not belong" in done.stderr
 
     missing = in_process("design", tmp_path / "nowhere.toml")
     assert missing.returncode == 2

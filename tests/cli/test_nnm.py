@@ -169,7 +169,7 @@ def test_branches_and_runs_never_share_a_folder(in_process, tmp_path):
     for arguments in (("nnm", "runs/examples/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
         ended = in_process(*arguments, "--force")
         assert ended.returncode == 2
-        assert "of this kind" in ended.stderr
+        assert "do not belong" in ended.stderr
 
     assert (run / "run.h5").read_text() == "results"
     assert (branches / "branch-mode-1.h5").read_text() == "results"

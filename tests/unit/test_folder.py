@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -58,7 +58,6 @@ def test_a_new_folder_gets_its_marker(tmp_path, kind):
     folder = tmp_path / "deep" / "new"
     with claim(folder, kind, OLD) as work:
         assert not work.going_on
-        assert work.folder == folder
     # The lock is removed with the claim.
     assert names_in(folder) == {kind.marker}
     assert (folder / kind.marker).read_text() == OLD
@@ -68,7 +67,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
     """``--force`` replaces neither a file nor a folder of another kind or without a marker."""
     (tmp_path / "file").touch()
     assert_refused("is a file", tmp_path / "file", RUN, OLD, force=True)
-    assert_refused("of this kind", tmp_path, RUN, OLD, force=True)
+    assert_refused("do not belong", tmp_path, RUN, OLD, force=True)
 
     for kind, file in SHOWN.items():
         folder = tmp_path / kind.noun
@@ -76,7 +75,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
             (folder / file).touch()
         for other in KINDS:
             if other is not kind:
-                assert_refused("of this kind", folder, other, OLD, force=True)
+                assert_refused("do not belong", folder, other, OLD, force=True)
         assert names_in(folder) == {kind.marker, file}
 
 
@@ -87,7 +86,6 @@ def test_the_same_case_is_resumed_and_nothing_is_touched(run):
     for resume in (False, True):
         with claim(run, RUN, OLD, resume=resume) as work:
             assert work.going_on
-            assert work.folder == run
     assert (run / "case.toml").stat() == before
 
 
@@ -117,96 +115,91 @@ def test_the_caller_decides_which_cases_differ(tmp_path):
     assert (folder / "case.toml").read_text() == NEW
 
 
-def replacing(folder: Path) -> Iterator[Claim]:
-    """Make new results in a folder with old ones and yield the claim before they are published."""
-    with claim(folder, RUN, NEW, force=True) as work:
+def test_force_sets_the_earlier_results_aside_until_the_new_ones_are_complete(run, caplog):
+    """Earlier results wait in NAME.old, which a line names; files of the user stay where they are."""
+    old = run.with_name("run.old")
+    with caplog.at_level(logging.INFO, logger="vipetsc"), claim(run, RUN, NEW, force=True) as work:
         assert not work.going_on
-        assert work.folder == folder / ".new"
-        (work.folder / "run.h5").write_text("new")
-        (work.folder / "figures").mkdir()
-        yield work
-
-
-def test_new_results_replace_the_old_ones_whole(run):
-    for work in replacing(run):
-        assert (run / "case.toml").read_text() == OLD
-        assert (run / "run.h5").read_text() == "old"
+        assert names_in(run) == {"case.toml", "notes.txt", ".lock"}
+        assert names_in(old) == {"case.toml", "run.h5", "summary.json", "analysis.h5", "figures", ".replaced"}
+        assert (old / "case.toml").read_text() == OLD
+        (run / "run.h5").write_text("new")
         work.publish()
-        assert work.folder == run
+    assert str(old) in caplog.text
 
-    # A file of the user's stays.
-    assert names_in(run) == {"case.toml", "run.h5", "figures", "notes.txt"}
+    assert names_in(run) == {"case.toml", "run.h5", "notes.txt"}
     assert (run / "case.toml").read_text() == NEW
-    assert (run / "run.h5").read_text() == "new"
-    assert not names_in(run / "figures")
+    assert not old.exists()
 
 
-class KilledError(Exception):
-    """An exception that stands for a kill: no later step is done."""
+def test_new_results_that_were_begun_are_resumed(run):
+    """Without ``--force`` the new results go on, those of another case are refused with the place of the old ones."""
+    old = run.with_name("run.old")
+    with claim(run, RUN, NEW, force=True):
+        (run / "parts").mkdir()
+    assert_refused(f"the results that it was to replace are in {old}", run, RUN, OLD)
 
-
-def publish_and_be_killed(folder: Path, monkeypatch, renamings: int) -> bool:
-    """Replace a folder's results, be killed after so many ``renamings``, and return whether there were more of them."""
-    remaining = renamings
-
-    def rename(source, target, replace=os.replace):
-        nonlocal remaining
-        remaining -= 1
-        if remaining < 0:
-            raise KilledError
-        replace(source, target)
-
-    with monkeypatch.context() as context:
-        try:
-            for work in replacing(folder):
-                context.setattr(os, "replace", rename)
-                work.publish()
-        except KilledError:
-            return True
-    return False
-
-
-def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch, tmp_path):
-    """The next command finishes a swap of results that was killed before any of its renamings or its removal."""
-    # A swap has fewer than twelve renamings: the last of these commands is not killed.
-    for renamings in range(12):
-        folder = tmp_path / f"killed-{renamings}"
-        shutil.copytree(run, folder)
-        killed = publish_and_be_killed(folder, monkeypatch, renamings)
-
-        # The first renaming decides which results there are.
-        case, content = (NEW, "new") if renamings else (OLD, "old")
-        with claim(folder, RUN, case) as work:
-            assert work.going_on
-        assert (folder / "run.h5").read_text() == content
-        if renamings:
-            assert names_in(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, renamings
-    # If the last command was killed, a swap has more renamings than were tried.
-    assert not killed
-
-
-def test_old_results_stay_while_new_ones_are_made(run):
-    for _ in replacing(run):
-        pass
-    with claim(run, RUN, OLD) as work:
-        assert work.folder == run
-
-
-@pytest.mark.parametrize("resume", [False, True])
-def test_new_results_that_were_begun_are_resumed(run, resume):
-    for _ in replacing(run):
-        pass
-    with claim(run, RUN, NEW, resume=resume) as work:
+    with claim(run, RUN, NEW, resume=True) as work:
         assert work.going_on
-        assert work.folder == run / ".new"
-        assert (work.folder / "run.h5").read_text() == "new"
+        assert (run / "parts").exists()
+        assert (old / "run.h5").read_text() == "old"
+        work.publish()
+    assert not old.exists()
 
 
-def test_new_results_that_were_begun_are_dropped_by_force(run):
-    for _ in replacing(run):
-        pass
-    with claim(run, RUN, NEW, force=True) as work:
-        assert names_in(work.folder) == {"case.toml"}
+def test_force_once_more_drops_what_was_begun_and_keeps_what_was_complete(run):
+    with claim(run, RUN, NEW, force=True):
+        (run / "run.h5").write_text("begun")
+        (run / "figures").mkdir()
+    with claim(run, RUN, NEW, force=True):
+        assert names_in(run) == {"case.toml", "notes.txt", ".lock"}
+    assert (run.with_name("run.old") / "run.h5").read_text() == "old"
+
+
+def test_force_goes_on_with_results_that_it_was_killed_in_moving(run):
+    """A kill leaves a part of the results in NAME.old; the next ``--force`` moves the others there."""
+    old = run.with_name("run.old")
+    old.mkdir()
+    (old / ".replaced").touch()
+    (run / "figures").rename(old / "figures")
+    with claim(run, RUN, NEW, force=True):
+        assert names_in(old) == {"case.toml", "run.h5", "summary.json", "analysis.h5", "figures", ".replaced"}
+
+
+@pytest.mark.parametrize("is_a_file", [False, True])
+def test_a_folder_of_the_user_with_that_name_is_not_touched(run, is_a_file):
+    backup = run.with_name("run.old")
+    if is_a_file:
+        backup.touch()
+    else:
+        shutil.copytree(run, backup)
+    assert_refused("is in the way", run, RUN, NEW, force=True)
+    assert (run / "run.h5").read_text() == "old"
+
+    with claim(run, RUN, OLD) as work:
+        work.publish()
+    assert backup.exists()
+
+
+def test_the_folder_in_which_one_works_is_replaced_too(run, monkeypatch):
+    """The folder may be named "." or by a link: the earlier results are then beside the folder itself."""
+    link = run.with_name("link")
+    link.symlink_to(run)
+    monkeypatch.chdir(run)
+    for name in (".", link):
+        with claim(name, RUN, NEW, force=True) as work:
+            assert (run.with_name("run.old") / "case.toml").exists()
+            work.publish()
+    assert (run / "case.toml").read_text() == NEW
+
+
+def test_folders_in_the_folder_of_a_sweep_are_its_members(tmp_path):
+    folder = tmp_path / "sweep"
+    with claim(folder, SWEEP, OLD):
+        (folder / "index.json").touch()
+        (folder / "000-amplitude").mkdir()
+    with claim(folder, SWEEP, OLD, force=True):
+        assert names_in(folder) == {"case.toml", ".lock"}
 
 
 def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
@@ -269,23 +262,6 @@ def held(folder: Path) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
-class Clock:
-    """A clock in place of the module ``time``, whose sleeps take no time and call ``meanwhile`` with their number."""
-
-    def __init__(self, meanwhile: Callable[[int], None] = lambda turn: None) -> None:
-        self.meanwhile = meanwhile
-        self.seconds = 0.0
-        self.turns = 0
-
-    def monotonic(self) -> float:
-        return self.seconds
-
-    def sleep(self, seconds: float) -> None:
-        self.seconds += seconds
-        self.turns += 1
-        self.meanwhile(self.turns)
-
-
 def written_at(folder: Path) -> dict[Path, int]:
     """Return the time in ns of the last change of each file and folder; a file that comes and goes changes a folder."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -304,10 +280,8 @@ def written_at(folder: Path) -> dict[Path, int]:
         ("paper", "--quick"),
     ],
 )
-def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command, monkeypatch):
+def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command):
     """Every verb refuses a folder that another process has locked and names it; locks of killed processes are free."""
-    monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.1)
-
     with held(run) as process:
         before = written_at(run)
         ended = in_process(*command, "--out", run)
@@ -321,32 +295,6 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
         with claim(run, RUN, OLD):
             pass
         assert not (run / ".lock").exists()
-
-
-@pytest.mark.parametrize("folder_is_new", [False, True])
-def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, monkeypatch, folder_is_new):
-    """A command waits some seconds for a lock and then takes it.
-
-    After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending.
-    """
-    folder = tmp_path / "new" if folder_is_new else run
-    with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
-        # The holder ends while this process waits for the third time.
-        def end_the_holder(turn):
-            if turn == 3:
-                process.stdin.close()
-                process.wait()
-
-        clock = Clock(meanwhile=end_the_holder)
-        monkeypatch.setattr(lock, "time", clock)
-        with locked(MPI.COMM_SELF, folder):
-            assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} ")
-    assert clock.turns == 3
-
-    # The other process created a new folder and removed it; this process created it again and removed it.
-    assert folder.exists() != folder_is_new
-    (message,) = caplog.messages
-    assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in message
 
 
 def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_again(tmp_path, monkeypatch):
@@ -386,19 +334,15 @@ def test_a_folder_that_its_holder_removes_while_it_is_created_is_created_again(t
     assert refused == [folder]
 
 
-def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run, caplog, monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(lock, "time", clock)
-    caplog.set_level(logging.INFO, logger="vipetsc")
-    refused = pytest.raises(FolderError, match="is working in it; wait until it has ended")
-    with held(run), refused, locked(MPI.COMM_SELF, run):
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [("/proc/vipetsc", "No such file"), ("/dev/null/new", "Not a directory"), ("/proc/self/fd/new/er", "No such file")],
+)
+def test_a_folder_that_cannot_be_created_is_refused(path, reason):
+    """The system's reason is given, after a limited number of attempts."""
+    refused = pytest.raises(FolderError, match=f"{path}: cannot be created or locked: {reason}")
+    with refused, locked(MPI.COMM_SELF, Path(path)):
         pass
-    # The command looks often and logs once.
-    (message,) = caplog.messages
-    assert "waiting up to 5 s" in message
-    assert clock.turns >= 20
-    # The command gives up at its first look after the time that it has announced.
-    assert 5 <= clock.seconds < 5 + 2 * lock.LOOK_EVERY
 
 
 @pytest.mark.parametrize("below", [".", "new"])

@@ -145,7 +145,7 @@ def simulate(
 
     with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
-        # A run that a kill has ended between its file and its publication is published now.
+        # A run that a kill has ended after its file was written is complete.
         ended = output.ending()
         if ended:
             result = Result.from_attributes(ended, resumable=False, folder=output.folder)
@@ -153,7 +153,7 @@ def simulate(
             result = simulation.make(output)
         if not result.resumable:
             claim.publish()
-    return replace(result, folder=claim.path)
+    return replace(result, folder=claim.folder)
 
 
 @dataclass(frozen=True)

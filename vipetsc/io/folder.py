@@ -1,13 +1,10 @@
 """Output folders: their claim by one command, and the provenance that every output carries.
 
-Names that begin with a dot are not results: ``.lock`` while a command works in the folder, ``.new`` for results that
-will replace the present ones, ``.*.part`` for a file being written. When new results are complete, they are swapped
-with the old ones in three steps, and after a kill the next command goes on from the step that was reached: ``.new``
-becomes ``.ready``; the old ones are moved to ``.replaced.old``, and ``.ready`` becomes ``.moving``; what is in
-``.moving`` is moved to the folder itself.
+Names that begin with a dot are not results: ``.lock`` while a command works in the folder, ``.*.part`` for a file being
+written. ``--force`` moves earlier results of the folder NAME to NAME.old, beside it. They are removed when the new ones
+are complete, and stay if the command dies before.
 """
 
-import os
 import platform
 import shutil
 import subprocess
@@ -33,10 +30,17 @@ from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
+from vipetsc.process import say
 
 FORMAT_VERSION = 1
 MOST_NAMED = 6  # keys of another case that a message names: more do not help to tell which case it is
-NEW, READY, MOVING, OLD = ".new", ".ready", ".moving", ".replaced.old"
+# The file in NAME.old by which it is known as a folder of earlier results, and not one of the user's.
+REPLACED = ".replaced"
+# What verbs leave beside the results themselves in a folder of any kind, as patterns of ``Path.glob``.
+ACCOMPANYING = (
+    "figures", "curves", "law", "summary.json", "analysis.h5", "run.xdmf", "branch-*.csv", "ensemble.h5", "backbone.h5",
+    "best*.toml", "identified.toml",
+)  # fmt: skip
 
 Difference = Callable[[str], str | None]
 """Takes the text of an earlier case; returns why its results are not the wanted ones, or None if they are."""
@@ -52,8 +56,8 @@ class FolderKind:
         What messages call one result.
     results
         Patterns of the files that show that a folder holds results of this kind.
-    companions
-        Patterns of the files that are replaced together with the results.
+    has_folders
+        Whether every folder in the folder belongs to the results, as those of a sweep's members do.
     marker
         Name of the file with the case of the results.
     free
@@ -62,67 +66,50 @@ class FolderKind:
 
     noun: str
     results: tuple[str, ...]
-    companions: tuple[str, ...] = ("figures", "curves")
+    has_folders: bool = False
     marker: str = "case.toml"
     free: str = ""
 
 
-RUN = FolderKind(
-    noun="run",
-    results=("run.h5", "parts"),
-    companions=("summary.json", "analysis.h5", "run.xdmf", "curves", "figures"),
-    free="analysis",
-)
-BRANCHES = FolderKind(noun="branch", results=("branch-*.h5",), companions=("branch-*.csv", "figures", "curves"))
+RUN = FolderKind(noun="run", results=("run.h5", "parts"), free="analysis")
+BRANCHES = FolderKind(noun="branch", results=("branch-*.h5",))
 SEARCH = FolderKind(noun="search", results=("design.h5",))
 LAW = FolderKind(noun="law", results=("law.h5", "law-runs*.jsonl"))
-SWEEP = FolderKind(
-    noun="sweep",
-    results=("index.json", "members*.jsonl"),
-    # Every folder: members with fields, figures, curves, and others that are there (the manual says so).
-    companions=("*/", "ensemble.h5", "backbone.h5"),
-)
+SWEEP = FolderKind(noun="sweep", results=("index.json", "members*.jsonl"), has_folders=True)
 PREDICTION = FolderKind(noun="prediction", results=("prediction.h5", "prediction-runs*.jsonl"))
-OPTIMUM = FolderKind(
-    noun="optimum", results=("optimum.h5", "optimum-runs*.jsonl"), companions=("figures", "curves", "law", "best*.toml")
-)
-IDENTIFIED = FolderKind(
-    noun="identification",
-    results=("identified.h5", "identified-runs*.jsonl"),
-    companions=("figures", "curves", "identified.toml"),
-)
-PAPER = FolderKind(noun="paper", results=("plan.json",), companions=(), marker="plan.json")
+OPTIMUM = FolderKind(noun="optimum", results=("optimum.h5", "optimum-runs*.jsonl"))
+IDENTIFIED = FolderKind(noun="identification", results=("identified.h5", "identified-runs*.jsonl"))
+PAPER = FolderKind(noun="paper", results=("plan.json",), marker="plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, IDENTIFIED, PAPER)
 
 
+@dataclass(frozen=True)
 class Claim:
-    """The right to work in the output folder ``path``, for results of ``kind``, on all ranks of ``comm``.
+    """The right to work in the output folder ``folder``, on all ranks of ``comm``.
 
-    Results are written to ``folder``, which is ``path/.new`` if they are to replace others that stay until then, and
-    ``path`` itself otherwise. ``going_on`` is whether ``folder`` holds earlier results of the same case.
+    ``going_on`` is whether it holds earlier results of the same case.
     """
 
-    def __init__(self, comm: MPI.Comm, path: Path, kind: FolderKind, folder: Path, going_on: bool) -> None:
-        self.comm = comm
-        self.path = path
-        self.kind = kind
-        self.folder = folder
-        self.going_on = going_on
+    comm: MPI.Comm
+    folder: Path
+    going_on: bool
 
     def publish(self) -> None:
-        """Replace earlier results by the new ones, which are complete; all ranks must call it."""
+        """Remove earlier results that ``--force`` has set aside, since the new ones are complete. Collective."""
 
-        def swap() -> None:
-            # Results that an earlier swap has replaced, if a kill left any: new names must be free there.
-            shutil.rmtree(self.path / OLD, ignore_errors=True)
-            sys.audit("vipetsc.swap", str(self.path))
-            # From this rename on the new results count: the next claim finishes a swap that a kill ends.
-            os.replace(self.folder, self.path / READY)
-            _finish_swap(self.path, self.kind)
+        def remove() -> None:
+            sys.audit("vipetsc.publish", str(self.folder))
+            old = set_aside_in(self.folder)
+            if (old / REPLACED).exists():
+                discard(old)
 
-        if self.folder != self.path:
-            on_root(self.comm, swap)
-            self.folder = self.path
+        on_root(self.comm, remove)
+
+
+def set_aside_in(folder: Path) -> Path:
+    """Return the folder to which ``--force`` moves the earlier results of ``folder``."""
+    folder = folder.resolve()
+    return folder.with_name(f"{folder.name}.old")
 
 
 @contextmanager
@@ -138,16 +125,15 @@ def claimed(
 ) -> Iterator[Claim]:
     """Claim the folder ``path`` for results of ``kind``: start new results, or continue those of the same case.
 
-    All ranks must call it. A missing folder is created; leftovers of a killed command are removed, and a swap that it
-    began is finished.
+    All ranks must call it. A missing folder is created; leftovers of a killed command are removed.
 
     Parameters
     ----------
     text
         The resolved case, which is stored in the folder.
     force
-        Start again: earlier results, perhaps of another case, stay until the new ones are published. The next call
-        without ``force`` continues the new ones.
+        Start again: earlier results, perhaps of another case, are moved to the folder NAME.old until the new ones are
+        published. The next call without ``force`` continues the new ones.
     resume
         Only continue existing results.
     difference
@@ -161,57 +147,73 @@ def claimed(
     """
     path = Path(path)
     with locked(comm, path):
-        folder, going_on = on_root(comm, lambda: _claim(path, kind, text, force, resume, difference))
-        yield Claim(comm, path, kind, folder, going_on)
+        going_on = on_root(comm, lambda: _claim(path, kind, text, force, resume, difference))
+        yield Claim(comm, path, going_on)
 
 
-def _claim(
-    path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None
-) -> tuple[Path, bool]:
-    """The folder to work in, and whether it holds results of the same case; see ``claimed``."""
+def _claim(path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None) -> bool:
+    """Prepare the folder ``path``; returns whether it holds results of the same case. See ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
 
-    # A swap that was cut off is finished first, unless the results are another verb's.
-    foreign = _holds_another_kind(path, kind)
-    if not foreign:
-        _finish_swap(path, kind)
     # An empty folder is no result.
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
-    if foreign or (filled and not (path / kind.marker).exists()):
-        raise FolderError(f"{path}: contains files that are not a {kind.noun}'s of this kind; choose another --out")
+    if _holds_another_kind(path, kind) or (filled and not (path / kind.marker).exists()):
+        raise FolderError(f"{path}: contains files that do not belong to a {kind.noun}; choose another --out")
     if resume and not filled:
         raise FolderError(f"{path}: contains no {kind.noun} to resume; omit --resume")
 
-    aside = path / NEW
     going_on = filled and not force
     if going_on:
-        # Results begun with --force are continued if they are of this case, else those that they were to replace.
-        folder = path
-        if (aside / kind.marker).exists() and not _problem(aside, kind, text, difference):
-            folder = aside
-        problem = _problem(folder, kind, text, difference)
+        problem = _problem(path, kind, text, difference)
+        old = set_aside_in(path)
+        if problem and (old / REPLACED).exists():
+            problem += f"; the results that it was to replace are in {old}"
         if problem:
             raise FolderError(f"{path}: {problem}")
-    else:
-        discard(aside)
-        folder = path
-        if filled:
-            # Until the new results are complete, the old ones stay where they are.
-            folder = aside
-        folder.mkdir(exist_ok=True)
+    elif filled:
+        _set_aside(path, kind)
 
     # Keys that leave continued results valid may have changed: the text is then replaced by the present one.
-    if not going_on or _text_of(folder / kind.marker) != text:
-        write_text(folder / kind.marker, text)
-    remove_temporary_files(folder)
-    return folder, going_on
+    if not going_on or _text_of(path / kind.marker) != text:
+        write_text(path / kind.marker, text)
+    remove_temporary_files(path)
+    for leftover in path.glob(".*.old"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    return going_on
+
+
+def _set_aside(path: Path, kind: FolderKind) -> None:
+    """Move the results in ``path`` to NAME.old, or remove them if results that are complete are there already."""
+    old = set_aside_in(path)
+    if old.exists() and not (old / REPLACED).exists() and (not old.is_dir() or any(old.iterdir())):
+        remedy = "rename or remove it"
+        raise FolderError(f"{old}: is in the way, since --force keeps earlier results there until it is done; {remedy}")
+    sys.audit("vipetsc.aside", str(path))
+    old.mkdir(exist_ok=True)
+    (old / REPLACED).touch()
+
+    patterns = [*kind.results, *ACCOMPANYING]
+    if kind.has_folders:
+        patterns.append("*/")
+    entries = {entry for pattern in patterns for entry in path.glob(pattern) if not entry.name.startswith(".")}
+
+    # The marker is moved last: where it is there, an earlier ``--force`` has moved all results, and did not come to its
+    # end. What it has left is not complete, and goes.
+    is_unfinished = (old / kind.marker).exists()
+    for entry in (*sorted(entries), path / kind.marker):
+        if not is_unfinished:
+            shutil.move(entry, old / entry.name)
+        elif entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+    say(f"earlier results stay in {old} until the new ones are complete")
 
 
 def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
-    """Whether ``path`` holds results of a kind other than ``kind``, published or in a swap."""
+    """Return whether ``path`` holds results of a kind other than ``kind``."""
     patterns = [pattern for other in KINDS if other is not kind for pattern in other.results]
-    matches = [folder.glob(pattern) for folder in (path, path / READY, path / MOVING) for pattern in patterns]
-    return any(any(files) for files in matches)
+    return any(any(path.glob(pattern)) for pattern in patterns)
 
 
 def _results(folder: Path) -> list[Path]:
@@ -269,29 +271,6 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
             yield from _keys(value, f"{path}{key}.")
         else:
             yield path + key, value
-
-
-def _finish_swap(path: Path, kind: FolderKind) -> None:
-    """Finish a swap from the step at which a kill ended it, if one was begun; remove results that were replaced."""
-    ready = path / READY
-    moving = path / MOVING
-    old = path / OLD
-    # Earlier results are moved first, and ``ready`` becomes ``moving`` when all of them are gone. A kill before that
-    # leaves earlier results in ``path``, which are still to be moved; a kill after it leaves new ones, which must stay.
-    if ready.is_dir():
-        old.mkdir(exist_ok=True)
-        for pattern in (kind.marker, *kind.results, *kind.companions):
-            for entry in list(path.glob(pattern)):
-                if not entry.name.startswith("."):
-                    os.replace(entry, old / entry.name)
-        os.replace(ready, moving)
-
-    if moving.is_dir():
-        for entry in moving.iterdir():
-            os.replace(entry, path / entry.name)
-        moving.rmdir()
-    for leftover in path.glob(".*.old"):
-        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:

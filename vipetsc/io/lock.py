@@ -1,12 +1,10 @@
 """Locks on folders, so that one command at a time works in a folder."""
 
 import fcntl
-import logging
 import os
 import platform
 import secrets
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -16,16 +14,11 @@ from mpi4py import MPI
 from vipetsc.io.errors import FolderError
 from vipetsc.parallel import on_root
 
-logger = logging.getLogger(__name__)
-
 LOCK = ".lock"
 # The name of this process in a lock: two processes in containers on one host may have the same number.
 TOKEN = secrets.token_hex(8)
-# Seconds that a command waits for another one in the folder. If a rank is killed, mpirun returns before its other ranks
-# are gone, and the same command may be typed at once. mpirun sends the others SIGTERM and, a second later, SIGKILL; a
-# rank with much memory takes a moment more.
-PATIENCE = 5.0
-LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
+# A command that ends removes a folder that it has created and left empty, perhaps while this one creates it.
+ATTEMPTS = 100
 
 
 @contextmanager
@@ -34,10 +27,10 @@ def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
 
     All ranks must call it. Rank 0 locks the file ``.lock`` in each folder; the system releases the lock when the
     process ends, however it ends. The same process may take the lock again within the block. Folders that were created
-    for the lock and stay empty are removed at the end. Rank 0 waits up to ``PATIENCE`` s for another process that has
-    the lock, and logs a message. Where the file system has no locks, there is none, and no error.
+    for the lock and stay empty are removed at the end. Where the file system has no locks, there is none, and no error.
 
-    Raises FolderError on all ranks if a path is no folder, or if another process, which it names, keeps the lock.
+    Raises FolderError on all ranks if a path is not a folder and cannot become one, or if another process, which it
+    names, has the lock.
     """
     with ExitStack() as stack:
         on_root(comm, lambda: [stack.enter_context(_lock(path)) for path in paths])
@@ -50,7 +43,7 @@ def _lock(path: Path) -> Iterator[None]:
     if path.exists() and not path.is_dir():
         raise FolderError(f"{path}: is a file, not a folder; choose another --out")
     for part in (path, *path.parents):
-        # No folder can be created there, and ``_acquire`` would try for ever.
+        # No folder can be created there, and the system only says that the file exists.
         if part.is_symlink() and not part.exists():
             target = os.readlink(part)
             raise FolderError(f"{path}: {part} is a link to {target}, which is missing; choose another --out")
@@ -103,33 +96,26 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
     """Lock the folder ``path``, which is created where it is missing; the folders ``created`` are added to the list.
 
     Returns the descriptor of the file that is locked, or None if this process has the lock already or the file system
-    has no locks. Raises FolderError if another process still has the lock after ``PATIENCE``.
+    has no locks. Raises FolderError if another process has the lock, or the folder cannot be created.
     """
     sys.audit("vipetsc.lock", str(path))
-    deadline = None
-    while True:
-        # Inside the loop, because a holder that ends removes the folder if it created it and left nothing there.
+    reason = ""
+    for _ in range(ATTEMPTS):
         created += [folder for folder in (path, *path.parents) if not folder.exists()]
         try:
             path.mkdir(parents=True, exist_ok=True)
             descriptor, holder = _try_to_lock(path)
-        except (FileNotFoundError, FileExistsError):
-            # A holder that ended just now has removed the folder again: before it could be locked, or after it was
-            # found to exist and before it was looked at.
-            if path.exists() and not path.is_dir():
-                raise
+        except (FileNotFoundError, FileExistsError) as error:
+            reason = str(error.strerror)
             continue
+        except OSError as error:
+            reason = str(error.strerror)
+            break
         if holder is None:
             return descriptor
-
-        now = time.monotonic()
-        if deadline is None:
-            deadline = now + PATIENCE
-            logger.info("vipetsc: %s: %s is working in it; waiting up to %g s for it to end", path, holder, PATIENCE)
-        elif now >= deadline:
-            remedy = "wait until it has ended, or choose another --out"
-            raise FolderError(f"{path}: {holder} is working in it; {remedy}")
-        time.sleep(LOOK_EVERY)
+        remedy = "wait until it has ended, or choose another --out"
+        raise FolderError(f"{path}: {holder} is working in it; {remedy}")
+    raise FolderError(f"{path}: cannot be created or locked: {reason}; choose another --out")
 
 
 def _try_to_lock(path: Path) -> tuple[int | None, str | None]:

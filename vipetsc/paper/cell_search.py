@@ -73,7 +73,7 @@ def search_design(
         claim.publish()
 
         def summary() -> str:
-            with open_netcdf(claim.path / "design.h5", "search", BEST) as data:
+            with open_netcdf(claim.folder / "design.h5", "search", BEST) as data:
                 return _table(data)
 
         return on_root(comm, summary)

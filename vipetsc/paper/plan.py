@@ -22,7 +22,7 @@ import numpy as np
 import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.case.predict import PredictCase
-from vipetsc.io.folder import NEW, FolderError, provenance
+from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.modes.branches.follow import claim_branches
@@ -164,9 +164,6 @@ class PaperStep:
         if not (folder / "case.toml").exists():
             return MISSING
         if not self._is_case_of(folder):
-            if self._is_case_of(folder / NEW):
-                # Results of this case were begun, aside, and will replace those of the other case.
-                return BEGUN
             return STALE
         if outdated(folder):
             return STALE

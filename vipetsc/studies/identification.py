@@ -64,7 +64,7 @@ def run_identification(
         claim.publish()
 
         def summary() -> str:
-            with open_netcdf(claim.path / "identified.h5", "identification", ("value", "summary")) as data:
+            with open_netcdf(claim.folder / "identified.h5", "identification", ("value", "summary")) as data:
                 return str(data.attrs["summary"])
 
         return on_root(comm, summary)

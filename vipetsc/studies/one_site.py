@@ -90,7 +90,7 @@ def make_law(
                 on_root(comm, lambda: write_netcdf(path, runs.dataset(errors)))
 
         claim.publish()
-        return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))
+        return on_root(comm, lambda: ScatteringLaw.read(claim.folder / "law.h5"))
 
 
 class ScatteringRuns:

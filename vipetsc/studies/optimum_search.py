@@ -58,7 +58,7 @@ def run_search(
         claim.publish()
 
         def summary() -> str:
-            with open_netcdf(claim.path / "optimum.h5", "search for an optimum", ("value", "summary")) as data:
+            with open_netcdf(claim.folder / "optimum.h5", "search for an optimum", ("value", "summary")) as data:
                 return str(data.attrs["summary"])
 
         return on_root(comm, summary)

@@ -82,7 +82,7 @@ def predict(
                 on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
 
         claim.publish()
-        return on_root(comm, lambda: read_prediction(claim.path))
+        return on_root(comm, lambda: read_prediction(claim.folder))
 
 
 def read_prediction(folder: str | Path) -> xr.Dataset:

@@ -122,7 +122,7 @@ def run_sweep(
         result = _make_all(plan, claim.folder, comm, stop or StopRequest(), progress)
         if not result.resumable:
             claim.publish()
-    return replace(result, folder=claim.path)
+    return replace(result, folder=claim.folder)
 
 
 def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: bool) -> SweepResult:
