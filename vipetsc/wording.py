@@ -14,10 +14,12 @@ def shortened(items: Sequence[object]) -> str:
 
 
 def counted(number: int | str, noun: str) -> str:
-    """A ``number``, or its text, with a ``noun`` whose plural ends in s: "1 site", "5 sites"."""
+    """Return a ``number``, or its text, with a ``noun`` whose plural ends in s: "1 site", "5 sites", "2 masses"."""
     text = str(number)
     if text == "1":
         return f"{text} {noun}"
+    if noun.endswith("s"):
+        noun += "e"
     return f"{text} {noun}s"
 
 

@@ -162,7 +162,7 @@ def test_a_lattice_without_springs_begins_with_no_mode_and_no_packet(motion):
 def test_stops_are_described_by_what_they_are():
     """A stop is described by its clearances, as touching, or by its precompression, with the side."""
     gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
-    expected = ["touches on side -", "precompressed by 0.002 mm on side +", "+0.2 mm -0.3 mm"]
+    expected = ["touches on side -", "precompressed by 0.002 mm on side +", "0.2 mm on side +, 0.3 mm on side -"]
     assert describe_stops(gaps, (0.0, 0.0, 2e-4)) == expected
     assert describe_stops((), (2e-4,)) == ["0.2 mm"]
 

@@ -13,6 +13,7 @@ from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.lattice.damped import damped_bloch
 from vipetsc.lattice.modes import linear_modes
 
@@ -45,6 +46,41 @@ def test_a_run_is_that_of_an_oscillator(engine):
     u = run["displacement"].values[:, 0, 0]
     assert np.abs(u).max() > 0.45
     np.testing.assert_allclose(u, solved.y[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("ends", ["free", "fixed", "periodic"])
+@pytest.mark.parametrize(
+    "cell",
+    [
+        {"masses": [1.0]},
+        # The stop is that of the first mass, which takes a second one along by a spring.
+        {"masses": [1.0, 0.1], "springs": [{"start": 1, "end": 2, "stiffness": 10.0}]},
+        # A second mass that nothing holds stays where it is.
+        {"masses": [1.0, 0.1]},
+    ],
+)
+def test_nothing_has_to_connect_a_single_cell(cell, ends):
+    """A mass flies at 1 m/s onto an elastic stop 1 m away and comes back; alone, at the speed at which it came."""
+    table = {
+        "lattice": {"cells": 1, "ends": ends, "cell": cell},
+        "contacts": {"stiffness": 1e6, "sites": [1], "pair": [0, 1], "side": "minus", "clearance": 1.0},
+        "initial": {"kind": "velocity", "cell": 1, "velocity": -1.0},
+        "time": {"end": 2.0, "sample_interval": 0.01},
+    }
+    case = Case.from_table(table)
+    run = run_of(case)
+    stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"]
+    assert stored.values == pytest.approx(0.5, rel=1e-9)
+    if "springs" not in cell:
+        # The contact of 1 kg on 1e6 N/m^1.5 lasts 3.2181 (m^2/(k^2 v))^(1/5) = 0.01281 s.
+        assert run["displacement"].values[-1, 0, 0] == pytest.approx(-0.012811, abs=1e-5)
+        assert run["velocity"].values[-1, 0, 0] == pytest.approx(1.0, rel=1e-9)
+    rows = dict(lattice_rows(case))
+    assert rows["clearance"] == "1000 mm on side -"
+    assert rows["lattice"].startswith("1 cell, ")
+    without = Case.from_table(table | {"contacts": {"sites": []}})
+    assert dict(lattice_rows(without))["contact"] == "none"
+    assert not [text for text in case.warnings() if "wavelength" in text]
 
 
 def test_its_only_mode():

@@ -232,14 +232,14 @@ def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
     texts = []
     for plus, minus in gaps:
         stops = [_describe_stop(side, gap) for side, gap in (("+", plus), ("-", minus)) if gap < np.inf]
-        texts.append(" ".join(stops))
+        texts.append(", ".join(stops))
     return texts
 
 
 def _describe_stop(side: str, gap: float) -> str:
     """Description of the stop on one ``side``: its clearance in mm, touching, or precompressed."""
     if gap > 0:
-        return f"{side}{1e3 * gap:.4g} mm"
+        return f"{1e3 * gap:.4g} mm on side {side}"
     if gap == 0:
         return f"touches on side {side}"
     return f"precompressed by {-1e3 * gap:.4g} mm on side {side}"
@@ -294,7 +294,8 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 def check_joined(lattice: LatticeTable, contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """The problem of cells of one's own, valid or not, that neither springs nor contacts, ``count`` sites, join."""
-    if lattice.cell is None or not (lattice.cell.springs or count):
+    # A single cell has no other one to be joined to.
+    if lattice.cell is None or lattice.cells == 1 or not (lattice.cell.springs or count):
         return
     by_springs = any(spring.next_cell for spring in lattice.cell.springs)
     by_contacts = any(values_of_sites(contacts, "next_cell", count))

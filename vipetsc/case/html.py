@@ -9,7 +9,7 @@ from vipetsc.case.contacts import describe_stops
 from vipetsc.case.model import Model
 from vipetsc.lattice import UnitCell, wave_bands
 from vipetsc.lattice.chain import Pair
-from vipetsc.wording import MOST_SHOWN, shortened
+from vipetsc.wording import MOST_SHOWN, counted, shortened
 
 # Fraction of a band's upper edge that counts as zero. A frequency is the root of an eigenvalue, which has a rounding
 # error of 1e-16 of the largest one, so that an edge at zero is computed as 1e-8 of the largest frequency.
@@ -45,11 +45,8 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
     """The case ``name`` as HTML: a table of its lattice, bands, contacts and ``drives`` (in words), its cell drawn."""
     chain = model.chain
     cell = chain.cell
-    masses = "1 mass"
-    if cell.dofs > 1:
-        masses = f"{cell.dofs} masses"
     rows = [
-        ("lattice", f"{chain.cells} cells of {masses}, {ends} ends"),
+        ("lattice", f"{counted(chain.cells, 'cell')} of {counted(cell.dofs, 'mass')}, {ends} ends"),
         ("pass bands in rad/s", shortened(_band_edges(cell))),
     ]
 

@@ -144,7 +144,8 @@ def length_warnings(model: Model) -> Iterator[str]:
     drive = model.drive
     cells = model.chain.cells
     waves = waves_at(model.chain.cell, drive.frequency)
-    if model.first_drive_acts and waves:
+    # A rig of one cell is not about waves.
+    if model.first_drive_acts and waves and cells > 1:
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
         wavelength = 2 * pi / max(kappa, 1e-300)
         if wavelength * WAVELENGTHS > cells:

@@ -8,7 +8,7 @@ from vipetsc.case.contacts import describe_stops
 from vipetsc.case.warnings import losses
 from vipetsc.cli.tables import first_few
 from vipetsc.lattice import gaps, wave_bands
-from vipetsc.wording import MOST_SHOWN
+from vipetsc.wording import MOST_SHOWN, counted
 
 
 def lattice_rows(case: Case) -> list[tuple[str, str]]:
@@ -17,10 +17,10 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     chain = model.chain
     cell = chain.cell
 
-    lattice = f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {describe_ends(case)}"
+    lattice = f"{counted(chain.cells, 'cell')}, {counted(chain.cells * cell.dofs, 'mass')}, {describe_ends(case)}"
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
-    band_list = "none: only contacts join the cells"
+    band_list = "none: no spring runs from cell to cell"
     gap_list = ""
     bands = wave_bands(cell)
     if bands:
@@ -28,9 +28,10 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         gap_list = "none"
         if between := gaps(bands):
             gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in between) + " rad/s"
-    # Each of a million sites may have its own law: a list shows only the first ones.
-    laws = model.used_laws[:MOST_SHOWN]
-    clearances = first_few(describe_stops(model.gaps, chain.clearances))
+    # Each of a million sites may have its own law: a list shows only the first ones. Without sites a law has no
+    # stiffness.
+    laws = model.used_laws[: min(len(chain.sites), MOST_SHOWN)]
+    clearances = describe_stops(model.gaps, chain.clearances)
 
     return [
         ("case", case.name),
@@ -38,9 +39,9 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         ("pass bands", band_list),
         ("gaps", gap_list),
         ("loss", describe_losses(case)),
-        ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
+        ("contact", "; ".join(dict.fromkeys(map(str, laws))) or "none"),
         ("sites", first_few([cell + 1 for cell in chain.sites])),
-        ("clearance", clearances),
+        ("clearance", first_few(clearances)),
     ]
 
 
