@@ -304,7 +304,7 @@ def test_a_rank_without_cells_writes_no_power_of_dashpots(ends):
     # Empty views, whose surroundings show what is read and written beyond them.
     motion = np.ones(3)
     powers = np.zeros(3)
-    damping_powers(motion[1:1], record, powers[1:1])
+    damping_powers(motion[1:1], record, 0, powers[1:1])
     assert powers.tolist() == [0.0, 0.0, 0.0]
 
 

@@ -10,7 +10,6 @@ from tests.exact_lattices import exponential
 from tests.unit.propagator_parts import chain_parts
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.vectors import LANES
@@ -91,20 +90,3 @@ def test_the_bound_keeps_below_every_tolerance(interval):
     chain = small_case().model().chain
     for tolerance in np.geomspace(1e-14, 1e-3, 34):
         assert StepSeries(chain, interval, tolerance).truncation < tolerance
-
-
-@pytest.mark.parametrize("ends", ["fixed", "free"])
-def test_rows_of_dashpots_do_not_depend_on_the_cell_that_is_seen_first(ends):
-    """Ranks see other cells first: a cell just as far from an end as a row reaches, or one in the middle."""
-    damping = {"mass": 10.0, "stiffness": 5e-6}
-    chain = small_case(lattice={"cells": 60, "damping": damping, "ends": ends}).model().chain
-    series = StepSeries(chain, 2e-4, 1e-10)
-
-    rows = []
-    for first in (series.reach, 30, chain.cells - series.reach - 2):
-        dashpots = DashpotRows(series)
-        dashpots.kinds([first])
-        rows.append(dashpots.rows(dashpots.interior))
-
-    np.testing.assert_array_equal(rows[0], rows[1])
-    np.testing.assert_array_equal(rows[2], rows[1])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.dynamics import recorded_sizes, simulate
@@ -26,6 +28,13 @@ def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Blo
         dissipated_by_damping=none,
     )
     return Block(first=0, times=np.arange(len(work)) * 1.0, energies=energies, samples=None, state=None)
+
+
+def damped_block(lost: list[float], powers: list[float], first: int = 0) -> Block:
+    """Samples of a lattice at rest whose dashpots have ``lost`` so many J, at ``powers`` in J per sample."""
+    begun_block = block(work=[10.0] * len(lost), total=[0.0] * len(lost))
+    energies = replace(begun_block.energies, dissipated_by_damping=np.array(lost), damping=np.array(powers))
+    return replace(begun_block, first=first, energies=replace(energies, kinetic=10.0 - np.array(lost)))
 
 
 def begun(kind: type[Observer]) -> Observer:
@@ -220,3 +229,32 @@ def test_a_run_killed_at_its_end_keeps_its_statistics(folder, monkeypatch):
     for name in ("samples", "end", "work", "dissipated", "ledger_error", "episodes", "deepest_indentation"):
         assert resumed.statistics[name] == straight.statistics[name], name
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "killed" / "run.h5"))
+
+
+def test_a_loss_of_dashpots_that_falls_is_an_error_of_the_balance():
+    """The largest fall below any earlier value counts, also across blocks and a checkpoint."""
+    ledger = begun(Ledger)
+    ledger.observe(damped_block([0.0, 3.0, 2.5], [0.0, 1.0, 1.0]))
+    assert ledger.statistics()["ledger_error"] == pytest.approx(0.05)
+
+    resumed = begun(Ledger)
+    resumed.restore(ledger.checkpoint())
+    resumed.observe(damped_block([2.0, 4.0], [1.0, 1.0], first=3))
+    assert resumed.statistics()["ledger_error"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("cuts", [[7], [1, 6], [2, 5], [3, 1, 3], [1] * 7])
+def test_the_quadrature_of_dashpots_is_the_trapezoidal_rule_over_all_blocks(cuts):
+    """Its error is the largest distance from the rule over every other sample."""
+    powers = np.array([1.0, 4.0, 2.0, 0.0, 3.0, 5.0, 1.0])
+    ledger = begun(Ledger)
+    first = 0
+    for count in cuts:
+        part = powers[first : first + count]
+        ledger.observe(damped_block(np.zeros(count), part, first))
+        first += count
+
+    found = ledger.statistics()
+    assert found["damping_quadrature"] == trapezoid(powers)
+    distances = [trapezoid(powers[: n + 1]) - 2 * trapezoid(powers[: n + 1 : 2]) for n in (0, 2, 4, 6)]
+    assert found["damping_quadrature_error"] == np.abs(distances).max() > 0

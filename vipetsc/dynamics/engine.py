@@ -29,10 +29,13 @@ class FillResult(NamedTuple):
 class Engine(ABC):
     """Advances a lattice from sample to sample; a subclass gives its ``name`` in case files.
 
+    ``integrates_damping`` says whether it integrates what dashpots dissipate. Where it does not, that is what the
+    energies of a sample leave (``energies``).
     ``state`` (as ``Layout`` orders it, ghosts up to date) and ``time`` in s are those of the last time reached.
     """
 
     name: ClassVar[str]
+    integrates_damping: ClassVar[bool]
     state: PETSc.Vec
     time: float
 

@@ -60,7 +60,7 @@ class LatticeRecord(NamedTuple):
     ``site_dofs`` (site,) of dtype ``SITE_DOFS`` and ``contacts`` (site,) of dtype ``SITE`` are those of the same sites.
     ``spring_laws`` (law,) of dtype ``SPRING_LAW`` are those that ``nonlinear`` refers to.
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
-    ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
+    ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where there are dashpots
     ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
     """
 
@@ -128,7 +128,7 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
     if right is not None:
         right_ghost = ghosted
         ghosted += layout.ghost_rows
-    if layout.damped:
+    if layout.integrates_damping:
         damping = 2 * layout.dofs * layout.owned
 
     return Shape(

@@ -2,8 +2,8 @@
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
 mass 2, ...), velocities likewise, then its ledger components (what the dashpots of each owned cell have dissipated, if
-there are any; work of each drive whose cell it owns; dissipated energy of each owned site). The ghosts follow them:
-displacements of the neighbouring cell on the left, with velocities where there are dashpots to integrate or contacts
+an engine integrates that; work of each drive whose cell it owns; dissipated energy of each owned site). The ghosts
+follow them: displacements of the neighbouring cell on the left, with velocities where there are dashpots or contacts
 with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
 """
 
@@ -30,19 +30,20 @@ class Layout:
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
     numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``rows`` components, and
-    ``ghost_rows`` as a ghost. With ``dashpots`` a damped lattice has one more component a cell, for what they
-    dissipate, and velocities in the ghosts. The propagator needs that for the dissipation alone; the right-hand side of
-    ``ts`` has no dashpots without it.
+    ``ghost_rows`` as a ghost. With ``dashpots`` a damped lattice is ``damped``: its ghosts have velocities, and
+    ``create_record`` has its dashpots. Where ``integrates_damping`` is true, too, each cell of it has one more
+    component, the energy that its dashpots have dissipated.
     """
 
-    def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False) -> None:
+    def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False, integrates_damping: bool = True) -> None:
         chain = model.chain
         self.comm = comm
         self.cells = chain.cells
         self.dofs = chain.cell.dofs
         self.periodic = chain.ends == "periodic"
         self.damped = dashpots and chain.is_damped
-        self.rows = 2 * self.dofs + self.damped
+        self.integrates_damping = self.damped and integrates_damping
+        self.rows = 2 * self.dofs + self.integrates_damping
         self.ghost_rows = self.dofs * (1 + (self.damped or chain.is_joined))
 
         cuts = cell_cuts(self.cells, comm.size)
@@ -144,7 +145,7 @@ class Layout:
             if first < stop:
                 part = rows[:, first - self.start : stop - self.start]
                 part[: 2 * self.dofs] = cells[first - at : stop - at].T
-                if self.damped:
+                if self.integrates_damping:
                     part[2 * self.dofs] = checkpoint["dashpots"][first - at : stop - at]
             at += len(cells)
 

@@ -59,7 +59,7 @@ def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
     chain = model.chain
     cell = model.chain.cell
     owned = -(-chain.cells // ranks)
-    per_cell = 2 * cell.dofs + chain.is_damped
+    per_cell = 2 * cell.dofs + (chain.is_damped and engine == "ts")
     states = PROPAGATOR_STATES
     if engine == "ts":
         states = 2 * STAGES[model.method] + FURTHER_STATES
@@ -71,8 +71,8 @@ def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
     if chain.variation:
         differing = sum(array.nbytes for _, array in chain.variation.items())
     if engine == "propagator" and differing and (series := step_series(model)):
-        # Rows of the step, and with dashpots of the losses in it.
-        numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1) * (1 + chain.is_damped)
+        # Rows of the step.
+        numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1)
         differing += 8 * numbers * series.own_rows()[1] // ranks
     return (states * per_cell + 2 * tables) * 8 * owned + differing
 

@@ -138,12 +138,21 @@ class Guard(Observer):
 
 
 class Ledger(Observer):
-    """Keeps the largest residual in J of the energy balance."""
+    """Keeps the largest residual in J of the energy balance.
+
+    Where the loss of dashpots is what the balance leaves, the residual cannot show errors of the motion. That loss is
+    then checked in two ways. It must never fall: by how much it does counts as a residual. And it is compared with
+    ``quadrature``, the trapezoidal rule over the dashpots' power at the samples; how far this is from ``coarse``, the
+    rule over every other sample, says what the comparison is worth. All are in J.
+    """
 
     name = "ledger"
-    saved = ("worst", "most_work", "work", "dissipated", "dissipated_by_damping")
-    worst = most_work = 0.0
+    saved = ("worst", "most_work", "work", "dissipated", "dissipated_by_damping", "most_damped", "quadrature")
+    saved = (*saved, "quadrature_error", "coarse", "last_power", "last_even_power")
+    worst = most_work = most_damped = 0.0
     work = dissipated = dissipated_by_damping = float("nan")
+    quadrature = quadrature_error = coarse = 0.0
+    last_power = last_even_power = float("nan")
 
     def observe(self, block: Block) -> None:
         energies = block.energies
@@ -152,9 +161,40 @@ class Ledger(Observer):
         self.dissipated_by_damping = float(energies.dissipated_by_damping[-1])
         self.worst = max(self.worst, float(np.abs(energies.residual).max()))
         self.most_work = max(self.most_work, float(np.abs(energies.work).max()))
+        if energies.damping is not None:
+            self._check_damping(energies.dissipated_by_damping, energies.damping, block.first)
+
+    def _check_damping(self, lost: np.ndarray, powers: np.ndarray, first: int) -> None:
+        """Compare what dashpots have ``lost`` in J with the sums of their ``powers`` (sample,) in J per sample."""
+        most_lost = np.maximum.accumulate(np.append(self.most_damped, lost))
+        self.worst = max(self.worst, float((most_lost[1:] - lost).max()))
+        self.most_damped = float(most_lost[-1])
+
+        # A run's first sample has none before it: what the sums below add for it is taken off beforehand.
+        if first == 0:
+            self.last_power = float(powers[0])
+            self.last_even_power = self.last_power
+            self.quadrature = -self.last_power
+            self.coarse = -2 * self.last_power
+        before = np.append(self.last_power, powers[:-1])
+        quadrature = self.quadrature + np.cumsum((before + powers) / 2)
+        self.quadrature = float(quadrature[-1])
+        self.last_power = float(powers[-1])
+
+        even = slice(first % 2, None, 2)
+        if powers[even].size:
+            before = np.append(self.last_even_power, powers[even][:-1])
+            coarse = self.coarse + np.cumsum(before + powers[even])
+            self.quadrature_error = max(self.quadrature_error, float(np.abs(quadrature[even] - coarse).max()))
+            self.coarse = float(coarse[-1])
+            self.last_even_power = float(powers[even][-1])
 
     def statistics(self) -> dict[str, Any]:
-        """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
+        """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end.
+
+        Where the loss of dashpots is what the balance leaves, ``damping_quadrature`` in J is that of the trapezoidal
+        rule, and ``damping_quadrature_error`` its estimated error.
+        """
         numbers = {"ledger_error": 0.0}
         if self.most_work:
             numbers["ledger_error"] = self.worst / self.most_work
@@ -164,6 +204,8 @@ class Ledger(Observer):
         numbers |= {"work": self.work, "dissipated": self.dissipated}
         if self.setup.model.chain.is_damped:
             numbers["dissipated_by_damping"] = self.dissipated_by_damping
+        if not np.isnan(self.last_power):
+            numbers |= {"damping_quadrature": self.quadrature, "damping_quadrature_error": self.quadrature_error}
         return numbers
 
     def warnings(self) -> list[str]:

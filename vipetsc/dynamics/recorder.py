@@ -6,7 +6,6 @@ unless they write one file together.
 """
 
 import sys
-from dataclasses import fields
 from typing import Any
 
 from mpi4py import MPI
@@ -16,15 +15,16 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.case.points import PointTable
 from vipetsc.contact.tracker import EPISODE
-from vipetsc.dynamics.energies import ENERGY_SUMS, Energies
+from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.recorded_sizes import chunk_samples, possible_output, recorded_cells, written_together
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, Recording, ranges
+from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording, ranges
 
-ENERGIES = {field.name: f"energy/{field.name}" for field in fields(Energies)}
+# Of each of the energies in a file, by its name in ``Energies``.
+ENERGIES = {name.removeprefix("energy/"): name for name in (*SAMPLED, DAMPED) if name.startswith("energy/")}
 
 
 class Recorder(Observer):

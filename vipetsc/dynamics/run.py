@@ -178,8 +178,9 @@ class Simulation:
         begin = Begin(wall=time.perf_counter(), cpu=time.process_time(), compiled=compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
-            layout = Layout(self.model, output.comm, dashpots=True)
-            engine = ENGINES[self.engine.name](self.model, layout, self.stop)
+            kind = ENGINES[self.engine.name]
+            layout = Layout(self.model, output.comm, dashpots=True, integrates_damping=kind.integrates_damping)
+            engine = kind(self.model, layout, self.stop)
         with released(engine, output.comm):
             setup = Setup(
                 case=self.case,

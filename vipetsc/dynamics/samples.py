@@ -10,7 +10,7 @@ import numpy as np
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
 from vipetsc.dynamics.drives import wall_energy
-from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, add_loss, measure
+from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, add_loss, add_powers, measure
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
 
@@ -59,6 +59,9 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
     drives = samples.lattice.drives
     number = samples.number + k
     measure(y, samples.lattice, samples.unit, samples.sums[k])
+    # Where no engine integrates what dashpots dissipate, the sample has their power instead.
+    if shape.damping < 0 and samples.lattice.damping.size > 0:
+        add_powers(y, samples.lattice, samples.interval, samples.unit, samples.sums[k])
 
     for i in range(drives.rows.size):
         drive = drives.rows[i]

@@ -29,7 +29,7 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall.
 
     A ``mass`` of dofs + j stands for the velocity in m/s of mass j, which lies there in ``y`` (component,). Ghosts have
-    velocities only where dashpots are integrated or contacts join cells (``Layout.ghost_rows``).
+    velocities only where there are dashpots or contacts join cells (``Layout.ghost_rows``).
     """
     shape = lattice.shape
     if 0 <= cell < shape.cells:
@@ -80,7 +80,7 @@ def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass:
     shape = lattice.shape
     n = shape.cells
     d = shape.dofs
-    is_damped = shape.damping >= 0
+    is_damped = lattice.damping.size > 0
 
     # Sum of k (u_other - u) + c (v_other - v) over the springs and the dashpots parallel to them.
     force = 0.0
@@ -141,7 +141,7 @@ def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, firs
     """Accelerations of a mass in the cells from ``first`` on, whose neighbours are all owned."""
     n = lattice.shape.cells
     count = out.size
-    is_damped = lattice.shape.damping >= 0
+    is_damped = lattice.damping.size > 0
     # Components of the state: the mass's displacements in these cells, and its velocities, all displacements later.
     begin = mass * n + first
     velocities = lattice.shape.dofs * n
@@ -272,8 +272,8 @@ def add_squares(
 
 
 @kernel
-def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) -> None:
-    """Put the power in W that the dashpots of each owned cell dissipate into ``powers`` (cell,).
+def damping_powers(y: np.ndarray, lattice: LatticeRecord, first: int, powers: np.ndarray) -> None:
+    """Put the power in W that the dashpots of the owned cells from ``first`` on dissipate into ``powers`` (cell,).
 
     ``y`` (component,) is the rank's part of the state, with ghosts.
     """
@@ -285,9 +285,9 @@ def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) ->
 
     # c (v_other - v)^2 of the dashpots parallel to springs, then c v^2 of those to the ground.
     powers[:] = 0.0
-    add_squares(y, lattice, 0, d, lattice.damping, powers)
+    add_squares(y, lattice, first, d, lattice.damping, powers)
     for mass in range(d):
-        rate = y[(d + mass) * n :][:n]
-        ground = lattice.grounding[mass * n :][:n]
-        for i in range(n):
+        rate = y[(d + mass) * n + first :][: powers.size]
+        ground = lattice.grounding[mass * n + first :][: powers.size]
+        for i in range(powers.size):
             powers[i] += ground[i] * rate[i] * rate[i]

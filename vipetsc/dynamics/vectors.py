@@ -58,17 +58,6 @@ def _add_product(typing_context: Any, total: Any, factor: Any, x: Any, i: Any) -
     return total(total, types.float64, x, types.intp), generate
 
 
-def _add_lanes(typing_context: Any, total: Any, vector: Any, x: Any, i: Any) -> Any:
-    """The vector ``total`` + ``vector`` times x[i : i + LANES], lane by lane, which must lie within ``x``."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        before, factors, array, begin = arguments
-        cells = builder.load(_address(context, builder, x, array, begin), align=8)
-        return builder.fadd(before, builder.fmul(factors, cells))
-
-    return total(total, vector, x, types.intp), generate
-
-
 def _store(typing_context: Any, vector: Any, out: Any, i: Any) -> Any:
     """out[i : i + LANES] = ``vector``; they must lie within ``out``."""
 
@@ -102,6 +91,5 @@ def _prefetch(typing_context: Any, x: Any, i: Any) -> Any:
 zeros: Any = intrinsic(_zeros)
 add: Any = intrinsic(_add)
 add_product: Any = intrinsic(_add_product)
-add_lanes: Any = intrinsic(_add_lanes)
 store: Any = intrinsic(_store)
 prefetch: Any = intrinsic(_prefetch)

@@ -222,7 +222,12 @@ def run_table(result: "Result", faster: str = "") -> str:
         energy = f"work {work:.6g} J, dissipated {100 * numbers['dissipated'] / work:.4g} %"
         if damped := numbers.get("dissipated_by_damping", 0.0):
             energy += f" in contacts and {100 * damped / work:.4g} % in dashpots"
-        energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
+        if (quadrature := numbers.get("damping_quadrature")) is None:
+            energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
+        else:
+            tolerance = numbers["damping_quadrature_error"] / work
+            energy += f" (by the balance; the samples' power gives {100 * quadrature / work:.4g} %"
+            energy += f" with an error of about {100 * tolerance:.2g} %)"
 
     restitution = ""
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]

@@ -75,19 +75,9 @@ lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude tha
 
 **9. Variations** of an orbit move by P and by one small matrix a step in contact: ``tangent``, ``tangent_kernels``.
 
-**10. What dashpots dissipate** (``dashpots``, ``free_losses``, ``loss_tables``, ``losses``) is the integral of v^T C v
-over the step, computed from the motion and not from the other energies, so that the balance of these is a check. With
-v = V(s) y + sum_l integral of r_l F_l dt, V the rows of 7 and r_l the velocities after an impulse on DoF l, it has
-three parts. That of free motion is y^T S y, with S = H integral of V^T C V ds by Gauss's rule: S is symmetric and
-banded, and y^T S y a sum over cells. Let the fractions a and b >= a of the step remain after two impulses. The force at
-the later one then adds
-
-    2 F_l(a) [ f_l(a) y + sum_m integral of Psi_lm(a, b) F_m dt ],
-    f_l(a) = H integral_0^a r_l(x)^T C V(x + 1 - a) dx,   Psi_lm(a, b) = H integral_0^a r_l(x)^T C r_m(x + b - a) dx,
-
-the sum over forces up to then. All are smooth in a and b: their coefficients in Legendre's polynomials are tabulated,
-and a force enters by its moments with these polynomials, those of the substeps before and, up to each node, that of the
-substep itself.
+**10. What dashpots dissipate** is not computed from the motion: ``energies`` takes it from the balance, as the work
+less what contacts have dissipated and less the energy of the lattice. ``observers.Ledger`` checks that it never falls,
+and compares it with a quadrature over the samples.
 
 **11. Nonlinear springs** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
 elongation z, of which k belongs to K. The rest is a force on the DoF z = c u, with c as for the w of a site,
@@ -104,9 +94,8 @@ of them count, and how far. ``groups``: contact DoFs and their groups. ``step_ch
 ``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
 tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep. ``kinks``:
 where a contact opens or closes without a change of modes. ``advance``: substeps up to a change of modes. ``forces``:
-changes up to the step's end. ``engine``: steps up to the sample. ``dashpots``, ``free_losses``, ``loss_modes``,
-``loss_tables``, ``losses``: what dashpots dissipate. ``tangent`` and ``tangent_kernels``: variations. ``orbit_tape``:
-contacts of an orbit.
+changes up to the step's end. ``engine``: steps up to the sample. ``tangent`` and ``tangent_kernels``: variations.
+``orbit_tape``: contacts of an orbit.
 
 References
 ----------

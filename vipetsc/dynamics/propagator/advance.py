@@ -38,7 +38,6 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.kinks import first_kink
-from vipetsc.dynamics.propagator.losses import PairLosses, accumulate_losses
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, select_active, write_on_tape
 from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shift
@@ -316,12 +315,10 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
 
 
 @inlined
-def _take(cluster: Cluster, losses: PairLosses, trial: Trial, substep: Substep) -> None:
+def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
     state = cluster.state[0]
     accumulate_moments(cluster, trial, substep)
-    if losses.moments.shape[1] > 0:
-        accumulate_losses(losses, cluster, trial, substep)
     write_on_tape(cluster, trial, substep)
     for i in trial.closed:
         _update_extremes(cluster, trial, i, cluster.interval * substep.length)
@@ -331,8 +328,8 @@ def _take(cluster: Cluster, losses: PairLosses, trial: Trial, substep: Substep) 
 
 
 @kernel
-def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tuple[int, int]:
-    """Advance a cluster to the first change of modes or to the step's end; ``losses`` are those of its dashpots.
+def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
+    """Advance a cluster to the first change of modes or to the step's end.
 
     Returns how it ended, and a site or -1. ``DONE``: at the step's end. ``CHANGED``: the cluster stands on a change of
     modes, and the caller switches the sites whose switching functions say so; the site is one that changes again before
@@ -390,7 +387,7 @@ def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tup
             # Judged only now: a force continued beyond its end is no smooth function.
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
-            _take(cluster, losses, trial, substep)
+            _take(cluster, trial, substep)
         # A substep that was rejected is repeated without a search, too.
         blind = leads_nowhere
         if landed:

@@ -140,14 +140,8 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
     leftmost_cells = dofs["cell"] - series.reach
-    # What losses are computed from lies further out. A force reaches dashpots that begin one cell before ``leftmost``,
-    # and their rates follow from the free motion of ``reach`` cells on either side of them.
-    margin = 0
-    if layout.damped:
-        margin = series.reach + 1
-    column = halo.add(leftmost_cells - margin, series.width + 2 * margin) + margin
     return DofTables(
-        column=column,
+        column=halo.add(leftmost_cells, series.width),
         owned=_owned_cells(leftmost_cells, series.width, layout),
         table=table,
         rows=_form_rows(cells, forms, series),

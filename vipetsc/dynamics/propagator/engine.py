@@ -21,10 +21,7 @@ from vipetsc.dynamics.engine import FillResult, OpeningEngine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
-from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
-from vipetsc.dynamics.propagator.free_losses import create_loss_stencil
-from vipetsc.dynamics.propagator.losses import FreeLosses, PairLosses, add_free_losses, loss_by_forces
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.substeps import Cluster
@@ -40,14 +37,13 @@ NEVER = np.iinfo(np.int64).max
 class States(NamedTuple):
     """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
-    ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, each with ``rows``
-    components, ``ghosts`` the neighbouring ones, the last columns of ``HaloRegions``, and ``ghost_rows`` what the state
-    has of each. ``progress`` (1,) is of dtype ``PROGRESS``.
+    ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
+    neighbouring ones, the last columns of ``HaloRegions``, and ``ghost_rows`` what the state has of each.
+    ``progress`` (1,) is of dtype ``PROGRESS``.
     """
 
     components: np.ndarray
     owned: int
-    rows: int
     ghosts: int
     ghost_rows: int
     parts: int
@@ -63,23 +59,10 @@ class Saved(NamedTuple):
     forces: dict[str, np.ndarray]
 
 
-class StepTables(NamedTuple):
-    """A linear step: the stencil of P(H); what dashpots dissipate in it, in free motion and by forces.
-
-    The losses by forces are those with the rates of free motion and those by pairs of forces. Without dashpots no loss
-    is computed.
-    """
-
-    stencil: Stencil
-    free_losses: Stencil
-    by_forces: FreeLosses
-    by_pairs: PairLosses
-
-
 @kernel
 def _complete(state: np.ndarray, states: States, ledger: np.ndarray, energies: np.ndarray, columns: np.ndarray) -> None:
     """Put the ledger's energies in J, and the ghosts from the halo's ``columns``, behind the cells of the ``state``."""
-    k = states.rows * states.owned
+    k = columns.shape[0] * states.owned
     for dof in ledger:
         state[k] = energies[dof]
         k += 1
@@ -101,7 +84,7 @@ def _is_driven(dofs: DofTables, c: int, drives: Drives, begin: float) -> bool:
 
 @njit(error_model="numpy")
 def take_steps(
-    states: States, step: StepTables, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
+    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
 ) -> tuple[int, np.ndarray]:
     """Go on to the last step and take the ``samples`` on the way; returns PETSc's error code and the log of ``tracks``.
 
@@ -136,11 +119,8 @@ def take_steps(
         if steps == progress.last or (failed and halo.scatter == 0):
             break
 
-        # Free motion of all cells, and what dashpots dissipate in it.
-        apply_propagator(step.stencil, cells, halo.columns, next_cells)
-        lost = states.components[1 - steps % 2, rows * owned : states.rows * owned]
-        if lost.size > 0:
-            add_free_losses(step.free_losses, cells, halo.columns, state[rows * owned : states.rows * owned], lost)
+        # Free motion of all cells.
+        apply_propagator(stencil, cells, halo.columns, next_cells)
 
         # What forces add. The clusters read the halo, that is the state before the step.
         count = clusters.state.size
@@ -150,7 +130,7 @@ def take_steps(
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
             if not may_touch and not _is_driven(dofs, c, clusters.drives, begin):
                 continue
-            followed, tracks = follow_contacts(clusters, step.by_pairs, dofs, c, tracks, begin)
+            followed, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
             if not followed:
                 # The others are followed all the same: ranks that do not feel this one follow theirs, too.
                 if progress.failed == NEVER:
@@ -160,9 +140,6 @@ def take_steps(
                 continue
             first = dofs.first[c]
             apply_impulses(dofs, first, clusters.moments[first : dofs.first[c + 1]], next_cells)
-            if lost.size > 0 and step.by_forces.leader[c] >= 0:
-                loss = loss_by_forces(step.by_forces, step.by_pairs, dofs, c, halo.columns)
-                lost[step.by_forces.leader[c]] += loss
 
         # Among others a rank that failed must keep their pace. One alone stays at the step that failed, for its state
         # to be shown, and takes no sample there again: its clusters have gone through that step, as far as they can.
@@ -176,6 +153,7 @@ class Propagator(OpeningEngine):
     """Advances a lattice from sample to sample; see ``Engine``."""
 
     name = "propagator"
+    integrates_damping = False
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         series = step_series(model)
@@ -186,19 +164,8 @@ class Propagator(OpeningEngine):
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
-        dashpots = None
-        if layout.damped:
-            dashpots = DashpotRows(series)
-        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions, dashpots))
+        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
-        # Without dashpots any stencil serves: none is applied.
-        loss_stencil = self._stencil
-        if dashpots is not None:
-            loss_stencil = create_loss_stencil(dashpots, layout, self._regions)
-        by_forces, by_pairs = self._forces.losses
-        self._tables = StepTables(
-            stencil=self._stencil, free_losses=loss_stencil, by_forces=by_forces, by_pairs=by_pairs
-        )
         ghosts = [cell for cell in layout.neighbours() if cell is not None]
         for cell in ghosts:
             self._regions.add(cell, 1)
@@ -209,7 +176,6 @@ class Propagator(OpeningEngine):
         self._record = States(
             components=self._components,
             owned=layout.owned,
-            rows=layout.rows,
             ghosts=len(ghosts),
             ghost_rows=layout.ghost_rows,
             parts=round(model.sample_interval / series.interval),
@@ -269,7 +235,7 @@ class Propagator(OpeningEngine):
         tracks = forces.tracker.tracks
         with PROPAGATOR:
             error, log = take_steps(
-                self._record, self._tables, self._halo, forces.dofs, forces.clusters, tracks, samples
+                self._record, self._stencil, self._halo, forces.dofs, forces.clusters, tracks, samples
             )
         if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")

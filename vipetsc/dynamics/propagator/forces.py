@@ -33,10 +33,7 @@ from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, RESTS, advance_cluster
 from vipetsc.dynamics.propagator.clusters import DofTables, create_dof_tables, create_responses, groups_within_reach
-from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs, group_dofs
-from vipetsc.dynamics.propagator.loss_tables import create_losses, no_losses
-from vipetsc.dynamics.propagator.losses import PairLosses, select_losses
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
@@ -114,29 +111,23 @@ def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
 
 
 @kernel
-def _begin_step(clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, begin: float) -> None:
+def _begin_step(clusters: Cluster, dofs: DofTables, c: int, begin: float) -> None:
     """Set cluster ``c`` to the beginning of a step, ``begin`` in s: nothing has acted in it yet."""
     cluster = select_cluster(clusters, dofs, c)
     state = cluster.state[0]
     state.begin = begin
     state.position = 0.0
     cluster.moments[:] = 0.0
-    losses = select_losses(all_losses, dofs, c)
-    losses.moments[:] = 0.0
-    losses.loss[:] = 0.0
 
 
 @kernel
-def _advance_and_switch(
-    clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, tracks: Tracks, may_rest: bool
-) -> tuple[int, int]:
+def _advance_and_switch(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, may_rest: bool) -> tuple[int, int]:
     """Advance cluster ``c`` to its next change and switch its sites there; returns what ``advance_cluster`` does.
 
     The log of ``tracks`` must have room.
     """
     cluster = select_cluster(clusters, dofs, c)
-    losses = select_losses(all_losses, dofs, c)
-    outcome, site = advance_cluster(cluster, losses, may_rest)
+    outcome, site = advance_cluster(cluster, may_rest)
     if outcome not in (CHANGED, RESTS):
         return outcome, site
 
@@ -156,20 +147,18 @@ def _advance_and_switch(
 # It may allocate, and such a function counts references to each array that it looks at: those of a cluster are left to
 # kernels.
 @allocating
-def follow_contacts(
-    clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, tracks: Tracks, begin: float
-) -> tuple[bool, Tracks]:
+def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, begin: float) -> tuple[bool, Tracks]:
     """Advance cluster ``c`` through the step that begins at ``begin`` in s, from one switching to the next.
 
     Returns whether that was possible, and ``tracks`` with as much room as was needed.
     """
-    _begin_step(clusters, all_losses, dofs, c, begin)
+    _begin_step(clusters, dofs, c, begin)
     # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests. Numba would
     # compile the call twice for a variable that begins as False, once for the constant.
     landings_nowhere = 0
     for _ in range(MOST_CHANGES):
         tracks = with_room(tracks)
-        outcome, site = _advance_and_switch(clusters, all_losses, dofs, c, tracks, landings_nowhere > 0)
+        outcome, site = _advance_and_switch(clusters, dofs, c, tracks, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
         landings_nowhere += outcome == CHANGED and site >= 0
@@ -179,15 +168,12 @@ def follow_contacts(
 class Forces:
     """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
 
-    ``dofs`` are their tables, ``clusters`` the record of all of them, ``losses`` those of ``dashpots`` by
-    their forces, none if these are None, ``tracker`` the modes of their sites and the log.
+    ``dofs`` are their tables, ``clusters`` the record of all of them, ``tracker`` the modes of their sites and the log.
     ``logs`` (cluster,) marks those that this rank logs: every rank that a cluster reaches does the same sums on the
     same numbers, and the one that owns its first cell logs it.
     """
 
-    def __init__(
-        self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions, dashpots: DashpotRows | None = None
-    ) -> None:
+    def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm = layout.comm
         all_dofs = contact_dofs(model)
         all_groups = group_dofs(model, series.reach)
@@ -195,10 +181,6 @@ class Forces:
         self._numbers = groups.numbers
         self._cells = all_dofs["cell"][groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
-        if dashpots is None:
-            self.losses = no_losses(len(groups.numbers), len(groups.first) - 1)
-        else:
-            self.losses = create_losses(groups, self.dofs, model, layout, dashpots)
         self.clusters = _create_clusters(groups, self.dofs, model, series)
         self.tracker = ImpactTracker(self.clusters.contacts, _site_numbers(groups, model).tolist())
 

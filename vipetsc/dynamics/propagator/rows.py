@@ -68,18 +68,16 @@ class _Neighbourhoods(NamedTuple):
     acts: np.ndarray
 
 
-def local_recursion(
-    chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int, number: type = np.longdouble
-) -> PowerRecursion:
+def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
     """The recursion for rows of the masses of ``cells``, each with the coefficients of the cells on either side of it.
 
     ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has; there must be more
     neighbours on either side than powers. Neighbours further away than ``near`` are taken to be as the reference cell,
     the one that the case describes before any cell is varied: sec. 8 bounds what that leaves out. The step is of
-    ``interval`` in s, and rows are of the type ``number``.
+    ``interval`` in s.
     """
     width = exists.shape[1] // 2
-    masses, grounding, stiffness, damping = _coefficients_near(chain, cells, width, min(near, width), number)
+    masses, grounding, stiffness, damping = _coefficients_near(chain, cells, width, min(near, width))
 
     # No power reaches the outermost neighbours: what np.roll carries across them is zero.
     acts = np.ones_like(exists)
@@ -87,7 +85,7 @@ def local_recursion(
         acts = exists & np.roll(exists, -1, axis=-1)
     neighbours = _Neighbourhoods(chain=chain, masses=masses[:, None], exists=exists[:, None, None], acts=acts[:, None])
 
-    h = number(interval)
+    h = np.longdouble(interval)
     by_stiffness = partial(_multiply, neighbours, h**2 * stiffness, None)
     by_damping = None
     if chain.is_damped:
@@ -95,17 +93,17 @@ def local_recursion(
     return PowerRecursion(by_stiffness, by_damping)
 
 
-def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int, number: type) -> Coefficients:
+def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int) -> Coefficients:
     """Coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on either side of each of ``cells``.
 
-    They are those of the reference cell beyond the ``near`` ones. Grounding is that of dashpots to the ground. They are
-    of the type ``number``: extended precision for the propagator P(H), whose entries are sums of high powers of them,
-    must be good to double precision, and are used in every step.
+    They are those of the reference cell beyond the ``near`` ones. Grounding is that of dashpots to the ground. They
+    have extended precision: the entries of P(H) are sums of high powers of them, must be good to double precision, and
+    are used in every step.
     """
     # A chain without variation has the reference cell wherever it is asked, also beyond its ends.
     reference = Chain(chain.cell, 1).coefficients(-1, 0)
     shape = (len(cells), 2 * width + 1, 1)
-    arrays: list[np.ndarray] = [np.tile(array, shape).astype(number) for array in reference]
+    arrays: list[np.ndarray] = [np.tile(array, shape).astype(np.longdouble) for array in reference]
 
     if chain.variation is not None:
         for i, cell in enumerate(cells.tolist()):

@@ -71,6 +71,7 @@ class Integrator(Engine):
     """
 
     name = "ts"
+    integrates_damping = True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm = layout.comm

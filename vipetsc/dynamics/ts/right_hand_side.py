@@ -125,7 +125,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         f[shape.work + i] = force * y[drive.target]
 
     if shape.damping >= 0:
-        damping_powers(y, lattice, f[shape.damping : shape.damping + n])
+        damping_powers(y, lattice, 0, f[shape.damping : shape.damping + n])
 
 
 _TABLES = (
