@@ -204,6 +204,12 @@ class ConservativeMotions:
         frame = self._frame_at(balance, x, 2 * np.pi / point.period, float(np.abs(x).max()))
         if point.tangent.size:
             frame.tangent = unit(frame.direction(point))
+            # With another number of harmonics the point itself is corrected before a step is taken from it: else the
+            # corrections of the steps would contain the change of the harmonics, however short the steps are.
+            if balance.order != point.order:
+                attempt = frame.correct(frame.xi, 0.0)
+                if attempt.converged:
+                    frame.xi = attempt.xi
         return frame
 
     def _frame_at(self, balance: HarmonicBalance, x: np.ndarray, omega: float, size: float) -> HarmonicFrame:

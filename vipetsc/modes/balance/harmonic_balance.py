@@ -38,8 +38,9 @@ from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.shifted_compliance import Compliance, ShiftedCompliance
 from vipetsc.modes.latest import LatestValues
 
-# Motions whose forces are kept: the latest one of Newton's method, and the two ends of a difference along its branch.
-KEPT_MOTIONS = 3
+# The energy's derivative by the frequency at given forces is a difference over this fraction of the frequency to each
+# side. The linear system alone enters, whose shifted compliance has no pole there.
+FREQUENCY_STEP = 1e-5
 
 
 class _Columns(NamedTuple):
@@ -99,7 +100,8 @@ class HarmonicBalance:
             shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
         self.shifted = shifted
         # Newton's method asks for the same forces several times.
-        self._series = LatestValues[tuple[bytes, float], ForceSeries](KEPT_MOTIONS)
+        self._series = LatestValues[tuple[bytes, float], ForceSeries](1)
+        self._changes = LatestValues[tuple[bytes, float, bytes], np.ndarray](1)
 
     def weighted(self, weight: float) -> "HarmonicBalance":
         """The equations with another ``weight``."""
@@ -176,14 +178,7 @@ class HarmonicBalance:
         columns = self._columns
         count = len(self.orders)
         pairs = self.forces.pairs
-
-        # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k they
-        # change by 1 and 1, by Im Z_k by i and -i.
-        two_sided = self.series(x, omega).jacobian(orders=columns.orders, rows=self.orders) * columns.halves
-        plus = two_sided[:, :, :count]
-        minus = two_sided[:, :, count:]
-        changes = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, count - len(self._sines) :]], axis=2)
-        changes -= shift[:, 0] * columns.same
+        changes = self._force_changes(x, omega, shift)
 
         # Of pair i and order k by the unknown u of pair j: G_s (dF - s dZ), and dZ of the pair itself.
         matrix = shifted.compliance.swapaxes(0, 1)[:, :, :, None] * changes.swapaxes(0, 1)
@@ -192,6 +187,23 @@ class HarmonicBalance:
         matrix = matrix.reshape(pairs, count, -1)
         rows = [matrix.real, matrix[:, count - len(self._sines) :].imag]
         return np.concatenate(rows, axis=1).reshape(self.size, self.size)
+
+    def _force_changes(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
+        """The derivative (pair, orders, unknowns of the pair) of F - s Z by the unknowns of the same pair."""
+
+        def compute() -> np.ndarray:
+            columns = self._columns
+            count = len(self.orders)
+            # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k
+            # they change by 1 and 1, by Im Z_k by i and -i.
+            two_sided = self.series(x, omega).jacobian(orders=columns.orders, rows=self.orders) * columns.halves
+            plus = two_sided[:, :, :count]
+            minus = two_sided[:, :, count:]
+            changes = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, count - len(self._sines) :]], axis=2)
+            changes -= shift[:, 0] * columns.same
+            return changes
+
+        return self._changes.get((x.tobytes(), omega, shift.tobytes()), compute)
 
     def rate(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """dR/domega (size,) in m s/rad of the ``residual`` with no linear motion given: dG_s/domega (F - s Z).
@@ -237,11 +249,46 @@ class HarmonicBalance:
 
         ``x`` (size,) are its unknown harmonics in m, ``shift`` (orders, 1, 1) in N/m the stiffnesses of ``shift``.
         """
-        shifted = self.shifted.at(omega, shift)
         elongation = self.unpack(x).T[self._places]
         force = self.shifted_force(x, omega, shift)[..., 0]
-        quadratic = shifted.compliance + (self.orders * omega)[:, None, None] * self.shifted.rate(omega, shift)
-        energies = np.einsum("ki,kij,kj->k", force.conj(), quadratic, force).real
+        energies = np.einsum("ki,kij,kj->k", force.conj(), self._stored_by_forces(omega, shift), force).real
         # What the added springs hold.
         energies -= shift[:, 0, 0] * np.sum(np.abs(elongation) ** 2, axis=1)
-        return float(np.where(self.orders == 0, 0.5, 0.25) @ energies + self.series(x, omega).potential.sum())
+        return float(self._means @ energies / 2 + self.series(x, omega).potential.sum())
+
+    def energy_change(
+        self, x: np.ndarray, omega: float, shift: np.ndarray, along: np.ndarray, by_omega: float
+    ) -> float:
+        """The change of the ``energy`` in J with the unknowns by ``along`` (size,) in m and omega by ``by_omega``.
+
+        The forces' derivative is exact, also next to a touch, where a difference along the branch would be wrong.
+        """
+        elongation = self.unpack(x).T[self._places]
+        change = self.unpack(along).T[self._places]
+        shifts = shift[:, 0]
+        shifted_force = self.shifted_force(x, omega, shift)[..., 0]
+        of_pairs = along.reshape(self.forces.pairs, -1)
+        force_change = np.einsum("pku,pu->kp", self._force_changes(x, omega, shift), of_pairs)
+
+        stored = self._stored_by_forces(omega, shift)
+        changes = np.einsum("ki,kij,kj->k", shifted_force.conj(), stored, force_change).real
+        changes -= np.sum((shifts * elongation.conj() * change).real, axis=1)
+        # The potential changes by the work of the forces.
+        force = shifted_force + shifts * elongation
+        changes += np.sum((force.conj() * change).real, axis=1)
+
+        step = FREQUENCY_STEP * omega
+        after = self._stored_by_forces(omega + step, shift)
+        before = self._stored_by_forces(omega - step, shift)
+        by_frequency = np.einsum("ki,kij,kj->k", shifted_force.conj(), after - before, shifted_force).real
+        return float(self._means @ (changes + by_frequency / (4 * step) * by_omega))
+
+    def _stored_by_forces(self, omega: float, shift: np.ndarray) -> np.ndarray:
+        """G_s + omega dG_s/domega (orders, pairs, pairs), by which forces give the energy of the linear system."""
+        compliance = self.shifted.at(omega, shift).compliance
+        return compliance + (self.orders * omega)[:, None, None] * self.shifted.rate(omega, shift)
+
+    @cached_property
+    def _means(self) -> np.ndarray:
+        """The mean (orders,) over a period of products of two harmonics of one order."""
+        return np.where(self.orders == 0, 1.0, 0.5)

@@ -17,10 +17,6 @@ from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, FlowError, unit
 
-# The energy's derivative along the branch is a central difference over this distance along the tangent to each side.
-# Close to grazing, on the out-of-phase branch of the paper's model with Hertz's law, it errs by 7e-9 of the energy
-# through the curvature of the branch and by 5e-11 through rounding. Folds of the energy are where it changes its sign.
-SLOPE_STEP = 1e-5
 # A frequency that changes by this factor, or its inverse, within one correction has left the branch.
 LARGE_FACTOR = 2.0
 
@@ -107,8 +103,9 @@ class HarmonicFrame:
         tangent = np.empty(0)
         energy_tangent = slope = np.nan
         if direction is not None:
-            energies = [balance.energy(*self.motion(xi + s * SLOPE_STEP * direction), self.shift) for s in (1, -1)]
-            energy_tangent = (energies[0] - energies[1]) / (2 * SLOPE_STEP)
+            energy_tangent = balance.energy_change(
+                x, omega, self.shift, along=direction[:-1] * self.size, by_omega=direction[-1] * self.omega
+            )
             by_frequency = direction[-1] * self.omega / (2 * np.pi)
             # The slope is df/dE in Hz/J: infinite at a fold of the energy.
             slope = np.inf
