@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import inspect
 import pickle
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
+import xarray as xr
 
+import vipetsc
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase, Sweep
 from vipetsc.case.html import cell_svg, html_table
 from vipetsc.lattice import Spring, UnitCell, four_band
 from vipetsc.lattice.chain import Pair
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.studies.one_site import make_law
+from vipetsc.studies.prediction import predict
 
 TABLE = {
     "lattice": {"cells": 24},
@@ -152,3 +161,63 @@ def test_the_drawing_has_room_for_every_mass_of_the_next_cell():
         assert float(circle["cx"]) + radius <= left + width
         assert top <= float(circle["cy"]) - radius
         assert float(circle["cy"]) + radius <= top + height
+
+
+LOOP: dict[str, Any] = {}
+LOOP["lattice"] = LOOP
+ENDLESS: list[Any] = []
+ENDLESS.append(ENDLESS)
+
+
+@pytest.mark.parametrize(
+    ("call", "word"),
+    [
+        (lambda: Case(None), "lattice={"),
+        (lambda: Case("case.toml"), "Case.load"),
+        (lambda: LawCase(5), "LawCase.load"),
+        (lambda: Case.from_table(5), "a dict"),
+        (lambda: Case.from_table(None), "a dict"),
+        (lambda: Case.from_table([("lattice", {})]), "a dict"),
+        (lambda: Case.from_toml(5), "a text"),
+        (lambda: Case.from_toml(b"name = 'x'"), "a text"),
+        (lambda: Case.load(5), "name of a case file"),
+        (lambda: Case.load(None, "lattice.cells=5"), "list"),
+        (lambda: Case.load(None, 5), "list"),
+        (lambda: Case.of(5), "dataset"),
+        (lambda: Case.of(xr.Dataset()), "dataset"),
+        (lambda: Case().varied(lattice=5), "lattice is a section"),
+        (lambda: vipetsc.simulate("case.toml"), "simulate takes a case of the class Case"),
+        (lambda: vipetsc.simulate(None), "simulate takes a case"),
+        (lambda: vipetsc.sweep(Case()), "sweep takes a case of the class Sweep"),
+        (lambda: vipetsc.analyse("run.h5"), "dataset"),
+        (lambda: make_law(Case(), "folder"), "make_law takes a case"),
+        (lambda: predict(LawCase(), "folder"), "predict takes a case"),
+        (lambda: follow_all(Case(), None, MPI.COMM_SELF), "NnmCase or NfrcCase"),
+    ],
+)
+def test_the_door_says_what_it_takes(call, word):
+    """An argument of a wrong type is refused where it is given, not by whatever it meets inside."""
+    with pytest.raises(TypeError, match=re.escape(word)):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "key"),
+    [
+        (lambda: Case.from_toml("["), "case"),
+        (lambda: Case.from_toml("name = 'a'\nname = 'b'"), "case"),
+        (lambda: Case.from_toml("x = " + 5000 * "["), "case"),
+        (lambda: Case.from_table(LOOP), "case"),
+        (lambda: Case(lattice=LOOP), "lattice"),
+        (lambda: Case(contacts={"sites": ENDLESS}), "contacts"),
+        (lambda: Case(contacts={"sites": (ENDLESS,)}), "contacts"),
+        (lambda: Case.from_table({1: 2}), "case"),
+        (lambda: Case.from_table({"drive": {"more": [{2: 3}]}}), "drive.more[1]"),
+        (lambda: Case(drive={"amplitude": 1j}), "drive.amplitude"),
+    ],
+)
+def test_a_table_that_is_none_is_a_problem_of_the_case(call, key):
+    """What a file could not hold either is an error of the case, with its place."""
+    with pytest.raises(CaseError) as caught:
+        call()
+    assert key in [problem.key for problem in caught.value.problems]

@@ -234,6 +234,8 @@ class Case(CaseFile):
         for section in without:
             table.pop(section, None)
         for section, values in changes.items():
+            if not isinstance(values, Mapping):
+                raise TypeError(f"{section} is a section: give the keys that change, a dict, not {values!r}")
             merged = table.get(section, {}) | values
             table[section] = {key: value for key, value in merged.items() if value is not None}
         if name is not None:

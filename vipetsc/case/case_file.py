@@ -24,9 +24,8 @@ from vipetsc.case.changes import put as put
 from vipetsc.case.changes import with_overrides as with_overrides
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.nearest_type import BRANCH, of_nearest_type
-from vipetsc.case.nesting import TOO_DEEP, is_deeper
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
-from vipetsc.case.plain import plain_table
+from vipetsc.case.plain import TOO_DEEP, is_deeper, plain_table, wrong_keys
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
 from vipetsc.case.section import is_within
@@ -68,13 +67,20 @@ class CaseFile(Section):
     waveforms: ClassVar[tuple[str, ...]] = ()
     builtin_table: ClassVar[Table] = {}
 
-    def __init__(self, **sections: Any) -> None:
+    def __init__(self, *unnamed: Any, **sections: Any) -> None:
         """Read and resolve the case of these ``sections``: tables by keyword, with a ``name`` or without.
 
         ``Case(lattice={"cells": 60}, drive={"amplitude": 8.0})`` is the case of a file with these sections. Values are
         as in a file; arrays, tuples and sections of another case are taken too, and None is a key that is not given.
         Raises CaseError with all problems.
         """
+        kind = type(self).__name__
+        if unnamed:
+            ways = f"{kind}.load takes the name of a file, {kind}.from_table a table"
+            raise TypeError(f"{kind} takes its sections by name, as in {kind}(lattice={{...}}); {ways}")
+        too_deep = [Problem(name, None, TOO_DEEP) for name, value in sections.items() if is_deeper(value)]
+        if too_deep:
+            raise CaseError(too_deep)
         super().__init__(**self.fields_of(plain_table(sections)))
 
     @classmethod
@@ -105,7 +111,9 @@ class CaseFile(Section):
 
     @classmethod
     def load(cls, path: str | Path | None = None, overrides: Iterable[str] = ()) -> Self:
-        """The case in file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
+        """Return the case in the file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
+        if not isinstance(path, str | Path | None):
+            raise TypeError(f"{cls.__name__}.load takes the name of a case file, not {path!r}")
         # Not for an empty name, which an unset variable of a shell gives: a built-in case is not what is meant.
         if path is None:
             return cls.from_table(cls.builtin_table, overrides, "built-in case")
@@ -113,17 +121,29 @@ class CaseFile(Section):
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """The case written in ``text``."""
-        return cls.from_table(tomllib.loads(text))
+        """Return the case written in ``text``; raises CaseError."""
+        if not isinstance(text, str):
+            raise TypeError(f"{cls.__name__}.from_toml takes a text, not {text!r}")
+        return cls.from_table(parsed(text, "case"))
 
     @classmethod
     def of(cls, run: "xr.Dataset") -> Self:
-        """The resolved case that a file of results carries in its attribute ``case``."""
-        case = _kept_case(cls, run.attrs["case"])
+        """Return the resolved case that a file of results carries in its attribute ``case``."""
+        text = getattr(run, "attrs", {}).get("case")
+        if not isinstance(text, str):
+            raise TypeError(f"{cls.__name__}.of takes a dataset of results, with its case in attrs['case']")
+        case = _kept_case(cls, text)
         assert isinstance(case, cls)
         # A kept case was read before, and the modules that it names may be gone by now: this reports them.
         case.import_plugins()
         return case
+
+    @classmethod
+    def expect(cls, case: Any, function: str) -> None:
+        """Raise TypeError if a ``function`` that takes a case of this verb is called with another ``case``."""
+        if not isinstance(case, cls):
+            given = f"not {type(case).__name__}; {cls.__name__}.load reads a file"
+            raise TypeError(f"{function} takes a case of the class {cls.__name__}, {given}")
 
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
@@ -139,8 +159,19 @@ class CaseFile(Section):
 
     @classmethod
     def fields_of(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> dict[str, Any]:
-        """The resolved fields of a parsed table, its name among them; raises CaseError."""
+        """Return the resolved fields of a parsed table, its name among them; raises CaseError."""
+        if not isinstance(table, dict):
+            raise TypeError(f"{cls.__name__}.from_table takes a table of sections by name, a dict, not {table!r}")
+        if isinstance(overrides, str) or not isinstance(overrides, Iterable):
+            raise TypeError(f"overrides are a list of texts, as ['lattice.cells=60'], not {overrides!r}")
         problems: list[Problem] = []
+        if is_deeper(table):
+            problems.append(Problem("case", None, TOO_DEEP))
+        else:
+            problems += wrong_keys(table)
+        if problems:
+            raise CaseError(problems, source)
+
         if overrides:
             table, problems = with_overrides(table, overrides)
         # One file may have sections of several verbs. A dictionary keeps their order, which a message shows.
@@ -265,16 +296,24 @@ def read_toml(path: str | Path) -> Table:
     path = Path(path)
     try:
         # utf-8-sig: editors on Windows begin files with a byte order mark, which TOML does not allow.
-        table = {"name": readable(path.stem)} | tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        remedy = f"{error.strerror}; a case file (TOML) is needed"
-    except (ValueError, RecursionError) as error:  # tomllib's and the decoder's errors are ValueErrors
-        remedy = f"not a TOML file ({error})"
-    else:
-        if not is_deeper(table):
-            return with_located(with_absolute_names(table, path.parent), path.parent)
-        remedy = TOO_DEEP
-    raise CaseError([Problem(readable(path), None, remedy)])
+        raise CaseError([Problem(readable(path), None, f"{error.strerror}; a case file (TOML) is needed")]) from None
+    except ValueError as error:
+        raise CaseError([Problem(readable(path), None, f"not a TOML file ({error})")]) from None
+    table = {"name": readable(path.stem)} | parsed(text, readable(path))
+    return with_located(with_absolute_names(table, path.parent), path.parent)
+
+
+def parsed(text: str, source: str) -> Table:
+    """Return the table that a ``text`` in TOML is; raises CaseError, with the ``source`` of the text as its key."""
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CaseError([Problem(source, None, f"not a TOML file ({error})")]) from None
+    if is_deeper(table):
+        raise CaseError([Problem(source, None, TOO_DEEP)])
+    return table
 
 
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:

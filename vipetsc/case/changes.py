@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
+from vipetsc.case.plain import DEEPEST, TOO_DEEP, is_deeper
 from vipetsc.case.section import Problem
 from vipetsc.io.names import readable
 

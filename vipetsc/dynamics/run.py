@@ -106,6 +106,7 @@ def simulate(
     OSError
         If a file cannot be written, on all ranks.
     """
+    Case.expect(case, "simulate")
     # In a script under mpirun a rank that raises would leave the others waiting; a hook of the script's own stays.
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         install_abort_hook()

@@ -55,6 +55,7 @@ def run_identification(
     All ranks of ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this
     identification, CaseError if a record has changed, RuntimeError if no start leads to a fit.
     """
+    IdentifyCase.expect(plan, "run_identification")
     with claimed(comm, folder, IDENTIFIED, plan.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "identified.h5"
         # A file that was cut off is written again, from the records of its fits.

@@ -77,6 +77,7 @@ def make_law(
     Raises FolderError if the folder contains anything else, RuntimeError if a run fails, StoppedError
     on a request to ``stop``.
     """
+    LawCase.expect(case, "make_law")
     with claimed(comm, folder, LAW, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "law.h5"
         # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.

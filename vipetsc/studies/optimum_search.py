@@ -50,6 +50,7 @@ def run_search(
     ``best-2.toml`` for its ends. The same files, to the bit, on any number of ranks and after any stop. All ranks of
     ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this search.
     """
+    OptimiseCase.expect(plan, "run_search")
     with claimed(comm, folder, OPTIMUM, plan.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "optimum.h5"
         # A file that was cut off is written again, from the records of its runs.

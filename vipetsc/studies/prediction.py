@@ -68,6 +68,7 @@ def predict(
     FolderError if the folder contains anything else, RuntimeError if a required run fails, StoppedError on a
     request to ``stop``.
     """
+    PredictCase.expect(case, "predict")
     with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "prediction.h5"
         # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.

@@ -110,6 +110,7 @@ def run_sweep(
     stored without a folder; FolderError if the folder contains anything else; ValueError without a folder if the ranks
     are on several machines.
     """
+    Sweep.expect(plan, "sweep")
     # For its errors alone: an empty list is sent to the other ranks, not all cases.
     on_root(comm, lambda: plan.tried()[:0])
     if folder is None:

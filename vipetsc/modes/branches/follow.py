@@ -67,6 +67,8 @@ def follow_all(
     their branches. Where all ranks follow one branch together, an error that one of them has alone leaves the others
     waiting, unless it ends them too (``parallel.install_abort_hook``).
     """
+    if not isinstance(case, BranchCase):
+        raise TypeError(f"follow_all takes a case of the class NnmCase or NfrcCase, not {type(case).__name__}")
     follower = partial(Follower, case, folder, provenance(comm), listener, stop, resume)
     jobs = method_of(case).jobs(case)
     # Collective calls inside: every rank follows the same branches in the same order.
