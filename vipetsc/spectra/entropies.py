@@ -36,9 +36,6 @@ KC = 12.0
 # into a core's cache. 8 snapshots take 10 % more time, 32 the same; 16 nodes and 32 snapshots take twice the time.
 CHUNK = 16
 GROUP = 8
-# Operations that a matrix product does while a fast transform does one: 5.8 were measured. With 5 an octave for which
-# both would take the same time is transformed.
-PRODUCT_GAIN = 5
 # The largest weight of a run is sought in so many snapshots: those with the largest energy in any window of so many
 # cells. In the built-in run 2 and 32 find the same weight.
 STRONGEST = 8
@@ -190,13 +187,14 @@ class _Filters(NamedTuple):
     @classmethod
     def of(cls, filters: np.ndarray) -> Self:
         """The ``filters`` (kappa, k) from the first to the last wavenumber that any lets through."""
-        inside = np.flatnonzero(_lets_through(filters))
+        # Whatever does not exceed the rounding of the largest value lets nothing through.
+        inside = np.flatnonzero(filters.max(axis=0) > np.finfo(float).eps * filters.max())
         first = int(inside[0])
         return cls(first=first, values=np.ascontiguousarray(filters[:, first : inside[-1] + 1]))
 
 
-class _FastOctave(NamedTuple):
-    """An octave of nodes whose wavelet transforms are computed by fast Fourier transforms.
+class _Octave(NamedTuple):
+    """An octave of nodes, whose wavelet transforms have one padding.
 
     A signal is transformed with the length ``padded``; the inverse transform, at every ``stride``-th cell, has the
     ``length`` padded/stride. ``groups`` are the filters of nodes that are filtered together.
@@ -216,49 +214,11 @@ class _FastOctave(NamedTuple):
             yield fft.ifft(x, norm="forward", overwrite_x=True)
 
 
-class _NarrowOctave(NamedTuple):
-    """An octave of nodes that let so few wavenumbers through that matrix products take less time than transforms.
-
-    ``waves`` (cell, 2 k) are the real and imaginary parts of exp(-i k x) in turn, ``filters`` (kappa, k) those of the
-    nodes, and ``waves_back`` (k, cell) are exp(i k x) at every ``stride``-th cell. The wavenumbers k are those of the
-    padded line at which any filter is not zero: the products are the Fourier transforms of that line.
-    """
-
-    waves: np.ndarray
-    filters: np.ndarray
-    waves_back: np.ndarray
-
-    @classmethod
-    def of(cls, filters: np.ndarray, padded: int, cells: int, stride: int) -> Self:
-        """The octave with these ``filters`` (kappa, k) on a line of ``padded`` cells."""
-        inside = np.flatnonzero(_lets_through(filters))
-        # Whole turns are left out in integers: in k x itself they would cost digits of the phase.
-        turns = np.outer(np.arange(cells), inside) % padded / padded
-        waves = np.exp(-2j * np.pi * turns)
-        return cls(
-            waves=waves.view(float),
-            filters=filters[:, inside],
-            waves_back=np.ascontiguousarray(waves[::stride].conj().T),
-        )
-
-    def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
-        """X (t, kappa, cell) at every ``stride``-th cell of the ``signal`` (t, cell), of all nodes."""
-        # The rounding of a matrix product depends on the number of its rows. There are always ``CHUNK`` snapshots, so
-        # that the bits of one do not depend on how many are transformed with it.
-        snapshots = np.zeros((CHUNK, signal.shape[1]))
-        snapshots[: len(signal)] = signal
-        spectrum = (snapshots @ self.waves).view(complex)
-        filtered = spectrum[:, None] * self.filters
-        # One product of all rows takes half as long as one for each snapshot.
-        x = filtered.reshape(-1, len(self.waves_back)) @ self.waves_back
-        yield x.reshape(*filtered.shape[:2], -1)[: len(signal)]
-
-
 @lru_cache(maxsize=8)
-def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
+def _octaves(cells: int, stride: int) -> list[_Octave]:
     """The octaves of the nodes for lattices of ``cells``, of which every ``stride``-th one is needed."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
-    octaves: list[_FastOctave | _NarrowOctave] = []
+    octaves: list[_Octave] = []
     # Wavelets of higher nodes are shorter: the padding of an octave is that of its lowest node.
     for number in range(int(np.log2(NODES)) + 1):
         nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
@@ -267,22 +227,9 @@ def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
         # The inverse transforms are not divided by the length of the line.
         filters = transform_filters(nodes, KC, padded) / padded
 
-        # Additions and multiplications for one snapshot, by products (real times complex, then complex times complex)
-        # and by transforms, 5/2 n log2 n of a real and 5 n log2 n of a complex signal of length n.
-        width = np.count_nonzero(_lets_through(filters))
-        in_products = 4 * width * cells + 8 * width * len(nodes) * -(-cells // stride)
-        in_transforms = 2.5 * padded * np.log2(padded) + 5 * len(nodes) * length * np.log2(length)
-        if in_products < PRODUCT_GAIN * in_transforms:
-            octaves.append(_NarrowOctave.of(filters, padded, cells, stride))
-        else:
-            groups = [_Filters.of(filters[first : first + GROUP]) for first in range(0, len(nodes), GROUP)]
-            octaves.append(_FastOctave(padded=padded, length=length, groups=groups))
+        groups = [_Filters.of(filters[first : first + GROUP]) for first in range(0, len(nodes), GROUP)]
+        octaves.append(_Octave(padded=padded, length=length, groups=groups))
     return octaves
-
-
-def _lets_through(filters: np.ndarray) -> np.ndarray:
-    """Whether any of the ``filters`` (kappa, k) exceeds the rounding of their largest value, by wavenumber (k,)."""
-    return np.asarray(filters.max(axis=0) > np.finfo(float).eps * filters.max())
 
 
 @kernel
