@@ -7,9 +7,8 @@ from typing import Any, Self
 import numpy as np
 
 from vipetsc.lattice import Chain, Drive, Waveform, pass_bands
-from vipetsc.lattice.modes import Modes
+from vipetsc.lattice.modes import Modes, linear_modes
 from vipetsc.spectra.band_energies import Parts
-from vipetsc.spectra.kept_modes import kept_modes
 from vipetsc.spectra.pooling import blocks
 from vipetsc.spectra.wavelet import BINS
 
@@ -36,7 +35,7 @@ class ModalParts:
     @classmethod
     def of(cls, chain: Chain) -> Self:
         """The modes of ``chain`` without its sites, sorted; they are computed once."""
-        modes = kept_modes(chain)
+        modes = linear_modes(chain)
         parts = Parts.of(pass_bands(chain.cell))
         is_band = np.array([bool(numbers) for numbers in parts.bands])
 
