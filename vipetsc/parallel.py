@@ -241,42 +241,12 @@ class StopRequest:
     """A request to stop, by a signal: ``requested`` once this rank has got one.
 
     One rank must not leave the others: a loop that all ranks go through asks whether it is ``agreed``, or calls
-    ``check``; work that one rank does alone looks at ``requested``, and the ranks agree when they meet again. Where
-    that may take long, the waiting ranks ``pass_on`` what they get within a block of ``passed_on``.
+    ``check``; work that one rank does alone looks at ``requested``, and the ranks agree when they meet again.
     """
 
-    _requested = False
+    requested = False
     _ends_at_once = False
     _GRACE = 2  # s in which EndedError has to get out of the work
-    _LOOK_EVERY = 0.1  # s between two looks at what others pass on; a look takes as long as a tenth of a time step
-    _passed: SharedCounter | None = None
-    _next_look = 0.0
-
-    @property
-    def requested(self) -> bool:
-        """Whether this rank has got a request, or another one has passed on its own."""
-        if self._passed and not self._requested and time.monotonic() >= self._next_look:
-            self._next_look = time.monotonic() + self._LOOK_EVERY
-            self._requested = self._passed.draw(0) > 0
-        return self._requested
-
-    @requested.setter
-    def requested(self, value: bool) -> None:
-        self._requested = value
-
-    @contextmanager
-    def passed_on(self, comm: MPI.Comm) -> Iterator[None]:
-        """Let the requests that other ranks of ``comm`` pass on count as this rank's within the block."""
-        with SharedCounter.within(comm) as self._passed:
-            try:
-                yield
-            finally:
-                self._passed = None
-
-    def pass_on(self) -> None:
-        """Tell the rank that works of a request that this one, which waits, has got."""
-        if self._requested and self._passed:
-            self._passed.draw()
 
     def agreed(self, comm: MPI.Comm) -> bool:
         """Whether any rank of ``comm`` got a request; all must call it."""

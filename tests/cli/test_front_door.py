@@ -49,9 +49,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, with_
 
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["complete"]
-    # A lattice this short is simulated by one rank, and other ranks draw.
-    assert summary["ranks"] == 1
-    assert ("one of 2 ranks computes" in ended.stdout) == (ranks == 2)
+    assert summary["ranks"] == (ranks or 1)
     assert summary["case"]["contacts"]["sites"] == [6, 12, 13]
     assert summary["statistics"]["ledger_error"] < 1e-8
     assert summary["petsc_version"]

@@ -67,9 +67,9 @@ def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kerne
     assert "numba" not in loaded
 
 
-def test_the_second_process_loads_neither_kernels_nor_mpi():
-    """The process that draws pictures beside a run loads matplotlib, but neither numba nor MPI nor PETSc."""
-    program = "import sys, vipetsc.figures.draw_requests, vipetsc.figures.registry; print(*sys.modules)"
+def test_figures_load_neither_kernels_nor_mpi():
+    """The registry of figures loads matplotlib, but neither numba nor MPI nor PETSc."""
+    program = "import sys, vipetsc.figures.registry; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "matplotlib" in loaded
     assert not {"numba", "mpi4py", "petsc4py"} & {*loaded}

@@ -260,13 +260,10 @@ SCENARIOS = {
 def shrink_pictures() -> None:
     """Reduce the program's pictures and the size of its chunks, as the cases are tiny."""
     # Only workers call this function: its replacements remain in the process.
-    from vipetsc.cli.verbs import run_verb
     from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
     registry.FIGURES = {name: spec for name, spec in registry.FIGURES.items() if name in DRAWN}
-    # The record is frozen, and the verb holds it already: it is changed in place.
-    object.__setattr__(run_verb.PICTURES, "unmeasured", tuple({*run_verb.PICTURES.unmeasured} & {*DRAWN}))
     measures_of = measure_pages.measures_of
     measure_pages.measures_of = lambda ensemble: measures_of(ensemble)[:1]
     recorded_sizes.CHUNK_SAMPLES = SAMPLES_A_CHUNK

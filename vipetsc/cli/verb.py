@@ -10,8 +10,7 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ from mpi4py import MPI
 
 from vipetsc.case import CaseFile
 from vipetsc.cli.arguments import Argument
-from vipetsc.cli.drawing import Helper, Pictures, draw_pictures, second_process
-from vipetsc.cli.helping_ranks import HelpingRanks, with_helping_ranks
+from vipetsc.cli.drawing import Pictures, draw_pictures
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
@@ -77,15 +75,13 @@ class PlainVerb(Verb):
 class Work:
     """Arguments of a study besides its case: the parsed ``options``, the ``folder`` of its results, the ranks ``comm``.
 
-    ``stop`` is a request to stop, which the study looks at. A ``helper``, if there is one, can draw pictures while the
-    study computes. ``warned`` are the warnings that were printed.
+    ``stop`` is a request to stop, which the study looks at. ``warned`` are the warnings that were printed.
     """
 
     options: argparse.Namespace
     folder: Path
     comm: MPI.Comm
     stop: StopRequest
-    helper: Helper | None = None
     warned: list[str] = field(default_factory=list)
 
     @property
@@ -125,8 +121,7 @@ class StudyVerb(Verb):
     ``study`` computes, prints the results, and returns how it ended; all ranks call it. ``table`` gives the rows that
     ``validate`` prints of a case on a number of ranks. ``pictures`` are drawn of the results, if there are any. The
     folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, for a verb
-    whose case depends on more than ``CASE`` and ``--set``. ``is_for_one_rank`` says whether one rank computes a case as
-    fast as a number of ranks.
+    whose case depends on more than ``CASE`` and ``--set``.
     """
 
     case: type[CaseFile]
@@ -136,7 +131,6 @@ class StudyVerb(Verb):
     pictures: Pictures | None = None
     suffix: str = ""
     load: Callable[[argparse.Namespace], CaseFile] | None = None
-    is_for_one_rank: Callable[[Any, int], bool] | None = None
     is_stoppable: bool = True
 
     def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
@@ -151,16 +145,7 @@ class StudyVerb(Verb):
         # Computed on rank 0 alone: warnings need the bands of the cell, which take a moment.
         work.warn(on_root(comm, case.warnings))
 
-        # Where no pictures are drawn, the other ranks could not help one that computes alone.
-        if comm.size > 1 and self.pictures_of(case) and on_root(comm, lambda: self.suits_one_rank(case, comm.size)):
-            work.report(f"one of {comm.size} ranks computes, which is as fast; the others draw pictures")
-
-            def compute_alone(helpers: HelpingRanks) -> Outcome:
-                return self.compute_and_draw(case, replace(work, comm=MPI.COMM_SELF, helper=helpers))
-
-            outcome = with_helping_ranks(comm, stop, compute_alone)
-        else:
-            outcome = self.compute_and_draw(case, work)
+        outcome = self.compute_and_draw(case, work)
 
         # Last, where a user sees them, and on stderr, so that --quiet does not silence them.
         for failure in outcome.failures:
@@ -169,35 +154,18 @@ class StudyVerb(Verb):
 
     def compute_and_draw(self, case: CaseFile, work: Work) -> Outcome:
         """Compute the results of the case and draw their pictures; all ranks of ``work`` must call it."""
-        options = work.options
         folder = work.folder
         comm = work.comm
-        pictures = self.pictures_of(case)
         # A study locks its folder too, as the same process may; this lock lasts until the pictures are drawn.
-        with ExitStack() as stack:
-            stack.enter_context(locked(comm, folder))
-            # Results of an earlier command have their pictures already: there is nothing to help with.
-            if pictures and not work.helper and (options.force or not pictures.are_of([folder])):
-                work.helper = stack.enter_context(second_process(pictures, comm, draws_alone=True))
-
+        with locked(comm, folder):
             outcome = self.study(case, work)
             # After a request to stop nothing is drawn: what was computed is saved, and the next command draws it.
             work.stop.check(comm)
-            if pictures and outcome.drawable:
+            if self.pictures and case.wants_pictures and outcome.drawable:
                 with work.stop.at_once():
-                    drawn = draw_pictures(pictures, [folder], comm, afresh=False, helper=work.helper)
+                    drawn = draw_pictures(self.pictures, [folder], comm, afresh=False)
                 echo_paths(comm, drawn)
         return outcome
-
-    def pictures_of(self, case: CaseFile) -> Pictures | None:
-        """The pictures of the results of a case, if it wants any."""
-        if case.wants_pictures:
-            return self.pictures
-        return None
-
-    def suits_one_rank(self, case: CaseFile, ranks: int) -> bool:
-        """Whether one rank computes the case as fast as a number of ``ranks``."""
-        return self.is_for_one_rank is not None and self.is_for_one_rank(case, ranks)
 
     def checked_case(self, options: argparse.Namespace) -> CaseFile:
         """Read the case, on one rank; raises CaseError, also for PETSc options that time stepping does not know."""

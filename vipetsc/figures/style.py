@@ -14,14 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import Bbox
-from PIL import Image
 
 from vipetsc.figures.figure_data import figure_data
-from vipetsc.figures.kept_formulas import kept_formulas
-from vipetsc.figures.kept_ticks import kept_ticks
-from vipetsc.figures.layout import apply_aspects, lay_out, pixel_canvas
+from vipetsc.figures.layout import apply_aspects, lay_out
 from vipetsc.figures.log_ticks import label_log_axes
-from vipetsc.figures.pdf_fonts import plain_fonts
 from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN = 3.4  # width of one journal column in inches
@@ -99,7 +95,7 @@ def band_number(part: str) -> int | None:
 @contextmanager
 def rc_style() -> Iterator[None]:
     """Make and save figures in the house style within the block; then matplotlib's settings are as before."""
-    with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")), kept_formulas():
+    with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")):
         yield
 
 
@@ -147,30 +143,15 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
     look = {"ha": "left", "va": "top", "fontsize": 7, "color": GREY}
     text = figure.text(0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
 
-    with kept_ticks(figure), atomic_write(path) as partial_path:
-        # Without a strip the canvas can print by itself, which takes less time than ``savefig``.
-        if path.suffix == ".pdf" and not lines:
-            # Imported here: the tools for fonts take a quarter of the time that matplotlib itself takes.
-            from matplotlib.backends.backend_pdf import FigureCanvasPdf
-
-            with plain_fonts():
-                FigureCanvasPdf(figure).print_pdf(partial_path)
-        elif path.suffix == ".png" and not lines:
-            figure.set_dpi(SCREEN)
-            canvas = pixel_canvas(figure)
-            canvas.draw()
-            # The page is opaque: without the channel for transparency it is written in half the time, and smaller.
-            pixels = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
-            pixels.convert("RGB").save(partial_path, "png", dpi=(SCREEN, SCREEN), compress_level=COMPRESSION)
-        else:
-            options: dict[str, Any] = {}
-            if lines:
-                options["bbox_inches"] = Bbox([[0, -NOTE * len(lines)], [width, height]])
-            if path.suffix == ".png":
-                options |= {"dpi": SCREEN, "pil_kwargs": {"compress_level": COMPRESSION}}
-            # With such a box ``savefig`` keeps all axes in the frames that they have now.
-            apply_aspects(figure)
-            figure.savefig(partial_path, format=path.suffix[1:], **options)
+    options: dict[str, Any] = {}
+    if lines:
+        options["bbox_inches"] = Bbox([[0, -NOTE * len(lines)], [width, height]])
+        # With such a box ``savefig`` keeps all axes in the frames that they have now.
+        apply_aspects(figure)
+    if path.suffix == ".png":
+        options |= {"dpi": SCREEN, "pil_kwargs": {"compress_level": COMPRESSION}}
+    with atomic_write(path) as partial_path:
+        figure.savefig(partial_path, format=path.suffix[1:], **options)
 
     # The next format of the figure gets a text of its own.
     text.remove()

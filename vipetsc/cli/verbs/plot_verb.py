@@ -10,7 +10,7 @@ from typing import Any
 from mpi4py import MPI
 
 from vipetsc.cli.arguments import Argument, argument
-from vipetsc.cli.drawing import Pictures, draw_pictures, prepare, second_process
+from vipetsc.cli.drawing import Pictures, draw_pictures, prepare
 from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import remove_abandoned
@@ -84,10 +84,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
         raise FolderError(f"{misplaced[0]}: applies only to movies; add --movie")
-    with second_process(pictures, comm, draws_alone=False, names=options.fig) as helper:
-        drawn = draw_pictures(
-            pictures, folders, comm, options.fig, formats=tuple(options.format or ("png",)), helper=helper
-        )
+    drawn = draw_pictures(pictures, folders, comm, options.fig, formats=tuple(options.format or ("png",)))
     echo_paths(comm, drawn)
     return DONE
 

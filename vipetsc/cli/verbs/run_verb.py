@@ -13,7 +13,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
 from vipetsc.cli.case_rows import lattice_rows
-from vipetsc.cli.drawing import Pictures, draw_unmeasured
+from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.messages import logger
 from vipetsc.cli.tables import duration, first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -80,8 +80,6 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     has_two_samples = result.statistics["samples"] > 1
     has_fields = bool(case.output.fields) and has_two_samples
     has_points = bool(case.output.points) and has_two_samples
-    if has_fields and work.helper:
-        draw_unmeasured(PICTURES, work.folder, work.helper)
     if has_fields or has_points:
         measure_unless_measured(work, linear)
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
@@ -112,13 +110,6 @@ def measure_unless_measured(work: Work, linear: "MemberHistory | None") -> None:
     if sweep.is_file():
         sweep = sweep.parent
     measure_run(work.folder, sweep, comm=work.comm, find_arrival=linear.arrival)
-
-
-def one_rank_suffices(case: Case, ranks: int) -> bool:
-    """Whether more ranks do not simulate the case faster, since messages between them take the time that they save."""
-    from vipetsc.dynamics.cost import estimate
-
-    return estimate(case, ranks).one_rank_suffices
 
 
 def run_rows(case: Case, ranks: int) -> Rows:
@@ -313,13 +304,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         measure_run(folder)
 
 
-PICTURES = Pictures(
-    source="run",
-    file="run.h5",
-    noun="run",
-    prepare=measure_where_missing,
-    unmeasured=("phase", "unit_cell", "impacts", "ledger"),
-)
+PICTURES = Pictures(source="run", file="run.h5", noun="run", prepare=measure_where_missing)
 VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",
@@ -331,6 +316,5 @@ VERB = StudyVerb(
     table=run_rows,
     results=RUN,
     pictures=PICTURES,
-    is_for_one_rank=one_rank_suffices,
     takes_petsc_options=True,
 )
