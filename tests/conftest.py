@@ -38,6 +38,7 @@ from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
 from vipetsc.dynamics.result import Result
+from vipetsc.io.read import RUN_NEEDS
 from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, wait_for_all
@@ -152,6 +153,20 @@ def simulated(case: Case, observers: Sequence[type[Observer]] = ()) -> tuple[xr.
     assert result.complete, result.sentence
     assert memory.dataset is not None
     return memory.dataset, result
+
+
+def with_every_variable(run: xr.Dataset) -> xr.Dataset:
+    """Return a ``run`` that was put together for a test with what it lacks of the variables of every run: no episodes.
+
+    The energies that it lacks are 0.
+    """
+    lacking = {"episode": ("episode", np.zeros(0))}
+    for name in RUN_NEEDS:
+        if name not in run and name not in run.attrs:
+            length = {"energy": ("time", run.sizes["time"]), "sites": ("site", run.sizes["site"])}
+            dimension, size = length.get(name.partition("/")[0], ("episode", 0))
+            lacking[name] = (dimension, np.zeros(size))
+    return run.assign(lacking)
 
 
 def run_of(case: Case) -> xr.Dataset:

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from tests.conftest import with_every_variable
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import (
+    RUN_NEEDS,
     curves,
     field_interval,
     field_time,
@@ -53,7 +55,7 @@ def run(tmp_path):
 
     path = tmp_path / "run.h5"
     case = '[lattice]\ncells = 30\nends = "fixed"\n[drive]\ncell = 12'
-    write_netcdf(path, xr.Dataset(data, attrs={"case": case}))
+    write_netcdf(path, with_every_variable(xr.Dataset(data, attrs={"case": case})))
     return path
 
 
@@ -101,12 +103,23 @@ def test_a_run_is_read_by_name(run):
         assert data.encoding["source"] == str(run)
 
 
+@pytest.mark.parametrize("name", RUN_NEEDS)
+def test_a_run_that_lacks_a_variable_is_refused(run, tmp_path, name):
+    with h5py.File(run, "r+") as file:
+        if name == "case":
+            del file.attrs[name]
+        else:
+            del file[name]
+    with pytest.raises(ValueError, match=f"it lacks ({name}|the coordinate)"):
+        open_run(run)
+
+
 def test_other_files_are_refused(tmp_path, folder):
     """A missing file, a file of another kind and results of an earlier version are refused with the reason."""
     with pytest.raises(OSError):
         open_run(tmp_path / "absent.h5")
 
-    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it lacks time, cell, energy"):
+    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it lacks time, cell, dof"):
         open_run(folder / "ensemble.h5")
 
     with h5py.File(tmp_path / "ensemble.h5", "w") as file:

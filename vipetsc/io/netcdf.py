@@ -21,6 +21,7 @@ import numpy as np
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
+from vipetsc.wording import shortened
 
 # xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
 if TYPE_CHECKING:
@@ -233,13 +234,15 @@ def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFile
     reason = str(error)
     if "unable to lock" in reason:
         reason = "another program has it open for writing"
+    if isinstance(error, KeyError):
+        reason = "it lacks the coordinate of a dimension of its variables"
     return UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}")
 
 
 def _refuse_other_kinds(path: str | Path, kind: str, missing: Sequence[str]) -> None:
     """Raise ResultFileError for a file in which something is ``missing`` that every file of its ``kind`` has."""
     if missing:
-        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {', '.join(missing)}")
+        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {shortened(missing)}")
 
 
 def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:

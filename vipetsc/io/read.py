@@ -22,8 +22,14 @@ if TYPE_CHECKING:
 
 # Files that ``open_results`` opens if a folder is given: the first one that exists.
 FIRST = "run.h5", "optimum.h5", "identified.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
-# What the file of a run has at least.
-RUN_NEEDS = "time", "cell", "energy", "case"
+# What the file of every run has: its times, cells and case, and for its energies, sites and episodes all variables.
+RUN_NEEDS = (
+    *("time", "cell", "dof", "case"),
+    *(f"energy/{name}" for name in ("kinetic", "spring", "contact", "work", "dissipated", "dissipated_by_site")),
+    *(f"sites/{name}" for name in ("cell", "clearance")),
+    *(f"impacts/{name}" for name in ("site", "side", "onset", "approach_velocity", "separation")),
+    *(f"impacts/{name}" for name in ("indentation", "force", "loss")),
+)
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
 
