@@ -231,13 +231,19 @@ def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[s
     for number, name in enumerate(plan.ids()):
         row = outcome(number, plan.case(number))
         if isinstance(row, str):
-            row = {"status": "failed", "reason": row}
-        about = {"id": name, "vipetsc_version": __version__, "status": "complete", "reason": "complete"}
+            row = {"reason": row}
+        about = {"kind": "member", "key": name, "vipetsc_version": __version__}
         about |= {"warnings": [], "cpu_seconds": 0.1, "rtol": 1e-10}
         records.append(about | row)
     records.close()
 
     conclude(Results(plan, folder))
+
+
+def record_of_linear(run: Any, name: str) -> dict[str, Any]:
+    """Return the record of a linear ``run`` of that ``name``, as a sweep writes it."""
+    key = " ".join([name, *map(str, run.measures)])
+    return {"kind": "linear", "key": key, "vipetsc_version": __version__} | run.record(name)
 
 
 def modified(folder: Path) -> dict[Path, int]:

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import vipetsc
-from tests.conftest import put_members
+from tests.conftest import put_members, record_of_linear
 from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
@@ -314,7 +314,7 @@ def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
         statistics={"work": 3.0},
         measures={7: {"ibtet": 0.1}},
     )
-    RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(case)))
+    RecordFile(folder / "members-1.jsonl").append(record_of_linear(run, linear_name(case)))
     assert read_linear(folder, Sweep.from_table(SWEEP).case(0)) is None
     again = read_linear(folder, case)
     assert again.record("") == run.record("")
@@ -329,7 +329,7 @@ def test_records_of_another_version_count_as_missing(folder, monkeypatch):
         statistics={"work": 3.0},
         measures={7: {"ibtet": 0.1}},
     )
-    RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(Case.load())))
+    RecordFile(folder / "members-1.jsonl").append(record_of_linear(run, linear_name(Case.load())))
     results = Results(sweep, folder)
     assert not (results.status == MISSING).any()
     assert results.linear
@@ -358,9 +358,9 @@ def scaled_record(name: str, site: int, work: float, warnings: list[str]) -> dic
     """Return the record of a member without contact that has the measures of the linear run ``wave`` at ``site``."""
     statistics = {"episodes": 0, "dissipated": 0.0, "engine": "ts", "work": work, "ledger_error": 0.0}
     return {
-        "id": name,
+        "kind": "member",
+        "key": name,
         "vipetsc_version": vipetsc.__version__,
-        "status": "scaled",
         "warnings": warnings,
         "statistics": statistics,
         "cpu_seconds": 0.0,
@@ -383,7 +383,7 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
 
     measures = {9: {"ibtet": 0.1}, 5: {"ibtet": 0.2, "entropy/history": [1.0], "entropy/snapshot": [0.0]}}
     linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures=measures)
-    file.append(linear.record("wave"))
+    file.append(record_of_linear(linear, "wave"))
     _, warnings = conclude(Results(sweep, tmp_path))
 
     assert warnings == ["3 members: seen", "1 member: alone"]
@@ -400,7 +400,7 @@ def test_an_ensemble_with_an_index_is_complete(tmp_path, monkeypatch):
     one, two = sweep.ids()
     linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures={5: {}})
     file = RecordFile(tmp_path / "members-0.jsonl")
-    file.append(linear.record("wave"))
+    file.append(record_of_linear(linear, "wave"))
     file.append(scaled_record(one, site=5, work=1.0, warnings=[]))
     conclude(Results(sweep, tmp_path))
     index = tmp_path / "index.json"

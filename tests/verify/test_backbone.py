@@ -9,6 +9,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import record_of_linear
 from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
@@ -51,7 +52,7 @@ def test_energies_align_at_grazing(tmp_path):
     envelope[8] = 1e-4
     case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
     linear = LinearRun(envelope, np.zeros(20), {"work": 1.5e-3}, {})
-    RecordFile(tmp_path / "members-0.jsonl").append(linear.record(linear_name(case)))
+    RecordFile(tmp_path / "members-0.jsonl").append(record_of_linear(linear, linear_name(case)))
 
     initiation = initiation_of(tmp_path, case)
 
@@ -72,7 +73,7 @@ def linear_record(folder, *overrides: str) -> Case:
     """Record the linear run of a case with ``overrides``, whose envelope is 2e-4 m everywhere; returns the case."""
     case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", *overrides])
     linear = LinearRun(np.full(20, 2e-4), np.zeros(20), {"work": 1.5e-3}, {})
-    RecordFile(folder / "members-0.jsonl").append(linear.record(linear_name(case)))
+    RecordFile(folder / "members-0.jsonl").append(record_of_linear(linear, linear_name(case)))
     return case
 
 

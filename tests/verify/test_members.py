@@ -14,12 +14,12 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.read import open_ensemble
 from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.ensemble import COMPLETE, SCALED
+from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED
 from vipetsc.studies.linear_run import MEMBERS, linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sweep import run_sweep
-from vipetsc.studies.sweep_runs import SweepRuns
+from vipetsc.studies.sweep_runs import NeededRun, SweepRuns
 
 TABLE = {
     "name": "margin",
@@ -42,7 +42,7 @@ def sweep(tmp_path_factory):
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
     plan = Sweep.from_table(TABLE | {"sweep": {"drive": {"amplitude": [1.0]}}})
     runs = SweepRuns(plan, folder, MPI.COMM_SELF, StopRequest())
-    runs.make_linear(linear_case(case), ())
+    runs.make_linear({linear_name(case): NeededRun(linear_case(case), [])})
     reached = runs.linear[linear_name(case)].reached(case).max()
 
     margins = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
@@ -98,7 +98,7 @@ def test_damaged_records_are_named_and_simulated_again(sweep, tmp_path):
 
     # The first line is the linear run, the others are the members.
     assert len(lines) == 7
-    assert b'"linear"' in lines[0][:10]
+    assert b'"linear"' in lines[0][:20]
 
     # Without the record of the linear run, the two members that are scaled from it are computed again.
     for number, missing in ((0, 2), (2, 1), (6, 1)):
@@ -175,7 +175,7 @@ def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
     paths.merged.unlink()
     file = RecordFile(paths.for_rank(1))
     for record in records:
-        if "measures" in record and "id" in record:
+        if record["kind"] == "member":
             record["measures"]["ibtet"] = 2 * right
         file.append(record)
     file.close()
@@ -272,3 +272,26 @@ def test_members_whose_bands_overlap_differently_keep_their_parts():
     assert ensemble["bands/share"].sum("part").values == pytest.approx(1.0)
     energy = ensemble["bands/modal_energy"].sum("part").values
     assert energy == pytest.approx(ensemble["work"].values * (1 - ensemble["dissipated_fraction"].values), rel=1e-2)
+
+
+NO_SECOND_SITE = """
+from vipetsc import register
+
+
+@register.measure("first-site-only", unit="1", text="a number", power=0.0)
+def first_site_only(record):
+    return [1.0][int(record.run["sites/cell"][0] == 13)]
+"""
+
+
+def test_measures_that_fail_for_one_first_site_fail_its_members_alone(tmp_path):
+    """Members with other first sites share the linear run, which one measure cannot measure from site 13 on."""
+    (tmp_path / "part.py").write_text(NO_SECOND_SITE)
+    table = TABLE | {"plugins": {"modules": [str(tmp_path / "part.py")]}}
+    table["sweep"] = {"measures": ["motion"], "contacts": {"sites": [[8, 15], [13, 15]]}}
+    table["sweep"]["drive"] = {"amplitude": [0.1, 0.2]}
+    table["contacts"] = {"clearance": 2e-4}
+
+    result = run_sweep(Sweep.from_table(table), tmp_path / "out")
+
+    assert result.status.tolist() == [SCALED, SCALED, FAILED, FAILED]

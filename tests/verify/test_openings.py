@@ -238,7 +238,7 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
         assert run_sweep(plan, tmp_path / name).complete
         lines = (tmp_path / name / "members.jsonl").read_text().splitlines()
         members = [json.loads(line) for line in lines]
-        records[name] = {row["id"]: row for row in members if "id" in row}
+        records[name] = {row["key"]: row for row in members if row["kind"] == "member"}
 
     # Sweeps of the same base case give the same names to equal members.
     for name, row in records["some"].items():

@@ -9,18 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-import vipetsc
 from vipetsc.case import Sweep
 from vipetsc.case.disorder import SEED
 from vipetsc.case.keys import unit_of
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
-from vipetsc.io.records import Line, Record, merge_records, read_records
+from vipetsc.io.records import Line, Record
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, power_of, row_of
-from vipetsc.studies.linear_run import FITTED, MEASURES, MEMBERS, LinearRun, of_motion
+from vipetsc.studies.linear_run import FITTED, LINEAR, MEASURES, MEMBER, MEMBERS, LinearRun, of_motion
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
@@ -104,39 +103,29 @@ class Results:
     def _read(self, number_of: Mapping[str, int]) -> dict[int, LinearSource]:
         """Take all records; returns what scaled members were scaled from, by the members' numbers."""
         sources: dict[int, LinearSource] = {}
-        for path in self.files:
-            for record, line in read_records(path, self.damaged.append):
-                # Another version may simulate and measure otherwise: its members count as missing.
-                if record["vipetsc_version"] != vipetsc.__version__:
-                    continue
-                if "envelope" in record:
-                    self._enter_linear(record, line)
-                    continue
-
-                number = number_of.get(record["id"])
-                if number is not None:
-                    self._enter(number, record, line)
-                    if record["status"] == STATUS[SCALED]:
-                        sources[number] = LinearSource(record["linear"], record["site"], record.get("factor", 1.0))
+        for key, record, line in self.paths.read(self.damaged.append):
+            number = number_of.get(str(key))
+            if record["kind"] == LINEAR and "reason" not in record:
+                # It may be measured for other sites than an earlier record of the same run.
+                name = record["linear"]
+                self.linear[name] = LinearRun.from_record(record).joined(self.linear.get(name))
+            elif record["kind"] == MEMBER and number is not None:
+                self._enter(number, record)
+                if self.status[number] == SCALED:
+                    sources[number] = LinearSource(record["linear"], record["site"], record.get("factor", 1.0))
+            else:
+                continue
+            self.lines[str(key)] = line
         return sources
 
-    def _enter_linear(self, record: Record, line: Line) -> None:
-        """Take the ``record`` of a linear run, which may be measured for other sites than an earlier one."""
-        run = LinearRun.from_record(record)
-        name = record["linear"]
-        self.linear[name] = run.joined(self.linear.get(name))
-        # A run may have several records, each with the measures for other first sites: all of them are kept.
-        self.lines[f"{name} {[*run.measures]}"] = line
-
-    def _enter(self, number: int, record: Record, line: Line) -> None:
-        """Take the ``record`` of a member; the latest counts, a failure only where nothing else is there."""
-        failed = record["status"] == STATUS[FAILED]
-        if failed and self.status[number] in (COMPLETE, SCALED):
-            return
-        self.status[number] = STATUS.index(record["status"])
-        self.lines[record["id"]] = line
+    def _enter(self, number: int, record: Record) -> None:
+        """Take the ``record`` of a member."""
+        self.status[number] = COMPLETE
+        if "linear" in record:
+            self.status[number] = SCALED
         self.reasons.pop(number, None)
-        if failed:
+        if "reason" in record:
+            self.status[number] = FAILED
             self.reasons[number] = record["reason"]
             return
 
@@ -205,7 +194,7 @@ class Results:
     def merge_files(self) -> None:
         """Merge the records of all ranks into one file, without outdated ones."""
         if self.damaged or self.files != [self.paths.merged]:
-            merge_records(self.paths.merged, self.lines.values(), self.paths.by_rank())
+            self.paths.merge(self.lines.values())
 
 
 def assemble(results: Results, warnings: Sequence[str] = ()) -> None:

@@ -16,12 +16,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import xarray as xr
 
-import vipetsc
 from vipetsc import spectra
 from vipetsc.case import Case, case_id
 from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
 from vipetsc.io.read import field_time
-from vipetsc.io.records import Record, read_records
+from vipetsc.io.records import Record
 from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
@@ -35,6 +34,9 @@ MARGIN = 0.9
 BLOCK = 64  # samples of which the envelope is taken together; any number that leaves arrays in the cache serves
 REFERENCE = 1.0  # amplitude of a linear run, in N or m
 MEMBERS = "members"  # what the records of a sweep are called
+# Kinds of these records.
+LINEAR = "linear"
+MEMBER = "member"
 
 # Measures of a member in the ensemble: further dimension, units and description.
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
@@ -94,20 +96,16 @@ class LinearRun(NamedTuple):
         """
         return reached(self.envelope, case)
 
-    def joined(self, other: "LinearRun | str | None") -> "LinearRun":
-        """The run with the measures that another record of it, ``other``, holds as well.
-
-        Without such a record, ``other`` is None or the reason why that run failed.
-        """
-        if isinstance(other, LinearRun):
-            return self._replace(measures=other.measures | self.measures)
-        return self
+    def joined(self, other: "LinearRun | None") -> "LinearRun":
+        """Return the run with the measures that another record of it, ``other``, holds as well."""
+        if other is None:
+            return self
+        return self._replace(measures=other.measures | self.measures)
 
     def record(self, name: str) -> Record:
-        """The run as the record ``name``."""
+        """The run as a record of the linear run ``name``."""
         return {
             "linear": name,
-            "vipetsc_version": vipetsc.__version__,
             "envelope": self.envelope.tolist(),
             "arrival": self.arrival.tolist(),
             "statistics": self.statistics,
@@ -286,8 +284,7 @@ def read_linear(sweep: Path, case: Case) -> LinearRun | None:
     """The linear run of ``case`` in the folder of a ``sweep``; None if there is no record of one."""
     run = None
     name = linear_name(case)
-    for path in RecordPaths(sweep, MEMBERS).existing():
-        for record, _ in read_records(path, damaged=lambda text: None):
-            if record.get("linear") == name and "envelope" in record:
-                run = LinearRun.from_record(record)
+    for _, record, _ in RecordPaths(sweep, MEMBERS).read():
+        if record["kind"] == LINEAR and record.get("linear") == name:
+            run = LinearRun.from_record(record)
     return run

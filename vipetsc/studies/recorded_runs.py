@@ -1,11 +1,12 @@
 """Runs of a study, simulated by teams of ranks and recorded as they end, so that an interrupted study can continue.
 
-Every study with many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum,
-and a sweep, whose records are in ``members.jsonl`` and are read by ``studies.ensemble``.
+Every study with many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum, an
+identification and a sweep. A record has the ``key`` of its run, a ``kind`` (a sweep has linear runs and members), the
+version of the program, the time that it took, and what was measured, or the ``reason`` why the run failed.
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from mpi4py import MPI
@@ -24,6 +25,7 @@ from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float] | tuple[str, float, int]
+RUN = "run"  # the kind of a record, where a study has one kind
 # Exceptions that say that a run itself has failed, and would fail again. Too little memory (MemoryError, or CaseError
 # from a check before the run) and a full disk (OSError) are not among them: the next attempt may have more.
 FAILURES = (RuntimeError, ArithmeticError)
@@ -57,6 +59,31 @@ class RecordPaths:
             files.insert(0, self.merged)
         return files
 
+    def read(self, damaged: Callable[[str], None] = lambda text: None) -> Iterator[tuple[Key, Record, Line]]:
+        """Yield the records of this version with their keys and places; a later one of a key replaces an earlier one.
+
+        A failure after a success is passed over. ``damaged`` gets a sentence about each line that cannot be used.
+        """
+        succeeded: set[Key] = set()
+        for path in self.existing():
+            for record, line in read_records(path, damaged):
+                # Another version may simulate and measure otherwise: its runs are made again.
+                if record["vipetsc_version"] != vipetsc.__version__:
+                    continue
+                key = record["key"]
+                # JSON has no tuples.
+                if isinstance(key, list):
+                    key = tuple(key)
+                if "reason" not in record:
+                    succeeded.add(key)
+                elif key in succeeded:
+                    continue
+                yield key, record, line
+
+    def merge(self, lines: Iterable[Line]) -> None:
+        """Merge the files of all ranks into one, which has the records at ``lines``."""
+        merge_records(self.merged, lines, self.by_rank())
+
 
 class RecordedRuns:
     """Runs simulated by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
@@ -87,7 +114,7 @@ class RecordedRuns:
     def read(self) -> "RecordedRuns":
         """Read the records in the files into ``records``, on all ranks; returns itself. Collective."""
         # Rank 0 reads for all ranks, which must agree on the runs that are missing.
-        self.records = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
+        self.records = on_root(self.comm, lambda: {key: record for key, record, _ in self.paths.read()})
         return self
 
     def make(
@@ -102,36 +129,16 @@ class RecordedRuns:
         """Compute the missing records of ``keys``; ``work`` returns that of a key. Collective.
 
         All ranks of a team call ``work`` for the same key. With ``allow_failures`` a run that fails is recorded with
-        its ``reason``; otherwise it raises RuntimeError on all ranks once the others have ended. Raises OSError on all
-        ranks, without a record, if memory or disk is short, or for an exception that is not among those that count as a
-        failure of a run: the next call may succeed. Raises StoppedError on all ranks after a request to stop; what has
-        ended by then is recorded. ``what`` names the runs in messages and in the bar that ``progress`` shows.
+        its ``reason``; otherwise it raises RuntimeError on all ranks once the others have ended. Raises as ``compute``,
+        and StoppedError on all ranks after a request to stop; what has ended by then is recorded. ``what`` names the
+        runs in messages and in the bar that ``progress`` shows.
         """
-        # A key that is given twice is computed once; the order stays, the same on all ranks.
-        missing = [key for key in dict.fromkeys(keys) if key not in self.records]
-        recorded: dict[Key, Record] = {}
         failed: list[str] = []
 
-        def make_one(key: Key) -> None:
-            begin = time.process_time()
-            record = work(key)
-            timed = {"cpu_seconds": round(time.process_time() - begin, 4)} | record
-            on_root(self.team, lambda: keep(key, timed))
-
-        def keep(key: Key, record: Record) -> None:
-            recorded[key] = {"key": key, "vipetsc_version": vipetsc.__version__} | record
-            self.file.append(recorded[key])
-
         def fail(key: Key, reason: str) -> None:
-            if allow_failures:
-                keep(key, {"reason": reason})
-            else:
-                failed.append(f"{key}: {reason}")
+            failed.append(f"{key}: {reason}")
 
-        self.pool.run(missing, make_one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
-        on_every_rank(self.comm, self.file.close)
-        for records in self.comm.allgather(recorded):
-            self.records |= records
+        self.compute(keys, work, what=what, progress=progress, fail=None if allow_failures else fail)
         if self.pool.stopped:
             raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command continues")
 
@@ -144,16 +151,61 @@ class RecordedRuns:
 
         on_root(self.comm, check)
 
-    def keep_part(self, key: Key, record: Record) -> None:
+    def compute(
+        self,
+        keys: Iterable[Key],
+        work: Callable[[Key], Record],
+        *,
+        kind: str = RUN,
+        what: str = "runs",
+        progress: bool = False,
+        keep: bool = True,
+        fail: Callable[[Key, str], None] | None = None,
+    ) -> int:
+        """Compute the missing records of ``keys``, of one ``kind``, until a request to stop; returns how many it made.
+
+        Collective. ``fail`` is called on the first rank of a team with the key and the reason of a run that failed; by
+        default the reason is recorded. With ``keep`` the records are added to ``records``, which is in memory.
+        Raises OSError on all ranks, without a record, if memory or disk is short, or for an exception that is not among
+        those that count as a failure of a run: the next call may succeed; PartError for a mistake in a user's module.
+        """
+        # A key that is given twice is computed once; the order stays, the same on all ranks.
+        missing = [key for key in dict.fromkeys(keys) if key not in self.records]
+        recorded: dict[Key, Record] = {}
+
+        def make_one(key: Key) -> None:
+            begin = time.process_time()
+            record = work(key)
+            timed = {"cpu_seconds": round(time.process_time() - begin, 4)} | record
+            on_root(self.team, lambda: append(key, timed))
+
+        def append(key: Key, record: Record) -> None:
+            whole = self._append(key, record, kind)
+            if keep:
+                recorded[key] = whole
+
+        def record_failure(key: Key, reason: str) -> None:
+            append(key, {"reason": reason})
+
+        bar = Progress(self.comm, len(missing), what, show=progress and bool(missing))
+        done = self.pool.run(missing, make_one, bar, fail or record_failure)
+        on_every_rank(self.comm, self.file.close)
+        for records in self.comm.allgather(recorded):
+            self.records |= records
+        return done
+
+    def _append(self, key: Key, record: Record, kind: str) -> Record:
+        """Append the ``record`` of ``key`` to this rank's file; returns it with its key, its kind and the version."""
+        whole = {"kind": kind, "key": key, "vipetsc_version": vipetsc.__version__} | record
+        self.file.append(whole)
+        return whole
+
+    def keep_part(self, key: Key, record: Record, kind: str = RUN) -> None:
         """Append the ``record`` of a part of the team's run; after an interruption, ``read`` finds it.
 
         All ranks of the team must call it. Raises OSError on all if the disk is full.
         """
-
-        def append() -> None:
-            self.file.append({"key": key, "vipetsc_version": vipetsc.__version__} | record)
-
-        on_root(self.team, append)
+        on_root(self.team, lambda: self._append(key, record, kind))
 
     def simulate(self, case: Case, output: RunOutput, opening: Callable[[], Opening | None] | None = None) -> Result:
         """Run ``case`` on all ranks of the team into ``output``, with an ``opening`` as in ``dynamics.simulate``.
@@ -176,26 +228,11 @@ class RecordedRuns:
         """
 
         def merge() -> None:
-            by_rank = self.paths.by_rank()
-            if by_rank:
-                merge_records(self.paths.merged, [line for _, line in self._read().values()], by_rank)
+            if self.paths.by_rank():
+                self.paths.merge({key: line for key, _, line in self.paths.read()}.values())
 
         on_root(self.comm, merge)
         self.team.Free()
-
-    def _read(self) -> dict[Key, tuple[Record, Line]]:
-        """Records of this version and their lines by key, without damaged lines, whose runs are simulated again."""
-        records: dict[Key, tuple[Record, Line]] = {}
-        for path in self.paths.existing():
-            for record, line in read_records(path, damaged=lambda text: None):
-                if record["vipetsc_version"] != vipetsc.__version__:
-                    continue
-                key = record["key"]
-                # JSON has no tuples.
-                if isinstance(key, list):
-                    key = tuple(key)
-                records[key] = record, line
-        return records
 
 
 def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, Result]:

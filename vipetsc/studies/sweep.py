@@ -27,10 +27,10 @@ from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
-from vipetsc.progress import Progress, say
+from vipetsc.progress import say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import LinearRun, first_site_cell, linear_name
-from vipetsc.studies.sweep_runs import SweepRuns
+from vipetsc.studies.sweep_runs import NeededRun, SweepRuns
 from vipetsc.wording import counted
 
 if TYPE_CHECKING:
@@ -167,33 +167,28 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     begin = time.perf_counter()
     sys.audit("vipetsc.plan", plan.name)
     runs = SweepRuns(plan, folder, comm, stop)
-    pool = runs.recorded.pool
 
     # One rank looks at what there is and decides on the order: on a network file system another rank may not see the
     # files yet. The survey stays there, in this list; the others get the parts of it that they need.
     surveys: list[_Survey] = []
 
-    def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun | str]]:
+    def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun]]:
         survey = _survey(plan, folder)
         surveys.append(survey)
         # Where no member is missing, no rank needs the linear runs, which may be large to send.
-        linear: dict[str, LinearRun | str] = {}
+        linear: dict[str, LinearRun] = {}
         if len(survey.missing):
             linear |= survey.results.linear
         return survey.needed, linear
 
     # Linear runs first: members without contact are scaled from them, and they show what the others will cost.
     needed, runs.linear = on_root(comm, look)
-    pool.run(list(needed), lambda name: runs.make_linear(*needed[name]))
-    _join_linear_runs(runs, comm)
-
+    runs.make_linear(needed)
     order = on_root(comm, lambda: surveys[0].order(runs.linear))
-    bar = Progress(comm, len(order), "runs", show=progress)
-    computed = pool.run(order, runs.make, bar, runs.fail)
-    on_every_rank(comm, runs.recorded.file.close)
+    computed = runs.make_members(order, progress)
 
     seconds = time.perf_counter() - begin
-    busy = tuple(comm.allgather(pool.busy / seconds))
+    busy = tuple(comm.allgather(runs.recorded.pool.busy / seconds))
 
     def put_together() -> tuple[np.ndarray, list[str]]:
         survey = surveys[0]
@@ -207,23 +202,6 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     # MPI has a limited number of communicators, and a process may run many sweeps.
     runs.recorded.team.Free()
     return SweepResult(status=status, computed=computed, seconds=seconds, busy=busy, folder=folder, warnings=warnings)
-
-
-def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
-    """Give every rank the linear runs of all ranks, each with all measures that any rank took of it. Collective."""
-    for from_rank in comm.allgather(runs.linear):
-        for name, run in from_rank.items():
-            # A text is the reason why the run failed.
-            if not isinstance(run, str):
-                run = run.joined(runs.linear.get(name))
-            runs.linear[name] = run
-
-
-class NeededRun(NamedTuple):
-    """A linear run that is missing: a ``case`` that needs it, and the first ``sites`` (cells) to measure it for."""
-
-    case: Case
-    sites: list[int]
 
 
 class DrawnMember(NamedTuple):
@@ -248,7 +226,7 @@ class _Survey(NamedTuple):
     needed: dict[str, NeededRun]
     lost: list[str]
 
-    def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
+    def order(self, linear: dict[str, LinearRun]) -> list[int]:
         """The numbers of the missing members in the order in which they are simulated.
 
         Members of one linear run follow each other, since ranks keep few of these runs. The longest come first, so that
@@ -261,7 +239,7 @@ class _Survey(NamedTuple):
         runs = [""]
         for member in self.drawn:
             run = linear.get(member.linear)
-            if isinstance(run, LinearRun):
+            if run is not None:
                 # Beyond ten clearances a site costs little more: a member of five sites takes 0.38 s of CPU at one or
                 # two clearances, 0.56 at 6, 0.64 at 19 and 0.97 at 620. The end time orders members without contacts.
                 contacts = float(np.minimum(run.reached(member.case), 10.0).sum())

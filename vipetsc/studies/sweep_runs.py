@@ -1,16 +1,15 @@
 """The runs of a sweep: members are simulated and measured, or scaled from a linear run, and each leaves a record."""
 
 import json
-import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 import xarray as xr
 
-import vipetsc
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.recorded_sizes import recorded_cells
@@ -23,23 +22,39 @@ from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
-from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly, history_bytes
-from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, first_site_cell, linear_name, measured
+from vipetsc.studies.linear_run import (
+    LINEAR,
+    MARGIN,
+    MEMBER,
+    MEMBERS,
+    LinearRun,
+    factor,
+    first_site_cell,
+    linear_name,
+    measured,
+)
 from vipetsc.studies.pool import reason_of
-from vipetsc.studies.recorded_runs import RecordedRuns
+from vipetsc.studies.recorded_runs import Key, RecordedRuns
 
 FIELDS = ("displacement", "velocity")
 # What ``analyse`` is asked for, by the sweep's ``measures``.
 ANALYSED = {"entropy": ("entropy",), "transfer": ("bands", "modal")}
 
 
+class NeededRun(NamedTuple):
+    """A linear run that is missing: a ``case`` that needs it, and the first ``sites`` (cells) to measure it for."""
+
+    case: Case
+    sites: list[int]
+
+
 class SweepRuns:
     """The members of the sweep ``plan`` and its linear runs, ``recorded`` in ``folder``.
 
-    All ranks of ``comm`` must construct one; the ranks of a team work together on each run, and call every method that
-    simulates. If the sweep keeps fields, each member also has a folder ``<id>/`` with ``run.h5`` and ``analysis.h5``.
-    ``linear`` holds the linear runs that this rank has so far, by name; of one that failed, the reason.
+    All ranks of ``comm`` must construct one; the ranks of a team work together on each run. If the sweep keeps fields,
+    each member also has a folder ``<id>/`` with ``run.h5`` and ``analysis.h5``. ``linear`` holds the linear runs that
+    this rank has so far, by name; ``failed`` the reasons of those that failed, by name and first site (0 for none).
     """
 
     def __init__(self, plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
@@ -47,40 +62,55 @@ class SweepRuns:
         self.folder = folder
         self.ids = plan.ids()
         self.measures = measures_of(plan)
-        # Any exception counts as a failure of the member, but for a full disk: a sweep goes on past failures.
+        # Most exceptions count as failures of the member: a sweep goes on past them.
         self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, ranks=plan.options.ranks, failures=(Exception,))
-        self.linear: dict[str, LinearRun | str] = {}
+        self.linear: dict[str, LinearRun] = {}
+        self.failed: dict[tuple[str, int], str] = {}
         self._histories = LinearHistories()
         # Members use one block of memory for their fields, one after the other: none is needed once it is measured.
         self._fields = FieldMemory()
 
-    def make_linear(self, case: Case, sites: Collection[int]) -> None:
+    def make_linear(self, needed: Mapping[str, NeededRun]) -> None:
+        """Simulate the linear runs that are ``needed``, by name, and give them to all ranks. Collective."""
+        keys = {_linear_key(name, run.sites): name for name, run in needed.items()}
+
+        def make(key: Key) -> Record:
+            run = needed[keys[str(key)]]
+            return self._linear_record(run.case, run.sites)
+
+        self.recorded.compute(keys, make, kind=LINEAR)
+        for key, name in keys.items():
+            # A run that a request to stop kept from being made has no record.
+            record = self.recorded.records.get(key)
+            if record is not None:
+                self._take_linear(name, needed[name].sites, record)
+
+    def _take_linear(self, name: str, sites: Sequence[int], record: Record) -> None:
+        """Take the ``record`` of the linear run ``name`` for the first ``sites`` (cells), or why it failed."""
+        if "reason" not in record:
+            self.linear[name] = LinearRun.from_record(record).joined(self.linear.get(name))
+        # What failed for several sites together is tried again for each: measures from one of them may be to blame.
+        elif len(sites) < 2:
+            self.failed[name, max(sites, default=0)] = record["reason"]
+
+    def _linear_record(self, case: Case, sites: Collection[int]) -> Record:
         """Simulate the linear run of ``case``, and measure it for members with a first site among ``sites`` (cells).
 
-        Raises StoppedError, or RuntimeError if the run fails; then it is not tried again, and every later call raises.
+        Returns its record. Raises StoppedError, or RuntimeError if the run fails.
         """
         name = linear_name(case)
-        earlier = self.linear.get(name)
-        if isinstance(earlier, str):
-            raise RuntimeError(earlier)
+        history = self._make_history(case)
 
-        try:
-            history = self._make_history(case)
+        def measure() -> Record:
+            entropies = history.opening_entropies(samples=history.run.sizes["time"], factor=1.0)
+            linear = LinearRun.of(
+                history.run, history.statistics, sites=sites, names=self.measures, entropies=entropies
+            )
+            return linear.record(name)
 
-            def measure() -> LinearRun:
-                entropies = history.opening_entropies(samples=history.run.sizes["time"], factor=1.0)
-                linear = LinearRun.of(
-                    history.run, history.statistics, sites=sites, names=self.measures, entropies=entropies
-                )
-                self.recorded.file.append(linear.record(name))
-                return linear
-
-            self.linear[name] = on_root(self.recorded.team, measure).joined(earlier)
-            self._keep(name, history, case)
-        except Exception as error:
-            # Every member that needs it fails with this reason, without another try.
-            self.linear[name] = reason_of(error)
-            raise
+        record = on_root(self.recorded.team, measure)
+        self._keep(name, history, case)
+        return record
 
     def _make_history(self, case: Case) -> LinearHistory:
         """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if the run fails."""
@@ -112,12 +142,21 @@ class SweepRuns:
         assert history
         return history.opening(case)
 
-    def make(self, number: int) -> None:
-        """Simulate the member ``number``, or scale it, and record it.
+    def make_members(self, numbers: Iterable[int], progress: bool) -> int:
+        """Simulate or scale the members with these ``numbers``; returns how many succeeded. Collective."""
+        number_of = {self.ids[number]: number for number in numbers}
 
-        Raises as ``make_linear``, and RuntimeError if its case is impossible or its run fails.
+        def make(key: Key) -> Record:
+            return self._member_record(number_of[str(key)])
+
+        # The records of a large sweep would not fit into the memory of all ranks: they are read when all are there.
+        return self.recorded.compute(number_of, make, kind=MEMBER, progress=progress, keep=False)
+
+    def _member_record(self, number: int) -> Record:
+        """Simulate the member ``number``, or scale it; returns its record.
+
+        Raises as ``_linear_of``, and RuntimeError if its case is impossible or its run fails.
         """
-        begin = time.process_time()
         member = self.plan.member(number)
         if member.case is None:
             raise RuntimeError("; ".join(map(str, member.problems)))
@@ -131,43 +170,36 @@ class SweepRuns:
             modules = case.plugins.modules
         scales = not self.plan.options.fields and can_be_scaled(modules)
         if scales and bool((linear.reached(case) < MARGIN).all()):
-            status = SCALED
             record = _scaled(case, linear, name, site)
         else:
-            status = COMPLETE
             record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), name)
-        record |= {"rtol": case.time.rtol, "cpu_seconds": round(time.process_time() - begin, 4)}
-        on_root(self.recorded.team, lambda: self._append(number, status, record))
+        return record | {"rtol": case.time.rtol}
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
-        """The linear run ``name`` of ``case``, with measures for the first ``site`` (cell); simulated if missing.
+        """Return the linear run ``name`` of ``case``, measured for the first ``site`` (cell); simulated if missing.
 
-        Raises as ``make_linear``.
+        Raises StoppedError, or RuntimeError if the run fails, or has failed before: then it is not tried again.
         """
-        linear = self.linear.get(name)
         # Where fields are kept members are measured, not scaled, and need no measures of the linear run.
         sites = [site]
         if self.plan.options.fields:
             sites = []
-        if not isinstance(linear, LinearRun) or not linear.measures.keys() >= {*sites}:
-            self.make_linear(case, sites)
-            linear = self.linear[name]
-        assert isinstance(linear, LinearRun)
-        return linear
+        linear = self.linear.get(name)
+        if linear is not None and linear.measures.keys() >= {*sites}:
+            return linear
 
-    def fail(self, number: int, reason: str) -> None:
-        """Record why a member failed, on the first rank of its team."""
-        self._append(number, FAILED, {"reason": reason})
-
-    def _append(self, number: int, status: int, record: Record) -> None:
-        """Append the ``record`` of a member with its name, its place in the sweep and its ``status``."""
-        about = {
-            "id": self.ids[number],
-            "place": [*map(int, np.unravel_index(number, self.plan.shape))],
-            "status": STATUS[status],
-            "vipetsc_version": vipetsc.__version__,
-        }
-        self.recorded.file.append(about | record)
+        failed = self.failed.get((name, max(sites, default=0)))
+        if failed is not None:
+            raise RuntimeError(failed)
+        try:
+            record = self._linear_record(case, sites)
+        except Exception as error:
+            # Every member that needs it fails with this reason, without another try.
+            self._take_linear(name, sites, {"reason": reason_of(error)})
+            raise
+        self.recorded.keep_part(_linear_key(name, sites), record, kind=LINEAR)
+        self._take_linear(name, sites, record)
+        return self.linear[name]
 
     def _simulate(self, case: Case, folder: Path, arrival: float | None, name: str) -> Record:
         """Simulate and measure a member of which all samples and cells are recorded; returns its record.
@@ -222,7 +254,6 @@ class SweepRuns:
                 for file in ("summary.json", "case.toml"):
                     (folder / file).unlink(missing_ok=True)
             return {
-                "reason": result.sentence,
                 "statistics": result.statistics,
                 "warnings": [*result.warnings, *json.loads(analysis.attrs.get("warnings", "[]"))],
                 "measures": measured(analysis),
@@ -231,13 +262,17 @@ class SweepRuns:
         return on_root(self.recorded.team, measure)
 
 
+def _linear_key(name: str, sites: Iterable[int]) -> str:
+    """Return the key of the linear run ``name`` that is measured for the first ``sites`` (cells)."""
+    return " ".join([name, *map(str, sites)])
+
+
 def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
     """The record of a member without contact: its ``linear`` run ``name``, scaled to the amplitude of ``case``.
 
     ``site`` is the member's first site (cell), for which the linear run was measured.
     """
     return {
-        "reason": "complete: scaled from the linear run",
         "linear": name,
         "site": site,
         "factor": factor(case),
