@@ -140,9 +140,8 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
     work = work_of(identify_table(table, measured_table(folder, table), unknowns=unknowns))
     misfit = work.windows().misfit
     z = work.starts()[0]
-    _, slopes = misfit.predicted(z, 0, 1.0, [0])
-    slopes = slopes[:, :, 0]
-    onsets = np.sort(misfit.respond(z, 0, 1.0).episodes["onset"])
+    onsets = np.sort(misfit.motion(z, 0, 1.0).onset)
+    slopes = misfit.jacobian(z, [1.0], [0]).reshape(-1, len(misfit.noise[0])) * misfit.noise[0]
 
     def moved(step: float) -> np.ndarray:
         """The velocities of a run whose clearance is exp(``step``) times as large."""

@@ -226,6 +226,10 @@ class StoppedError(Exception):
     """Work was left on request; the message says how to go on with it."""
 
 
+class StudyError(RuntimeError):
+    """A study that cannot be finished: the message says which of its runs failed, and why."""
+
+
 class EndedError(BaseException):
     """Work in which nothing has to be saved was ended on request, by an exception that no handler of errors takes.
 

@@ -66,6 +66,28 @@ def test_bad_data_write_nothing(in_process, case, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_case_without_a_fit_is_one_sentence(in_process, tmp_path):
+    """Where no start is a possible case, the command says so and leaves its records: exit code 1."""
+    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
+    wall = {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "frequency": 50.0}
+    table = {"lattice": {"cells": 4, "cell": {"masses": [0.1], "springs": [spring], "contact": [1, 1]}}, "drive": wall}
+    table["contacts"] = {"sites": []}
+    times = 1e-3 * np.arange(40)
+    np.savetxt(tmp_path / "r.csv", np.column_stack([times, np.sin(50 * times)]), delimiter=",")
+    sensor = {"quantity": "velocity", "column": 2, "cell": 2}
+    # A spring to a moved wall must be linear.
+    unknowns = [{"quantity": "quadratic", "bounds": [1e4, 1e6]}]
+    record = {"file": str(tmp_path / "r.csv"), "time": 1, "sensors": [sensor]}
+    path = tmp_path / "none.toml"
+    path.write_text(tomli_w.dumps(identify_table(table, record, unknowns=unknowns)))
+
+    ended = in_process("identify", path, "--out", tmp_path / "out")
+    assert ended.returncode == 1
+    assert "vipetsc: no start leads to a fit" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "out" / "identified.h5").exists()
+
+
 def test_another_record_is_not_gone_on_with(in_process, case, tmp_path):
     """Results of a record with other values are refused: the hash of the data is part of the case."""
     stopped = tmp_path / "out"

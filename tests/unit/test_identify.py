@@ -120,19 +120,44 @@ def test_unknowns_are_checked(tmp_path, unknown, key, part):
     assert part in problems[f"identify.unknowns[1].{key}"]
 
 
-def test_contacts_are_not_sought_in_silence_nor_where_they_touch(tmp_path):
-    """Contact parameters are refused for records without contact and for contacts that touch at rest."""
+def test_contacts_are_not_sought_in_silence(tmp_path):
+    """Contact parameters are refused for records without contact, and these where a site touches at rest."""
     record = record_in(written(tmp_path))
     problems = problems_of(record | {"contact": False})
     assert "says nothing about its contacts" in problems["identify.unknowns[1].quantity"]
 
-    table = lattice_table(contacts={"clearance": 0.0, "restitution": 1.0, "side": "plus"})
-    with pytest.raises(CaseError, match="has no onset"):
-        IdentifyCase.from_table(identify_table(table, record))
-
+    touching = {"clearance": 0.0, "restitution": 1.0, "side": "plus"}
     pressed = {"clearance": 1e-4, "precompression": 2e-4, "restitution": 1.0, "side": "plus"}
-    with pytest.raises(CaseError, match="touches or is pressed at rest"):
-        IdentifyCase.from_table(identify_table(lattice_table(contacts=pressed), record))
+    for contacts in (touching, pressed):
+        table = lattice_table(contacts=contacts)
+        unknowns = [{"quantity": "spring", "bounds": [1.0, 1e6]}]
+        with pytest.raises(CaseError, match="touches or is pressed"):
+            IdentifyCase.from_table(identify_table(table, record | {"contact": False}, unknowns=unknowns))
+
+
+@pytest.mark.parametrize("key", ["unknowns", "records"])
+@pytest.mark.parametrize("value", [[], None])
+def test_an_identification_seeks_something_in_something(tmp_path, key, value):
+    """A case without records or without unknowns is refused, whether the list is empty or missing."""
+    table = identify_table(lattice_table(), record_in(written(tmp_path)))
+    del table["identify"][key]
+    if value is not None:
+        table["identify"][key] = value
+    with pytest.raises(CaseError, match=f"identify.{key}"):
+        IdentifyCase.from_table(table)
+
+
+def test_an_offset_alone_may_be_sought(tmp_path):
+    """The clock of a record is an unknown, too."""
+    table = identify_table(lattice_table(), record_in(written(tmp_path), offset=[-1e-3, 1e-3]), unknowns=[])
+    assert [parameter.name for parameter in IdentifyCase.from_table(table).parameters] == ["offset"]
+
+
+def test_the_force_of_a_drive_without_amplitude_is_not_measured(tmp_path):
+    table = lattice_table(drive={"amplitude": 0.0}) | {"initial": {"kind": "velocity", "cell": 2, "velocity": 0.5}}
+    record = record_in(written(tmp_path), sensors=[{"quantity": "force", "column": "v"}])
+    with pytest.raises(CaseError, match="drive 1 has no amplitude"):
+        IdentifyCase.from_table(identify_table(table, record))
 
 
 def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
@@ -293,6 +318,7 @@ def test_columns_of_the_printed_table_stand_below_their_headings():
         "interval_low": [-1.234567e-10, 0.68, np.nan, np.nan],
         "interval_high": [-1.134567e-10, 0.72, np.nan, np.nan],
         "determined": [1, 1, 0, 0],
+        "at_bound": [0, 0, 0, 0],
         "at_least": [np.nan, np.nan, np.nan, 2.5e-3],
         "unit": ["m", "1", "N/m^3", "m"],
     }
@@ -318,6 +344,7 @@ def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_
     plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
     columns = {
         "parameter": [parameter.name for parameter in plan.parameters],
+        "at_bound": [0] * 4,
         "at_least": [np.nan] * 4,
         "determined": [0, 1, 1, 0],
         "sensor/cell": [2] * 4,

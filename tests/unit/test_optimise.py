@@ -13,8 +13,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import search_table
-from vipetsc.case import CaseError, case_id
+from tests.conftest import run_of, search_table
+from vipetsc.case import Case, CaseError, case_id
 from vipetsc.case.disorder import Deviation
 from vipetsc.case.named_files import relative_names, with_absolute_names
 from vipetsc.case.optimise import OptimiseCase
@@ -22,7 +22,7 @@ from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.optimum import compared_curves
 from vipetsc.figures.style import rc_style
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
+from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond, measured
 from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
@@ -271,15 +271,15 @@ class Bowl:
 
 
 class Recorder(CmaEs):
-    """CMA-ES that keeps the losses it is given."""
+    """CMA-ES that keeps the losses and the excess that it is given."""
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
         self.generations = []
 
-    def tell(self, losses):
-        self.generations.append(losses)
-        super().tell(losses)
+    def tell(self, losses, excess):
+        self.generations.append((losses, excess))
+        super().tell(losses, excess)
 
 
 def spend(search):
@@ -317,8 +317,8 @@ def fails_where_first_clearance_is_large(case):
     return case.contacts.clearance[0] > 2e-4
 
 
-def test_failed_and_impossible_designs_are_reported_as_worst_and_the_search_goes_on():
-    """The sampler receives losses unchanged; failed and impossible designs have a loss larger than the worst so far."""
+def test_failed_and_impossible_designs_are_reported_and_the_search_goes_on():
+    """The sampler receives losses unchanged; failed and impossible designs miss the constraints by any amount."""
     small = plan("optimise.budget=60")
     sampler = recorder(small)
     search = OptimumSearch(small, Bowl(fails_where_first_clearance_is_large), sampler, small.begin())
@@ -344,13 +344,10 @@ def test_failed_and_impossible_designs_are_reported_as_worst_and_the_search_goes
 
     # Design 0 is the case, which belongs to no generation.
     first = 1
-    for reported in sampler.generations:
-        last = first + len(reported)
-        losses = search.losses()[first:last]
-        bad = np.isnan(losses)
-        assert np.array_equal(reported[~bad], losses[~bad])
-        # CMA-ES ranks designs: any number above all others says "worst".
-        assert np.all(reported[bad] > np.nanmax(search.losses()[:last]))
+    for losses, excess in sampler.generations:
+        last = first + len(losses)
+        np.testing.assert_array_equal(losses, search.losses()[first:last])
+        assert np.array_equal(excess, np.where(np.isnan(losses[:, 0]), np.inf, 0.0))
         first = last
 
 
@@ -487,3 +484,11 @@ def test_a_search_finds_files_next_to_its_case_file(tmp_path, monkeypatch):
     assert relative_names(table) == ["a.h5", "b.h5"]
     variables = with_absolute_names(table, folder)["optimise"]["variables"]
     assert variables["initial"]["path"] == [str(folder / "a.h5"), str(folder / "b.h5")]
+
+
+def test_a_run_that_received_no_energy_has_a_reason():
+    """Fractions of no energy have no value: the reason says so, in place of a division by zero."""
+    run = run_of(Case.load(overrides=["lattice.cells=8", "contacts.sites=[3]", "time.end=0.01"]))
+    run["energy/work"] = 0.0 * run["energy/work"]
+    with pytest.raises(RuntimeError, match="received 0 J"):
+        measured(run, {"episodes": 0, "dissipated": 0.0}, [])

@@ -14,14 +14,19 @@ def bowl(points):
     return ((points - (0.3 + 0.1 * number)) ** 2 * 10.0**number).sum(axis=1, keepdims=True)
 
 
-def search_with(sampler, function, generations):
+def no_excess(points):
+    """Return the excess of points without constraints."""
+    return np.zeros(len(points))
+
+
+def search_with(sampler, function, generations, excess=no_excess):
     """Let a sampler minimise a function for some generations; return all points and their losses."""
     asked = []
     losses = []
     for _ in range(generations):
         asked.append(sampler.ask())
         losses.append(function(asked[-1]))
-        sampler.tell(losses[-1])
+        sampler.tell(losses[-1], excess(asked[-1]))
     return np.concatenate(asked), np.concatenate(losses)
 
 
@@ -71,6 +76,54 @@ def test_a_search_depends_on_its_seed_alone(make, function):
     np.random.seed(2)  # noqa: NPY002
     second, _ = search_with(make(), function, 12)
     assert first.tobytes() == second.tobytes()
+
+
+def left_of_the_middle(points):
+    """Return how far points lie left of the middle of the cube, where a constraint is missed."""
+    return np.maximum(0.0, 0.5 - points[:, 0])
+
+
+# Failed designs have an infinite excess and no losses.
+@pytest.mark.parametrize("failing", [0, 3])
+def test_designs_that_miss_a_constraint_die_out(failing):
+    """NSGA-II keeps feasible designs alone once it has found enough, however large their losses are."""
+    sampler = Nsga2(np.array([0.45, 0.5]), step=0.02, seed=1, population=12)
+
+    def losses(points):
+        values = np.column_stack([10 + points[:, 0], 20 - points[:, 1]])
+        values[:failing] = np.nan
+        return values
+
+    def excess(points):
+        return np.where(np.isnan(losses(points)[:, 0]), np.inf, left_of_the_middle(points))
+
+    points, _ = search_with(sampler, losses, 30, excess)
+    assert (left_of_the_middle(points) == 0).sum() > 12
+    survivors = sampler._search.pop.get("X").astype(float)
+    assert len(survivors) == 12
+    assert (left_of_the_middle(survivors) == 0).all()
+
+
+def test_a_search_begins_again_at_the_best_feasible_point():
+    """CMA-ES begins again at the feasible point of the least loss, also if losses are larger than any excess."""
+    sampler = CmaEs(np.array([0.2, 0.2]), np.zeros(2), np.eye(2), step=0.05, seed=1, population=8)
+    points, losses = search_with(sampler, lambda x: 5 + x[:, :1] ** 2, 150, left_of_the_middle)
+
+    feasible = left_of_the_middle(points) == 0
+    best = points[feasible][losses[feasible, 0].argmin()]
+    assert sampler._best == pytest.approx(best)
+    # A loss is least at the edge of what is feasible.
+    assert best[0] == pytest.approx(0.5, abs=0.01)
+    assert any((centre == sampler._centre).all() for centre in points[feasible])
+
+
+def test_a_search_returns_to_a_start_that_is_better_than_all_others():
+    """The start counts, too, where nothing that was asked for is feasible."""
+    start = np.array([0.5, 0.5])
+    sampler = CmaEs(start, np.zeros(2), np.eye(2), step=0.05, seed=1, population=4)
+    sampler.know_start(np.array([1e6]), 0.0)
+    search_with(sampler, bowl, 60, lambda points: np.ones(len(points)))
+    assert sampler._centre is start
 
 
 def test_a_search_that_has_contracted_begins_again_with_more():

@@ -160,7 +160,7 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
         values = [space.from_unit(point) for point in search.ask()]
         # The loss is the sum of three functions, with their minima at x = 2, n = 21 and the choice of the value 0.
         losses = [np.log10(x / 2) ** 2 + 0.05 * (n - 21) ** 2 + kinds[2].choices[int(c) - 1] for x, n, c in values]
-        search.tell(np.array(losses)[:, None])
+        search.tell(np.array(losses)[:, None], np.zeros(len(losses)))
         best = min(best, (min(losses), values[int(np.argmin(losses))]), key=lambda pair: pair[0])
 
     assert best[1][1:].tolist() == [21, 3]

@@ -129,6 +129,17 @@ def test_floor_is_part_of_the_divisors_fit(floor):
     assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
 
 
+@pytest.mark.parametrize("floor", [0.5, 5.0, 1e3])
+def test_a_floor_above_the_transfers_has_no_divisor(floor):
+    """Where most transfers lie below the floor, the divisor would grow without a limit: there is a reason instead."""
+    work, transfer = exact_transfer(1e3, 1e-3)
+    with pytest.raises(ValueError, match="no divisor"):
+        align(work, transfer, INITIATION, floor, branch())
+    # The misfit of a divisor that exists says how well it fits.
+    assert align(work, transfer, INITIATION, 1e-3, branch()).attrs["misfit"] < 1e-6
+    assert align(work, transfer, INITIATION, 2e-3, branch()).attrs["misfit"] > 1e-3
+
+
 def test_divisor_is_the_least_squares_one():
     """The fitted divisor has the least sum of squares of logarithms: 1 % more or less gives a larger one."""
     slope = branch()

@@ -32,6 +32,16 @@ UNKNOWNS = [
 ]
 POWER = {"law": "power", "exponent": 1.4, "stiffness": 2e6}
 SAMPLES = {"time": [0.0, 2e-3, 4e-3, 6e-3, 0.02], "value": [0.0, 3.0, -2.0, 1.0, 0.5]}
+# How the motion of a record begins: sections of its case.
+BEGINS = {
+    "burst": {},
+    "samples": {"drive": {"waveform": "samples", "samples": SAMPLES, "frequency": 500.0, "amplitude": 20.0}},
+    "step": {"drive": {"waveform": "step", "ramp": 5e-3, "amplitude": 60.0, "frequency": 500.0}},
+    "struck": {
+        "drive": {"amplitude": 0.0, "frequency": 500.0},
+        "initial": {"kind": "velocity", "cell": 3, "velocity": 2.0},
+    },
+}
 # These unknowns start from the values of the case, which are the true ones. The default unknowns start far from them.
 FROM_THE_TRUTH = [
     {"quantity": "clearance", "of": "each", "bounds": [5e-5, 3e-3]},
@@ -50,6 +60,12 @@ def results_of(folder, table):
     run_identification(IdentifyCase.from_table(table), folder)
     with open_netcdf(folder / "identified.h5", "identification") as file:
         return file.load()
+
+
+def slopes_of(misfit, z: np.ndarray) -> np.ndarray:
+    """Derivatives (sample, sensor, coordinate) of the signals of the only record at ``z`` (coordinate,)."""
+    jacobian = misfit.jacobian(z, [1.0], range(len(z)))
+    return jacobian.reshape(-1, len(misfit.noise[0]), len(z)) * misfit.noise[0][:, None]
 
 
 def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> np.ndarray:
@@ -81,9 +97,9 @@ def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path)
     work = fits_of(plan_table)
     misfit = work.windows().misfit
     z = work.starts()[0]
-    onsets = misfit.respond(z, 0, 1.0).episodes["onset"]
+    onsets = misfit.motion(z, 0, 1.0).onset
     assert len(onsets) > 20
-    _, slopes = misfit.predicted(z, 0, 1.0, range(len(z)))
+    slopes = slopes_of(misfit, z)
     times = misfit.records[0].times
 
     for number, engine in zip(range(len(z)), itertools.cycle(["ts", "propagator"]), strict=False):
@@ -99,35 +115,39 @@ def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path)
 
 
 @pytest.mark.slow
-def test_the_motion_is_that_of_the_engine(tmp_path):
-    """Predicted signals of all kinds are the engine's, and their derivative by the time offset is a difference."""
-    table = lattice_table()
-    record = measured_table(tmp_path, table) | {"offset": [-1e-3, 1e-3]}
+@pytest.mark.parametrize("late", [0.0, 5e-5, -2e-4])
+@pytest.mark.parametrize("begin", BEGINS)
+def test_samples_of_a_record_need_not_be_those_of_the_engine(tmp_path, begin, late):
+    """Signals of all kinds are those of a run, also where the drive begins between two samples of the record."""
+    table = lattice_table() | BEGINS[begin]
+    times = 2.5e-4 * np.arange(60)
+    path = tmp_path / "record.csv"
+    np.savetxt(path, np.column_stack([times, np.sin(times)]), delimiter=",")
     kinds = ["displacement", "velocity", "acceleration"]
-    record["sensors"] = [{"quantity": kind, "column": "a", "cell": 3, "mass": 2} for kind in kinds]
-    record["sensors"].append({"quantity": "force", "column": "a"})
+    sensors = [{"quantity": kind, "column": 2, "cell": 3, "mass": 2} for kind in kinds]
+    if begin != "struck":
+        sensors.append({"quantity": "force", "column": 2})
+    record = {"file": str(path), "time": 1, "offset": late, "sensors": sensors}
     work = fits_of(identify_table(table, record, unknowns=UNKNOWNS[3:4]))
-    misfit = work.windows().misfit
-    z = work.starts()[0]
-    z[0] = work.plan.parameters[0].to_coordinate(0.7)
-    values, slopes = misfit.predicted(z, 0, 1.0, [1])
+    z = np.array([work.plan.parameters[0].to_coordinate(0.7)])
+    motion = work.windows().misfit.motion(z, 0, 1.0)
+    values = work.windows().misfit.predicted(z, 0, 1.0)
 
-    run = run_of(work.plan.case_of([0.7, 0.0]).varied(output={"points": [{"name": "p", "cell": 3, "mass": 2}]}))
+    # A run whose samples, five times as many, are those of the record.
+    points = [{"name": "p", "cell": 3, "mass": 2}]
+    timed = {"sample_interval": 5e-5, "end": 0.0151, "rtol": 1e-12}
+    run = run_of(work.plan.case_of([0.7]).varied(output={"points": points}, time=timed))
+    sample = np.round((times - late) / 5e-5).astype(int)
+    started = sample >= 0
     for column, kind in enumerate(kinds):
-        expected = run[f"points/{kind}"].values[:, 0]
-        assert np.abs(values[:, column] - expected).max() < 1e-6 * np.abs(expected).max()
-    force = work.plan.base.model().drives[0].waveform.force(run["time"].values)
-    assert values[:, 3] == pytest.approx(force, abs=1e-9)
-
-    h = 1e-6
-    later, earlier = z.copy(), z.copy()
-    later[1] += h
-    earlier[1] -= h
-    expected = (misfit.predicted(later, 0, 1.0)[0] - misfit.predicted(earlier, 0, 1.0)[0]) / (2 * h)
-    # The first samples are left out: at t = 0 the offset moves a sample to before the motion.
-    inside = slice(2, None)
-    error = np.abs(slopes[inside, :, 0] - expected[inside]).max(axis=0)
-    assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
+        expected = run[f"points/{kind}"].values[sample, 0] * started
+        assert np.abs(values[:, column] - expected).max() < 1e-8 * np.abs(expected).max(), kind
+    if begin != "struck":
+        force = work.plan.base.model().drives[0].waveform.force(times - late)
+        assert values[:, 3] == pytest.approx(force, abs=1e-9)
+    onsets = run["impacts/onset"].values + late
+    assert len(onsets) > 3
+    assert motion.onset == pytest.approx(onsets[onsets < times[-1]], abs=1e-9)
 
 
 def test_a_force_is_that_of_its_drive_behind_a_wall_of_two_springs(tmp_path):
@@ -155,43 +175,13 @@ def test_a_force_is_that_of_its_drive_behind_a_wall_of_two_springs(tmp_path):
     work = fits_of(identify_table(table, record, unknowns=unknowns))
 
     # The amplitude that is sought is that of the wall: it moves the mass, and does not change the other drive's force.
-    values, slopes = work.windows().misfit.predicted(work.starts()[0], 0, 1.0, [0])
+    misfit = work.windows().misfit
+    values = misfit.predicted(work.starts()[0], 0, 1.0)
+    slopes = slopes_of(misfit, work.starts()[0])
     assert np.any(slopes, axis=0).tolist() == [[True], [False]]
     *of_springs, second = work.plan.base.model().drives
     assert len(of_springs) == 2
     assert values[:, 1] == pytest.approx(second.waveform.force(times), abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    "drive",
-    [{"waveform": "samples", "samples": SAMPLES}, {"waveform": "step", "ramp": 5e-3, "amplitude": 2.0}],
-    ids=["samples", "step"],
-)
-def test_a_drive_of_polynomials_has_a_rate(tmp_path, drive):
-    """Derivatives of a force without a frequency, and of the acceleration it makes, are differences.
-
-    They are those by the amplitude, coordinate 0, and by the offset, coordinate 1.
-    """
-    table = lattice_table() | {"drive": {"frequency": 500.0} | drive}
-    # No sample is at the beginning of a piece, across which a difference would not be that of one polynomial.
-    times = 1e-4 + 2.5e-4 * np.arange(4, 18)
-    path = tmp_path / "pushed.csv"
-    np.savetxt(path, np.column_stack([times, np.sin(times)]), delimiter=",")
-    sensors = [{"quantity": "acceleration", "column": 2, "cell": 1}, {"quantity": "force", "column": 2}]
-    record = {"file": str(path), "time": 1, "offset": [-1e-4, 1e-4], "contact": False, "sensors": sensors}
-    unknowns = [{"quantity": "amplitude", "bounds": [0.1, 10.0]}]
-    work = fits_of(identify_table(table, record, unknowns=unknowns))
-    misfit = work.windows().misfit
-    z = work.starts()[0]
-    _, slopes = misfit.predicted(z, 0, 1.0, [0, 1])
-
-    for coordinate in range(2):
-        shift = 1e-4 * np.eye(2)[coordinate]
-        above, _ = misfit.predicted(z + shift, 0, 1.0)
-        below, _ = misfit.predicted(z - shift, 0, 1.0)
-        expected = (above - below) / 2e-4
-        error = np.abs(slopes[:, :, coordinate] - expected).max(axis=0)
-        assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
 
 
 @pytest.mark.slow
@@ -324,6 +314,42 @@ def test_a_clearance_out_of_reach_does_not_slow_the_others_down(tmp_path):
     windows = work.windows()
     z = windows._solve(work.starts()[0], windows.last, range(5), Precision(steps=12))
     assert windows.misfit.values(z)[[0, 1, 4]] == pytest.approx([5e-4, 4e-4, 0.7], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_beads_without_springs_determine_their_restitution(tmp_path):
+    """Two free beads that collide once, with nothing else between them, have their restitution in the record."""
+    beads = {
+        "name": "beads",
+        "lattice": {"cells": 2, "ends": "free", "cell": {"masses": [2e-3]}},
+        "contacts": {"law": "hertz", "stiffness": 7e9, "sites": [1], "next_cell": True, "side": "minus"},
+        "initial": {"kind": "velocity", "cell": 1, "velocity": 1.0},
+        "time": {"end": 2e-3, "samples": 201},
+        "output": {"points": [{"name": "p", "cell": 2}]},
+    }
+    beads["contacts"] |= {"clearance": 1e-3, "restitution": 0.85, "damping": "exact"}
+    run = run_of(Case.from_table(beads))
+    np.savetxt(tmp_path / "r.csv", np.column_stack([run["time"], run["points/velocity"]]), delimiter=",", fmt="%.17g")
+    sensor = {"quantity": "velocity", "column": 2, "cell": 2}
+    record = {"file": str(tmp_path / "r.csv"), "time": 1, "sensors": [sensor]}
+    unknowns = [{"quantity": "restitution", "bounds": [0.2, 1.0], "start": 0.6}]
+    found = results_of(tmp_path / "out", identify_table(beads, record, unknowns=unknowns))
+    assert found["value"].values == pytest.approx([0.85], rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contacts", [{"clearance": 0.0}, {"clearance": 0.0, "precompression": 2e-5}])
+def test_contacts_that_touch_at_rest_determine_their_stiffness(tmp_path, contacts):
+    """Records of a lattice whose stops touch or press at rest give the stiffness of the contacts."""
+    table = lattice_table(
+        contacts=contacts | {"restitution": 1.0, "side": "plus", "sites": [3], "law": "bilinear", "stiffness": 3e4},
+        time={"end": 0.014},
+        drive={"amplitude": 5.0},
+    )
+    unknowns = [{"quantity": "stiffness", "bounds": [1e4, 1e5], "start": 2e4}]
+    record = measured_table(tmp_path, table)
+    found = results_of(tmp_path / "out", identify_table(table, record, unknowns=unknowns))
+    assert found["value"].values == pytest.approx([3e4], rel=1e-6)
 
 
 @pytest.mark.slow

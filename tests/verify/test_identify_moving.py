@@ -223,8 +223,8 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     ends = [0.0052]
     every = [0, 1, 2, 3, *range(4, misfit.size, 7)]
     jacobian = misfit.jacobian(z, ends, every)
-    # An onset before the record is logged at 0.
-    assert np.sum(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touching
+    # An onset before the record is logged at its beginning.
+    assert np.sum(misfit.motion(z, 0, 1.0).onset == misfit.records[0].times[0]) == touching
     # The five-point formula has an error of order h^4, and divides the errors of the runs by h. With this h both are
     # below the tolerance.
     h = 1e-4

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from tests.conftest import run_of
 from tests.identified import POINTS, identify_table, lattice_table, measured_table
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.identification.uncertainty import marginal_jacobian, uncertainty_of
+from vipetsc.identification.uncertainty import marginal_jacobian, quantile, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
 from vipetsc.studies import further_sensor as further_sensor_module
@@ -137,3 +137,46 @@ def test_fewer_data_than_parameters_leave_some_of_them_undetermined():
     few = uncertainty_of(1e3 * np.random.default_rng(3).standard_normal((3, 5)))
     assert not few.determined.any()
     assert few.directions @ few.directions.T == pytest.approx(np.eye(5), abs=1e-12)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
+def test_intervals_of_few_data_are_as_wide_as_their_noise_is_uncertain(confidence):
+    """Intervals of a straight line through six points with estimated noise hold the truth as often as they state."""
+    generator = np.random.default_rng(6)
+    jacobian = np.column_stack([np.ones(6), np.linspace(-1, 1, 6)])
+    noise = generator.standard_normal((40_000, 6))
+    found = noise @ np.linalg.pinv(jacobian).T
+    # Four degrees of freedom are left to the noise.
+    estimated = np.sqrt(np.sum((noise - found @ jacobian.T) ** 2, axis=1) / 4)
+    error = uncertainty_of(jacobian).errors[1] * estimated
+    held = np.abs(found[:, 1]) < quantile(confidence, 4) * error
+    assert np.mean(held) == pytest.approx(confidence, abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
+def test_a_value_at_its_bound_has_no_interval(tmp_path, given):
+    """A fit that wants a value beyond a bound says so; the interval of the others has the noise that is known."""
+    table = lattice_table(time={"end": 0.009})
+    record = measured_table(tmp_path, table, noise=0.01)
+    if given:
+        for sensor in record["sensors"]:
+            sensor["noise"] = 0.01
+    unknowns = [
+        {"quantity": "clearance", "bounds": [5.3e-4, 8e-4], "of": [[1]]},
+        {"quantity": "restitution", "bounds": [0.2, 1.0]},
+    ]
+    run_identification(IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns)), tmp_path / "out")
+    with open_netcdf(tmp_path / "out" / "identified.h5", "identification") as file:
+        found = file.load()
+    assert found["at_bound"].values.tolist() == [-1, 0]
+    assert found["value"].values[0] == pytest.approx(5.3e-4, rel=1e-3)
+    assert np.isnan(found["interval_low"].values[0])
+    assert "lower bound" in found.attrs["warnings"]
+    assert "at its bound" in found.attrs["summary"]
+
+    freedom = np.inf
+    if not given:
+        freedom = found.sizes["datum"] - 2
+    width = (found["interval_high"] - found["interval_low"]).values[1]
+    assert width == pytest.approx(2 * quantile(0.9, freedom) * found["standard_error"].values[1], rel=1e-6)

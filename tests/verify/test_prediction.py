@@ -16,9 +16,10 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.kinds import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import read_records
+from vipetsc.parallel import StudyError
 from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction import composed, predict
-from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, site_points
+from vipetsc.studies.prediction import composed, predict, prediction_warnings
+from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, onset_of, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, DISSIPATED, SiteResponse, SiteResponses, in_contact
 
@@ -75,6 +76,12 @@ def test_energy_is_whole_and_no_fraction_is_negative(prediction):
     predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
     # Predicted energy is in bands or dissipated, and nowhere else.
     np.testing.assert_allclose(predicted, 1, atol=1e-12)
+    # That holds by definition. What the forces of the sites take from the drive's wave is another sum, and is that
+    # which the runs of one site give.
+    taken = 1 - data["predicted/bands"].max("band")
+    assert float(taken.max()) > 0.2
+    assert float(np.abs(data["predicted/defect"]).max()) < 0.03
+    assert data.attrs["warnings"] == "[]"
     assert float(data["predicted/bands"].min()) >= 0
     # A little energy is in the contacts at the end of a simulation.
     simulated = data["simulated/bands"].sum("band") + data["simulated/dissipated"]
@@ -349,3 +356,31 @@ def test_a_ring_is_predicted_as_simulated(tmp_path):
 
     assert data.attrs["rms_upper"] < 0.15
     assert data.attrs["worst_dissipated"] < 0.05
+
+
+@pytest.mark.slow
+def test_sites_that_are_too_close_are_told(tmp_path):
+    """A prediction whose sites feel each other too strongly warns: its energies do not close, and its steps fail."""
+    contacts = {"sites": list(range(40, 56)), "clearance": 1e-3, "restitution": 1.0}
+    data = predict(prediction_case(contacts=contacts, predict={"amplitudes": [30.0, 1000.0]}), tmp_path)
+    assert float(np.abs(data["predicted/defect"]).max()) > 0.1
+    assert "too close together" in data.attrs["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"), [("change", 0.2, "iteration"), ("solved", 0, "unsolved"), ("defect", -0.3, "close")]
+)
+def test_each_failure_of_a_prediction_has_its_sentence(name, value, word):
+    """Warnings name what has not converged, at how many amplitudes, and are absent otherwise."""
+    good = {"predicted/change": np.zeros(3), "predicted/solved": np.ones(3), "predicted/defect": np.zeros(3)}
+    assert prediction_warnings(good) == []
+    values = good | {f"predicted/{name}": good[f"predicted/{name}"].copy()}
+    values[f"predicted/{name}"][1] = value
+    (warning,) = prediction_warnings(values)
+    assert "at 1 of 3 amplitudes" in warning
+    assert word in warning
+
+
+def test_a_wave_that_moves_no_site_has_no_onset():
+    with pytest.raises(StudyError, match="moves no site"):
+        onset_of({"reached": [0.0, 0.0]})

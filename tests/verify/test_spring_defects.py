@@ -17,8 +17,7 @@ from tests.steady_states import motion_at
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.dynamics import simulate
-from vipetsc.identification.motion import MotionCoefficients, no_slopes, respond, stacked_slopes
-from vipetsc.identification.motion_begin import MotionBegin
+from vipetsc.identification.motion import SampledModel
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import linear_modes, nonlinear_places
 from vipetsc.modes.response.steady import SteadyStates
@@ -120,18 +119,12 @@ def test_the_motion_is_that_of_scipy(run, exact):
 
 
 def test_the_motion_of_identification_is_that_of_scipy(run, exact):
-    """The motion that identification integrates is that by SciPy, to the tolerance of its steps.
-
-    No parameter of an identification stands for springs in single cells, so that derivatives are left out.
-    """
-    model = changed().model()
-    # Without columns of derivatives only the motion itself is computed.
-    begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
-    watched = np.arange(2 * CELLS)
-    coefficients = MotionCoefficients.of(model)
-    slopes = stacked_slopes([], no_slopes(model, coefficients))
-    motion = respond(model, coefficients, slopes, run["time"].values, watched, begin=begin).motion
-    assert np.abs(motion[:, :, 0, 0] - exact[:, : 2 * CELLS]).max() < 1e-7 * np.abs(exact[:, : 2 * CELLS]).max()
+    """The motion that identification compares with a record is that by SciPy, from a state that it is given."""
+    case = changed()
+    state = tuple(part.reshape(CELLS, 2) for part in np.split(exact[0], 2))
+    times = run["time"].values
+    motion = SampledModel(case, case.model(), range(2 * CELLS)).respond(times, 0.0, state).motion
+    assert np.abs(motion[:, :, 0] - exact[:, : 2 * CELLS]).max() < 1e-8 * np.abs(exact[:, : 2 * CELLS]).max()
 
 
 def test_its_energy_is_that_of_the_springs_and_is_conserved(run):

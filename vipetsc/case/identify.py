@@ -7,6 +7,7 @@ from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import tomli_w
 from pydantic import Field
 
@@ -49,8 +50,8 @@ class IdentifyTable(Section):
     ``confidence`` is that of the intervals; ``profile``: values of each parameter for which all others are fitted.
     """
 
-    records: list[RecordTable] = Field([], min_length=1)
-    unknowns: list[UnknownTable] = Field([], min_length=1)
+    records: list[RecordTable] = Field([])
+    unknowns: list[UnknownTable] = Field([])
     impacts: int = Field(4, ge=1)
     growth: Annotated[float, Field(gt=1, le=100)] = 1.6
     starts: int = Field(1, ge=1, le=10_000)
@@ -68,8 +69,7 @@ class IdentifyCase(StudyCase):
 
     verb = section = "identify"
     refuses: ClassVar[Mapping[str, str]] = {
-        "touching stops": "a stop that touches at rest has no onset, at which the derivatives of a contact begin",
-        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
+        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter"
     }
 
     @classmethod
@@ -88,12 +88,17 @@ class IdentifyCase(StudyCase):
             return {}, problems + error.problems
         # The case is valid. This verb may not support all of its features.
         problems += refusals(cls, dict(base), lambda *keys: True)
+        if not options.records:
+            problems.append(Problem("identify.records", [], remedy))
+        # The clock of a record may be all that is sought.
+        if not options.unknowns and not any(isinstance(record.offset, list) for record in options.records):
+            problems.append(Problem("identify.unknowns", [], remedy))
         if problems:
             return {}, problems
 
         fields = {"table": table, "options": options, "base": base}
         # Data are read last, since files may be large, and not at all for a case that is refused.
-        problems = [*_case_problems(base), *_unknown_problems(options, base), *_record_problems(options, base)]
+        problems = [*_unknown_problems(options, base), *_record_problems(options, base)]
         if problems:
             return fields, problems
         fields["options"], problems = _with_hashes(options)
@@ -164,20 +169,6 @@ def _varied_sections(record: RecordTable) -> dict[str, Any]:
     if isinstance(record.initial, dict) and record.initial:
         sections["initial"] = copy.deepcopy(record.initial)
     return sections
-
-
-def _case_problems(base: Case) -> Iterator[Problem]:
-    """Problems of a case in which contacts touch at rest."""
-    model = base.model()
-    gaps = model.gaps or [(gap, gap) for gap in model.chain.clearances]
-    for number, pair in enumerate(gaps, 1):
-        if min(pair) <= 0:
-            remedy = (
-                f"site {number} touches or is pressed at rest; identification needs open contacts, whose derivatives"
-                " begin at an onset"
-            )
-            yield Problem("contacts.clearance", float(min(pair)), remedy)
-            return
 
 
 def _group_problems(
@@ -297,7 +288,7 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 # The case itself is valid, so that the problem is one of the record's keys.
                 yield replace(problem, key=f"{at}.{problem.key}")
         else:
-            yield from _wall_problems(record, [drive for _, drive in case.drive.every], at)
+            yield from _force_problems(record, [drive for _, drive in case.drive.every], at)
         yield from sensor_problems(record, at, cells=base.lattice.cells, dofs=dofs, drives=len(case.drive.every))
 
         if record.initial == "estimate" and masses > MOST_MASSES:
@@ -305,6 +296,10 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.initial", "estimate", remedy)
         if record.initial == "estimate" and all(sensor.quantity == "force" for sensor in record.sensors):
             yield Problem(f"{at}.initial", "estimate", "needs a sensor of motion; a drive's force says nothing of it")
+
+        if not record.contact and _touches(base):
+            remedy = "a site touches or is pressed at rest; set it to true"
+            yield Problem(f"{at}.contact", False, remedy)
 
     # Without contact the misfit does not depend on quantities of sites, and the fit would be singular.
     if not any(record.contact for record in options.records):
@@ -314,14 +309,26 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 yield Problem(f"identify.unknowns[{index}].quantity", unknown.quantity, remedy)
 
 
-def _wall_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:
-    """Problems of sensors for the force of a wall that moves; ``drives`` are those of the ``record``."""
+def _touches(base: Case) -> bool:
+    """Whether a site of the case touches its stop, or is pressed against it, at rest."""
+    model = base.model()
+    gaps = [*model.chain.clearances, *(gap for both in model.gaps for gap in both)]
+    return min(gaps, default=np.inf) <= 0
+
+
+def _force_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:
+    """Problems of sensors of a drive's force; ``drives`` are those of the ``record``."""
     for number, sensor in enumerate(record.sensors, 1):
         drive = sensor.drive or 1
-        if sensor.quantity == "force" and drive <= len(drives) and drives[drive - 1].end:
+        if sensor.quantity != "force" or drive > len(drives):
+            continue
+        key = f"{at}.sensors[{number}].quantity"
+        if drives[drive - 1].end:
             # What a load cell at the wall measures is the force of the spring, by the motion of wall and mass.
             remedy = f"drive {drive} moves a wall, whose force depends on the lattice's motion; measure that of a mass"
-            yield Problem(f"{at}.sensors[{number}].quantity", "force", remedy)
+            yield Problem(key, "force", remedy)
+        elif drives[drive - 1].amplitude == 0:
+            yield Problem(key, "force", f"drive {drive} has no amplitude; set it, or remove this sensor")
 
 
 def _with_hashes(options: IdentifyTable) -> tuple[IdentifyTable, list[Problem]]:

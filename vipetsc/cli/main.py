@@ -13,10 +13,10 @@ from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import COMMON_ARGUMENTS
 from vipetsc.cli.messages import echo, reporting
 from vipetsc.cli.streams import report_unwritten
-from vipetsc.cli.verb import BAD_INPUT, STOPPED
+from vipetsc.cli.verb import BAD_INPUT, FAILED, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
-from vipetsc.parallel import EndedError, StoppedError, StopRequest, all_meet, on_root
+from vipetsc.parallel import EndedError, StoppedError, StopRequest, StudyError, all_meet, on_root
 from vipetsc.register import PartError
 
 # s within which all ranks that were stopped must meet. If one of them was killed they never do, and the launcher kills
@@ -86,6 +86,9 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         # Every rank gets here: bad input is found on one rank and raised on all.
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
+    except StudyError as error:
+        echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
+        return FAILED
     except EndedError:
         # Other ranks may be in a collective call, and would wait for this one for ever.
         if MPI.COMM_WORLD.size > 1:

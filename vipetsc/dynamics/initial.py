@@ -18,15 +18,14 @@ from vipetsc.lattice.modes import mode_shape
 from vipetsc.parallel import on_every_rank, on_root
 
 
-def set_in_motion(setup: Setup) -> None:
-    """Give the engine of ``setup`` the initial state of its model; all ranks must call it.
+def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
+    """Give the engine of ``setup`` an initial state; all ranks must call it.
 
-    Raises CaseError on all ranks if the state's file is gone or has changed.
+    ``fields`` are displacements in m and velocities in m/s (cell, dof) of the rank's cells.
     """
     layout = setup.layout
     meter = setup.meter
     state = layout.create_vector()
-    fields = initial_fields(setup.model, range(layout.start, layout.stop), layout.comm)
     layout.place(np.hstack(fields), work=0.0, y=state.array)
     state.ghostUpdate()
     with state.localForm() as local:

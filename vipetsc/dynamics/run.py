@@ -18,7 +18,7 @@ from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult, OpeningEngine
 from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.failing_place import failing_place
-from vipetsc.dynamics.initial import set_in_motion
+from vipetsc.dynamics.initial import initial_fields, set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
@@ -159,7 +159,11 @@ def simulate(
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: case, model and engine, observers, opening of a new run."""
+    """A simulation: case, model and engine, observers, opening of a new run.
+
+    A new run begins in the ``state``, displacements and velocities (cell, dof) of the rank's cells, if one is given,
+    else as the model says.
+    """
 
     case: Case
     model: Model
@@ -167,6 +171,7 @@ class Simulation:
     stop: StopRequest | None
     watching: Sequence[type[Observer]]
     opening: Callable[[], Opening | None] | None = None
+    state: tuple[np.ndarray, np.ndarray] | None = None
 
     def make(self, output: RunOutput) -> Result:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
@@ -196,8 +201,11 @@ class Simulation:
                 run.restore(checkpoints)
             elif opening is not None:
                 run.open(opening)
+            elif self.state is not None:
+                set_in_motion(run.setup, self.state)
             elif self.model.initial is not None:
-                set_in_motion(run.setup)
+                layout = run.setup.layout
+                set_in_motion(run.setup, initial_fields(self.model, range(layout.start, layout.stop), layout.comm))
             with log.SAMPLES:
                 ending, sentence = run.advance()
             note = {}

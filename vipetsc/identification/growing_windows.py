@@ -21,7 +21,7 @@ from vipetsc.identification.initial_state import NARROW, WIDTH
 from vipetsc.identification.least_residuals import least_residuals
 from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
-from vipetsc.identification.precision import EXACT, FINAL, GROWING, Precision, Tolerances
+from vipetsc.identification.precision import FINAL, GROWING, Precision
 
 # While windows grow, parameters that the data do not determine yet stay near their last values: a change of a
 # coordinate by PRIOR weighs as one datum that misses by its noise. The last fit has no such rows.
@@ -145,7 +145,7 @@ class GrowingWindows:
             for _ in range(REWEIGHTINGS):
                 self._estimate_noise(z)
                 z = self.solve(z, self.last, self._every())
-        window = self._window(z, self.last, FINAL)
+        window = self._window(z, self.last)
         windows.append(window)
         return Fit(
             coordinates=z,
@@ -202,7 +202,7 @@ class GrowingWindows:
             if fraction < 1:
                 precision = GROWING
             z = self.solve(z, ends, active, precision)
-            windows.append(self._window(z, ends, precision))
+            windows.append(self._window(z, ends))
             if fraction == 1:
                 return z
             fraction = min(fraction * plan.options.growth, 1.0)
@@ -224,14 +224,14 @@ class GrowingWindows:
             if is_last:
                 precision = FINAL
             fitted = self.solve(z, ends, self._every(), precision)
-            window = self._window(fitted, ends, precision)
+            window = self._window(fitted, ends)
             other = None
             # Below 1 the misfit is explained by the noise alone, and no contact is missing.
             if window.misfit > 1 or is_last:
-                other = other_contacts(self.misfit, fitted, ends, self.high, self.tolerances(precision))
+                other = other_contacts(self.misfit, fitted, ends, self.high)
             if other is not None:
                 fitted = self.solve(other, ends, self._every(), precision)
-                window = self._window(fitted, ends, precision)
+                window = self._window(fitted, ends)
 
             # A misfit that rises shows that the window has grown beyond the valley in which the fit began.
             growths = []
@@ -285,33 +285,31 @@ class GrowingWindows:
         for number, (first, last, length) in enumerate(zip(self._first(), self.last, lengths, strict=True)):
             if number in self.misfit.states:
                 last = min(last, first + length)
-            onsets = self.onsets(z, number, self.last[number], self.tolerances(GROWING))
+            onsets = self.onsets(z, number, self.last[number])
             if len(onsets) > impacts:
-                last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
+                last = min(last, float(onsets[impacts]))
             # Contacts may follow each other within a sample: a window must have data.
             ends.append(max(last, float(self.misfit.records[number].times[LEAST_SAMPLES - 1])))
         return ends
 
-    def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> np.ndarray:
-        """The onsets (episode,) in s of the model's contacts in record ``number``, since the beginning of its drive.
+    def onsets(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
+        """The onsets (episode,) in s of the model's contacts in record ``number``, by its clock.
 
         They are those from the record's first sample to its time ``end``; none where the model has no motion.
         """
         try:
-            onsets = self.misfit.motion(z, number, end, tolerances).episodes["onset"]
+            onset = self.misfit.motion(z, number, end).onset
         except (CaseError, MotionError):
             return np.zeros(0)
-        first = self.misfit.times(z, number, end)[0]
-        return np.asarray(onsets[onsets > first])
+        return onset[onset > self.misfit.records[number].times[0]]
 
-    def _window(self, z: np.ndarray, ends: Sequence[float], precision: Precision) -> Window:
-        """The window up to ``ends`` (record,) in s with its misfit at ``z``, by motions as exact as the fit's."""
-        tolerances = self.tolerances(precision)
+    def _window(self, z: np.ndarray, ends: Sequence[float]) -> Window:
+        """The window up to ``ends`` (record,) in s with its misfit at ``z``."""
         impacts = []
         for number, (record, end) in enumerate(zip(self.misfit.records, ends, strict=True)):
             if end >= record.times[0]:
-                impacts.append(len(self.onsets(z, number, end, tolerances)))
-        residuals = self.misfit.residuals(z, ends, tolerances)
+                impacts.append(len(self.onsets(z, number, end)))
+        residuals = self.misfit.residuals(z, ends)
         return Window(
             end=max(ends),
             impacts=sum(impacts),
@@ -352,15 +350,13 @@ class GrowingWindows:
             full[active] = x
             return full
 
-        tolerances = self.tolerances(precision)
-
         def residuals(x: np.ndarray) -> np.ndarray:
             self.check()
-            data = self.misfit.residuals(whole(x), ends, tolerances)
+            data = self.misfit.residuals(whole(x), ends)
             return np.concatenate([data, weights * (x - centre)])
 
         def jacobian(x: np.ndarray) -> np.ndarray:
-            data = self.misfit.jacobian(whole(x), ends, active, tolerances)
+            data = self.misfit.jacobian(whole(x), ends, active, precision.is_rough)
             # The first Jacobian sets the weights: it is asked for at the start, where the residuals of the prior are
             # zero with any weight.
             weights[is_parameter] = np.maximum(weights[is_parameter], RIDGE * np.linalg.norm(data))
@@ -370,21 +366,27 @@ class GrowingWindows:
         steps = precision.steps or self.misfit.plan.options.steps
         return whole(least_residuals(residuals, jacobian, start, bounds, precision, steps))
 
-    def tolerances(self, precision: Precision) -> Tolerances:
-        """The tolerances of motions in a fit of that ``precision``, by the least noise of a channel over its size."""
-        ratios = [np.min(noise / sizes) for noise, sizes in zip(self.misfit.noise, self._sizes, strict=True)]
-        return precision.tolerances(float(min(ratios)))
-
     def _estimate_noise(self, z: np.ndarray) -> None:
         """Estimate the noise of the channels for which none is given from their residuals at ``z`` (coordinate,)."""
         # A fit of m numbers to n data makes the mean square of the residuals smaller by 1 - m/n.
         count = sum(record.values.size for record in self.misfit.records)
-        free = max(count - self._fitted(z), 1.0) / count
+        free = self.freedom(z) / count
         for number, record in enumerate(self.misfit.records):
-            values, _ = self.misfit.predicted(z, number, self.last[number])
+            values = self.misfit.predicted(z, number, self.last[number])
             variance = np.mean((values - record.values) ** 2, axis=0) / free
             estimated = np.maximum(np.sqrt(variance), LEAST_NOISE * self._sizes[number])
             self.misfit.noise[number] = np.where(self._is_given[number], self.misfit.noise[number], estimated)
+
+    def freedom(self, z: np.ndarray) -> float:
+        """Degrees of freedom of the residuals at ``z`` (coordinate,): data less what is fitted to them, at least 1."""
+        count = sum(record.values.size for record in self.misfit.records)
+        return max(count - self._fitted(z), 1.0)
+
+    def noise_freedom(self, z: np.ndarray) -> float:
+        """Degrees of freedom of the noise at ``z`` (coordinate,): those of the residuals, inf if all noise is given."""
+        if all(map(all, self._is_given)):
+            return np.inf
+        return self.freedom(z)
 
     def _fitted(self, z: np.ndarray) -> float:
         """How many numbers are fitted to the data at ``z``: one a parameter, less than one a coordinate of a state.

@@ -17,14 +17,10 @@ others finite: no mode has more than some hundred times e, the energy of a mode 
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 import scipy
 
 from vipetsc.case import Model
-from vipetsc.dynamics.initial import initial_fields
-from vipetsc.identification.motion import MotionCoefficients
 
 # Standard deviation of the prior of a coordinate. It has to be wide: with 1, 3 and 30 the parameters of a chain, from a
 # record with 5 % noise, move by .05, .005 and .0005 standard errors.
@@ -66,12 +62,9 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
     square of what was measured.
     """
     # Modes of the lattice without contacts.
-    coefficients = MotionCoefficients.of(model)
-    n = len(coefficients.masses)
-    rows = np.repeat(np.arange(n), np.diff(coefficients.first))
-    stiffness = np.zeros((n, n))
-    stiffness[rows, coefficients.columns] = coefficients.stiffness
-    roots = np.sqrt(coefficients.masses)
+    masses = model.chain.masses()
+    stiffness = model.chain.stiffness_matrix().toarray()
+    roots = np.sqrt(masses)
     squares, vectors = scipy.linalg.eigh(stiffness / np.outer(roots, roots))
     frequencies = np.sqrt(np.maximum(squares, 0.0))
 
@@ -89,15 +82,3 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
         deviation = np.sqrt(np.sum((shapes[mass] * frequencies ** (order - 1)) ** 2))
         scale = max(scale, size / deviation)
     return InitialState(first, scale * scipy.linalg.block_diag(shapes / frequencies, shapes))
-
-
-def state_of(model: Model) -> np.ndarray:
-    """The state (2n,) in m and m/s in which ``model`` begins: rest, if it has no initial motion.
-
-    Raises CaseError if the file of an initial state is gone or has changed.
-    """
-    chain = model.chain
-    if model.initial is None:
-        return np.zeros(2 * chain.cells * chain.cell.dofs)
-    fields = initial_fields(model, range(chain.cells), MPI.COMM_SELF)
-    return np.concatenate([field.ravel() for field in fields])

@@ -17,7 +17,7 @@ from vipetsc.identification.uncertainty import uncertainty_of
 REACH = 3.0
 # The cost is about the number of data, and rises by about ten over the reach of a profile: by REACH^2 = 9 where the
 # problem is linear. For a thousand data the relative tolerance of 1e-5 is an error of 0.01 in the cost.
-PRECISION = Precision(steps=30, cost=1e-5, derivatives=1e-5, is_rough=True)
+PRECISION = Precision(steps=30, cost=1e-5, is_rough=True)
 # A step to the next value that changes the contacts is halved, down to this fraction of the distance: four halvings.
 # Contacts that change within a smaller step are taken to change in the motion of the least misfit, too.
 SMALLEST_STEP = 1 / 16
@@ -124,5 +124,4 @@ def _follow(
 
 def _contacts(windows: GrowingWindows, z: np.ndarray) -> list[int]:
     """The numbers of the model's contacts, one a record."""
-    tolerances = windows.tolerances(PRECISION)
-    return [len(windows.onsets(z, number, end, tolerances)) for number, end in enumerate(windows.last)]
+    return [len(windows.onsets(z, number, end)) for number, end in enumerate(windows.last)]

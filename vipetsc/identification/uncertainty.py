@@ -66,9 +66,13 @@ def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
     return np.asarray(upper[others:, others:])
 
 
-def quantile(confidence: float) -> float:
-    """Number of standard errors on either side of a value in an interval of that ``confidence``, for normal errors."""
-    return float(scipy.stats.norm.ppf(0.5 + confidence / 2))
+def quantile(confidence: float, freedom: float = np.inf) -> float:
+    """Number of standard errors on either side of a value in an interval of that ``confidence``.
+
+    ``freedom`` are the degrees of freedom of the noise: data less what is fitted to them where the noise is estimated
+    from their residuals (Student's t), infinite where it is given (normal errors).
+    """
+    return float(scipy.stats.t.ppf(0.5 + confidence / 2, freedom))
 
 
 def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: float) -> np.ndarray:

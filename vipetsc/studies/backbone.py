@@ -134,11 +134,13 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
     The paper's three steps: the lattice's energy is scaled so that the ``initiation`` energy (J) falls on the
     transition from region I to II; the slope is divided by a scalar s; the linear transfer ``floor`` is added.
-    s minimises the sum of [ln(slope/s + floor) - ln(ibtet)]^2 over the fitted points. Raises as ``log_slope``.
+    s minimises the sum of [ln(slope/s + floor) - ln(ibtet)]^2 over the fitted points. Raises as ``log_slope``, and
+    ValueError if most of these points are not above the floor, so that no s is best.
 
     Returns ``energy``, ``ibtet`` and ``fitted`` of ``LAYOUT``, energies rising, with the ``branch``. Attributes, unless
-    there are too few points to fit: the ``divisor`` s in Hz/J, the transfer's power law (``factor``, ``exponent`` with
-    the ends of its 95 % interval, ``r2_adjusted``), and ``slope_exponent`` at the fitted energies.
+    there are too few points to fit: the ``divisor`` s in Hz/J, the root mean square ``misfit`` of the logarithms, the
+    transfer's power law (``factor``, ``exponent`` with the ends of its 95 % interval, ``r2_adjusted``), and
+    ``slope_exponent`` at the fitted energies.
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     # By energy, not amplitude: the drive's work need not grow with the amplitude once sites are in contact.
@@ -160,6 +162,14 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
     log_transfer = np.log(ibtet[fitted])
     log_slopes = log_slopes[fitted]
+    # A divisor that grows without a limit leaves the floor alone: no divisor is best where that fits most points better
+    # than the sum, which is larger.
+    middle = float(np.median(ibtet[fitted]))
+    if middle <= floor:
+        raise ValueError(
+            f"the transfer without contact, {floor:.3g}, is not below that of the fitted points, {middle:.3g} in the"
+            " middle: no divisor of the branch's slope is best"
+        )
 
     def misfit(log_divisor: float) -> float:
         return float(np.sum((np.log(np.exp(log_slopes - log_divisor) + floor) - log_transfer) ** 2))
@@ -173,6 +183,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     low, high = law.exponent_interval
     return aligned.assign_attrs(
         divisor=float(np.exp(best.x)),
+        misfit=float(np.sqrt(best.fun / len(log_transfer))),
         factor=law.factor,
         exponent=law.exponent,
         exponent_low=low,
@@ -238,9 +249,11 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     except ValueError as error:
         return str(error)
     floor = float(untouched.mean())
-    aligned = align(
-        work=curve["work"].values, ibtet=curve["ibtet"].values, initiation=initiation.energy, floor=floor, branch=slope
-    )
+    work = curve["work"].values
+    try:
+        aligned = align(work, curve["ibtet"].values, initiation.energy, floor, slope)
+    except ValueError as error:
+        return str(error)
     if "exponent" not in aligned.attrs:
         count = int(aligned["fitted"].sum())
         remedy = "follow the branch to more energy (nnm.energy), or sweep more amplitudes"

@@ -63,7 +63,9 @@ class Composed(NamedTuple):
     """Energies in J at the end under an amplitude: ``into`` (band) other than the drive's, ``dissipated`` in contacts.
 
     In a lattice with dashpots ``into`` has the change of the drive's band as well. ``absorbed`` is what absorbing ends
-    have taken. ``z`` (site) is the largest at every site; ``change`` the last iteration's, over the linear wave.
+    have taken. ``z`` (site) is the largest at every site; ``change`` the last iteration's, over the linear wave, in
+    which the linear equations were ``solved`` or not. ``defect`` in J is the energy that the sites take from the
+    drive's wave, by the work of their forces, less what they dissipate and send into bands by their own runs.
     """
 
     into: np.ndarray
@@ -71,6 +73,8 @@ class Composed(NamedTuple):
     absorbed: float
     z: np.ndarray
     change: float
+    solved: bool
+    defect: float
 
 
 class Arriving(NamedTuple):
@@ -134,6 +138,7 @@ class Network:
         others = (response[:, :, :sites] - g.T[:, :, None] * eye) / radiated.T[:, None]
         self.between = np.where(inside, others.T, 0)
         self.radiated = _of_sites(radiated[:, most])
+        self.alone = _of_sites(g[:, most])
         self.power = self._powers(self.om)
 
         self.third = fastest_wave(self.cell, 3 * self.om, chain.contact_pairs[0])
@@ -159,6 +164,7 @@ class Network:
         c3 = np.zeros_like(linear)
         on = np.zeros(linear.shape, bool)
         change = 0.0
+        solved = True
 
         for i in range(MOST):
             z = self._over_clearance(c, c3)
@@ -169,7 +175,7 @@ class Network:
 
             state = sites.at(z)
             # GMRES begins with the last c, which is near the next one.
-            arriving = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
+            arriving, solved = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
             change = float(np.abs(arriving - c).max()) / size
             step = 1.0
             if i >= FULL_STEPS:
@@ -180,10 +186,12 @@ class Network:
             if self.third:
                 f3 = state.third * np.abs(c) * unit_phase(c) ** 3 * on
                 sent = self._sent(self.received3, f3) * self.centre
-                c3 = c3 + 0.5 * (self._solve(self.between3, -1.0 * on, sent, c3) - c3)
+                arriving3, is_solved = self._solve(self.between3, -1.0 * on, sent, c3)
+                c3 = c3 + 0.5 * (arriving3 - c3)
+                solved = solved and is_solved
             if change < CLOSE and i >= LEAST:
                 break
-        return self._energies(Arriving(c, c3, on), sites, change, amplitude)
+        return self._energies(Arriving(c, c3, on), sites, change, solved, amplitude)
 
     def _pulse(self, drive: Waveform) -> np.ndarray:
         """Spectrum (offset,) of the envelope of a drive of 1 N, or of 1 m of a wall, about its frequency."""
@@ -254,8 +262,10 @@ class Network:
         arriving = self.line.backward(np.einsum("jkt,jt->kt", between, self.line.forward(source)))
         return np.where(self.during, arriving, 0)
 
-    def _solve(self, between: np.ndarray, factor: np.ndarray, right: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Solve x = right + sent(factor x)."""
+    def _solve(
+        self, between: np.ndarray, factor: np.ndarray, right: np.ndarray, guess: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
+        """Solve x = right + sent(factor x); returns x, and whether GMRES has converged."""
 
         def left(x: np.ndarray) -> np.ndarray:
             y = x.reshape(right.shape)
@@ -265,14 +275,16 @@ class Network:
         operator = LinearOperator((size, size), left, dtype=complex)
         # SciPy's own relative tolerance, 1e-5, is well below CLOSE, at which the outer iteration ends. Its name is not
         # written: it was `tol` before SciPy 1.12, and is `rtol` alone from 1.14 on.
-        x, _ = gmres(operator, right.ravel(), guess.ravel(), atol=0.0, restart=40, maxiter=5)
-        return np.asarray(x).reshape(right.shape)
+        x, flag = gmres(operator, right.ravel(), guess.ravel(), atol=0.0, restart=40, maxiter=5)
+        return np.asarray(x).reshape(right.shape), flag == 0
 
     def _over_clearance(self, c: np.ndarray, c3: np.ndarray) -> np.ndarray:
         """z (site, time), the amplitudes of both harmonics together over the clearance."""
         return np.asarray((np.abs(c) + np.abs(c3)) / self.clearance[:, None])
 
-    def _energies(self, waves: Arriving, sites: SiteResponses, change: float, amplitude: float) -> Composed:
+    def _energies(
+        self, waves: Arriving, sites: SiteResponses, change: float, solved: bool, amplitude: float
+    ) -> Composed:
         """The energies at the end, of ``waves`` that arrive at the sites under ``amplitude``."""
         c = waves.first
         z = self._over_clearance(c, waves.third)
@@ -286,6 +298,12 @@ class Network:
         emitted = power * into
         dissipated = float((power * lost).sum()) * step
         bands = emitted.sum(axis=(1, 2)) * step
+
+        # The work of a site's force on its pair, whose motion is what arrives and what the force itself radiates.
+        force = state.fundamental * c * waves.on
+        motion = c + self.alone * force
+        taken = -0.5 * np.real(force * np.conj(1j * self.om * motion))
+        defect = float(taken.sum()) * step - float(bands.sum()) - dissipated
 
         passed = 1.0
         gain = np.zeros_like(power)
@@ -304,16 +322,26 @@ class Network:
                 spectrum=burst.spectrum,
                 third=gain,
                 given=power * lost + emitted.sum(axis=0) + gain,
-                force=state.fundamental * c * waves.on,
+                force=force,
             )
             end = self.losses.at_end(sent, amplitude)
-            return Composed(into=end.remaining, dissipated=dissipated, absorbed=end.absorbed, z=largest, change=change)
+            return Composed(
+                into=end.remaining,
+                dissipated=dissipated,
+                absorbed=end.absorbed,
+                z=largest,
+                change=change,
+                solved=solved,
+                defect=defect,
+            )
 
         bands = bands * passed
         if self.third:
             # The gain may be negative, where sites cancel each other's third harmonics; an energy may not.
             bands[self.third.band] = max(bands[self.third.band] + float(gain.sum()) * step, 0.0)
-        return Composed(into=bands, dissipated=dissipated, absorbed=0.0, z=largest, change=change)
+        return Composed(
+            into=bands, dissipated=dissipated, absorbed=0.0, z=largest, change=change, solved=solved, defect=defect
+        )
 
     def _third_gain(self, waves: Arriving, third: np.ndarray) -> np.ndarray:
         """Power (site, time) in W by which third harmonics of the sites give more together than each alone."""

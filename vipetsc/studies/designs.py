@@ -84,8 +84,12 @@ class OptimumSearch:
             return False
 
         generation = self.asked[0].generation
-        if generation:  # generation 0 is the case and the start, which the sampler did not ask for
+        if generation:
             self._tell()
+        else:
+            # The case and the start, which the sampler did not ask for. The start is the last of them.
+            first = self.asked[-1]
+            self.sampler.know_start(np.array(first.losses), first.excess)
         points = self.sampler.ask()[:left]
         self.asked = [self._design(self._values(point), generation + 1) for point in points]
         self.designs += self.asked
@@ -101,24 +105,12 @@ class OptimumSearch:
         return values
 
     def _tell(self) -> None:
-        """Give the sampler the losses of the designs that it asked for.
-
-        A design that misses a constraint is worse than all that miss none, the more so the more it misses (Deb 2000,
-        Comput. Methods Appl. Mech. Eng. 186, 311). A design that failed is as bad as the one that misses most, or worse
-        than all others if none misses any.
-        """
-        judged = self.feasible_losses()
-        # Over all designs so far, not those of this generation: losses that the sampler has must stay comparable. One
-        # more than the worst keeps designs that miss a constraint behind it.
-        worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
-        most = max(design.excess for design in self.designs)
-        losses = []
-        for design in self.asked:
-            row = np.array(design.losses)
-            if design.excess > 0:
-                row = worst + design.excess
-            losses.append(np.where(np.isfinite(row), row, worst + most))
-        self.sampler.tell(np.array(losses))
+        """Give the sampler the losses and the excess of the designs that it asked for."""
+        losses = np.array([design.losses for design in self.asked])
+        excess = np.array([design.excess for design in self.asked])
+        # A design that failed misses its constraints by more than any other.
+        excess[~np.isfinite(losses).all(axis=1)] = np.inf
+        self.sampler.tell(losses, excess)
 
     def losses(self) -> np.ndarray:
         """Losses of all designs (design, objective)."""

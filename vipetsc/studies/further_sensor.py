@@ -1,7 +1,7 @@
 """One more sensor for an identification: at which mass it would lower the error of each parameter most.
 
-A sensor adds the derivatives of what it measures, over its noise, as rows to the Jacobian. The derivatives at all
-candidate masses come from one integration of the fitted motion, so that no candidate needs a fit of its own.
+A sensor adds the derivatives of what it measures, over its noise, as rows to the Jacobian. The same runs give the
+derivatives at all candidate masses, so that no candidate needs a fit of its own.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,10 @@ from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.uncertainty import Uncertainty, errors_with_sensor
 
-# Masses at most, evenly over the lattice, at which a sensor is tried. With so many the motion of a thousand samples and
-# its derivatives by ten parameters are just below ``MOST_NUMBERS``; with more of them samples would be left out.
+# Masses at most, evenly over the lattice, at which a sensor is tried.
 MOST_CANDIDATES = 400
-# Numbers of the motion of these masses and its derivatives that are kept in memory, at most: 160 MB.
-MOST_NUMBERS = 20_000_000
+# Derivatives at these masses that are kept in memory, at most: 40 MB, those of a thousand samples by ten parameters.
+MOST_NUMBERS = 5_000_000
 
 
 def _further_sensor(sensors: Sequence[SensorTable], noise: np.ndarray) -> tuple[str, float]:
@@ -50,18 +49,20 @@ def further_sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: U
     dofs = plan.base.lattice.unit_cell().dofs
     count = plan.base.lattice.cells * dofs
     candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
-    inner, estimated = misfit.columns(record, range(misfit.size))
     # Of long records of large lattices every n-th sample, which stands for n of them, is enough.
-    # A motion has a further row, the acceleration's rate, behind those of what sensors measure.
-    rows = len(ROWS) + 1
-    numbers = len(misfit.records[record].times) * len(candidates) * rows * (1 + len(inner + estimated))
-    stride = -(-numbers // MOST_NUMBERS)
-    response = misfit.respond(
-        z, record, windows.last[record], active=range(misfit.size), watched=candidates, stride=stride
-    )
-    slopes = np.zeros((*response.motion.shape[:2], len(z)))
-    # Each sample stands for ``stride`` of them, whose information adds: sensitivities grow with its root.
-    slopes[:, :, inner + estimated] = np.sqrt(stride) * response.motion[:, :, ROWS[quantity], 1:]
+    times = misfit.records[record].times
+    stride = -(-len(times) * len(candidates) * len(z) // MOST_NUMBERS)
+
+    def measured(moved: np.ndarray) -> np.ndarray:
+        """What sensors at all candidates would measure (sample, mass) at the coordinates ``moved``."""
+        response = misfit.respond(moved, record, candidates.tolist(), times[::stride])
+        return response.motion[:, :, ROWS[quantity]]
+
+    slopes = np.zeros((len(times[::stride]), len(candidates), len(z)))
+    for p in range(len(z)):
+        if misfit.acts_on(p, record):
+            # Each sample stands for ``stride`` of them, whose information adds: sensitivities grow with its root.
+            slopes[:, :, p] = np.sqrt(stride) * misfit.difference(z, p, measured)
     errors = errors_with_sensor(uncertainty, slopes, noise)[:, : misfit.count]
     chosen = errors.argmin(axis=0)
     return {

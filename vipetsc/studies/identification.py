@@ -33,7 +33,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import IDENTIFIED, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.records import Record
-from vipetsc.parallel import StopRequest, divided, on_root
+from vipetsc.parallel import StopRequest, StudyError, divided, on_root
 from vipetsc.studies.identified import identified_values, summary_of, warnings_of
 from vipetsc.studies.identified_layout import LAYOUT
 from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
@@ -53,7 +53,7 @@ def run_identification(
     """Fit the parameters of ``plan`` to its records in ``folder``; returns a table of the results.
 
     All ranks of ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this
-    identification, CaseError if a record has changed, RuntimeError if no start leads to a fit.
+    identification, CaseError if a record has changed, StudyError if no start leads to a fit.
     """
     IdentifyCase.expect(plan, "run_identification")
     with claimed(comm, folder, IDENTIFIED, plan.to_toml(), force=force, resume=resume) as claim:
@@ -182,7 +182,7 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
     fits = _fits(work, starts, folder, comm, progress)
     fitted = [number for number, record in enumerate(fits) if "deviance" in record]
     if not fitted:
-        raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
+        raise StudyError(f"no start leads to a fit: {fits[0]['reason']}")
     # The number decides between equal fits, so that every rank takes the same one.
     best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
     recorded = _recorded_runs(work, folder, comm, ranks=1)

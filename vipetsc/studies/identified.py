@@ -8,10 +8,17 @@ import xarray as xr
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
-from vipetsc.identification.clearance_search import largest_towards, reached_by
+from vipetsc.identification.clearance_search import largest_towards, motion_without, reached_by
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit_profile import ProfileCosts
-from vipetsc.identification.uncertainty import DETERMINED, Uncertainty, marginal_jacobian, quantile, uncertainty_of
+from vipetsc.identification.uncertainty import (
+    DETERMINED,
+    SMALLEST,
+    Uncertainty,
+    marginal_jacobian,
+    quantile,
+    uncertainty_of,
+)
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
 from vipetsc.studies.further_sensor import further_sensor_values
@@ -26,6 +33,12 @@ BEYOND_NOISE = 1.2
 IMPROBABLE = 0.01
 # Residuals below this fraction of their channel are those of rounding and steps, not noise.
 EXACT = 1e-6
+# Distance of a coordinate from its bound up to which its value is at that bound. A fit stays inside, and comes as near
+# as its last steps allow.
+AT_BOUND = 1e-6
+# The least step of a fit, in standard errors, that shows that the data want a value beyond a bound. A fit that has
+# ended inside the bounds has steps of 1e-6.
+STEP = 0.01
 # Fits whose coordinates differ by at most this, or by three standard errors if these are more, lie in one valley.
 SAME_VALLEY = 1e-3
 
@@ -39,7 +52,7 @@ def identified_values(
     """
     jacobian = windows.misfit.whole_jacobian(z, windows.last)
     uncertainty = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
-    values = _parameter_values(windows, z, uncertainty)
+    values = _parameter_values(windows, z, jacobian, uncertainty)
     values |= further_sensor_values(windows, z, uncertainty_of(jacobian))
     values |= _window_values(windows, fits[best])
     values |= _start_values(windows, fits, best, uncertainty.errors)
@@ -58,18 +71,25 @@ def identified_values(
     }
 
 
-def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
-    """Parameters with their uncertainty, and what is not determined."""
+def _parameter_values(
+    windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray, uncertainty: Uncertainty
+) -> dict[str, Any]:
+    """Parameters with their ``uncertainty``, and what is not determined; ``jacobian`` is that of all coordinates."""
     misfit = windows.misfit
     parameters = misfit.plan.parameters
     reached = reached_by(misfit, z, windows.last)
-    z = z[: misfit.count]
     # A group whose stops are all out of reach is at least as wide as the largest motion towards any.
     at_least = np.array([largest_towards(misfit.plan, parameter, reached) for parameter in parameters])
+    for number in np.flatnonzero(np.isnan(at_least)):
+        at_least[number] = motion_without(misfit, z, int(number), windows.last, windows.high)
 
-    determined = uncertainty.determined & np.isnan(at_least)
+    at_bound = _bounds_met(windows, z, jacobian, uncertainty)
+    at_bound[np.isfinite(at_least)] = 0
+    confidence = misfit.plan.options.confidence
+    width = quantile(confidence, windows.noise_freedom(z)) * uncertainty.errors
+    z = z[: misfit.count]
+    determined = uncertainty.determined & np.isnan(at_least) & (at_bound == 0)
     slopes = np.array([parameter.slope(x) for parameter, x in zip(parameters, z, strict=True)])
-    width = quantile(misfit.plan.options.confidence) * uncertainty.errors
     low = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z - width, strict=True)]
     high = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z + width, strict=True)]
     return {
@@ -83,6 +103,7 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncer
         "interval_low": np.where(determined, low, np.nan),
         "interval_high": np.where(determined, high, np.nan),
         "determined": determined.astype(int),
+        "at_bound": at_bound,
         "at_least": at_least,
         "relative_error": uncertainty.errors,
         "correlation": uncertainty.correlation,
@@ -90,6 +111,29 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncer
         "singular": uncertainty.singular,
         "vector": uncertainty.directions,
     }
+
+
+def _bounds_met(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray, uncertainty: Uncertainty) -> np.ndarray:
+    """Of each parameter (parameter,): -1 at its lower bound, 1 at its upper one, else 0.
+
+    It is at a bound, or the data want it beyond: the next step of the fit without bounds ends there.
+    """
+    misfit = windows.misfit
+    prior = misfit.prior() @ z
+    residuals = np.concatenate([misfit.residuals(z, windows.last), prior])
+    step, *_ = np.linalg.lstsq(jacobian, -residuals, rcond=SMALLEST)
+
+    met = np.zeros(misfit.count, int)
+    for p in range(misfit.count):
+        # A step much smaller than the error is one of rounding.
+        moved = z[p]
+        if uncertainty.determined[p] and abs(step[p]) > STEP * uncertainty.errors[p]:
+            moved += step[p]
+        if min(z[p], moved) <= windows.low[p] + AT_BOUND:
+            met[p] = -1
+        elif max(z[p], moved) >= windows.high[p] - AT_BOUND:
+            met[p] = 1
+    return met
 
 
 def _window_values(windows: GrowingWindows, record: Record) -> dict[str, Any]:
@@ -183,7 +227,7 @@ def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     data: list[dict[str, np.ndarray]] = []
     for number, (record, table) in enumerate(zip(misfit.records, misfit.plan.options.records, strict=True)):
-        model, _ = misfit.predicted(z, number, windows.last[number])
+        model = misfit.predicted(z, number, windows.last[number])
 
         for k, sensor in enumerate(table.sensors):
             measured = record.values[:, k]
@@ -252,7 +296,16 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
             yield f"{name}: at least {least:.4g} m; nothing touches there"
 
     parameters = IdentifyCase.of(data).parameters
-    for row in np.flatnonzero((data["determined"].values == 0) & np.isnan(at_least)):
+    at_bound = data["at_bound"].values
+    for row in np.flatnonzero(at_bound):
+        bound = "upper" if at_bound[row] > 0 else "lower"
+        yield (
+            f"{data['parameter'].values[row]}: the fit ends at its {bound} bound, so that there is no interval; set"
+            " wider bounds if values beyond are possible"
+        )
+
+    is_open = (data["determined"].values == 0) & np.isnan(at_least) & (at_bound == 0)
+    for row in np.flatnonzero(is_open):
         helped = "no further sensor would do so"
         error = float(data["sensor/relative_error"].values[row])
         if error < DETERMINED:
@@ -313,6 +366,8 @@ class _ParameterRow(NamedTuple):
         if np.isfinite(parameter["at_least"]):
             value = ""
             interval = f"at least {float(parameter['at_least']):.6g}"
+        elif parameter["at_bound"]:
+            interval = "at its bound"
         elif not parameter["determined"]:
             interval = "not determined"
         else:

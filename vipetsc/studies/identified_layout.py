@@ -11,6 +11,7 @@ LAYOUT = {
     "interval_low": ("parameter", "1", "lower end of the confidence interval; NaN if not determined"),
     "interval_high": ("parameter", "1", "upper end of the confidence interval; NaN if not determined"),
     "determined": ("parameter", "1", "1 if the data determine the value, otherwise 0"),
+    "at_bound": ("parameter", "1", "1 at the upper bound, -1 at the lower one, where there is no interval; else 0"),
     "at_least": (
         "parameter",
         "m",

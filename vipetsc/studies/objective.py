@@ -182,6 +182,8 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
     model = Case.of(run).model()
     # The ledger counts the energy of the motion at t = 0 as work.
     work = float(run["energy/work"][-1])
+    if not work > 0:
+        raise RuntimeError(f"the lattice received {work:.3g} J: no energy of which a fraction could be measured")
     u = run["displacement"].values[-1:]
     v = run["velocity"].values[-1:]
     # All of these are measured whatever is asked for: the pictures compare designs by them.

@@ -24,10 +24,13 @@ from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.lattice import Chain, pass_bands
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction_runs import PredictionRuns, Records, amplitudes_of
+from vipetsc.studies.composition import CLOSE, Network
+from vipetsc.studies.prediction_runs import PredictionRuns, Records, amplitudes_of, onset_of
 from vipetsc.studies.response import SiteResponse, SiteResponses
 
+# Defect of the energies over the work above which a prediction warns. That of sites some cells apart is 0.02 at most,
+# while 20 neighbouring sites have 0.4.
+LARGEST_DEFECT = 0.1
 LAYOUT = {
     "amplitude": ("amplitude", "N", "amplitude of the drive; in m of a moved wall"),
     "band": ("band", "1", "pass band, from 1"),
@@ -46,6 +49,12 @@ LAYOUT = {
         "largest relative displacement of the wave that arrives at a site, over its clearance",
     ),
     "predicted/change": ("amplitude", "1", "change by the last iteration over the linear wave"),
+    "predicted/solved": ("amplitude", "1", "1 if the equations of the last iteration were solved to their tolerance"),
+    "predicted/defect": (
+        "amplitude",
+        "1",
+        "energy that sites take from the drive's wave, less what they dissipate and send into bands, over the work",
+    ),
 }
 MEASURED = ("bands", "upper", "other", "dissipated", "dashpots", "absorbed")
 LAYOUT |= {f"simulated/{name}": LAYOUT[f"predicted/{name}"] for name in MEASURED}
@@ -100,7 +109,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
     linear = records.linear
     amplitudes = amplitudes_of(case, linear)
     driven = next(i for i, band in enumerate(pass_bands(cell)) if model.drive.frequency <= band.high)
-    onset = 1 / max(linear["reached"])
+    onset = onset_of(linear)
 
     kinds = case.kinds
     responses = [
@@ -126,20 +135,46 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
         simulated = _simulated(records.members, driven, model.chain)
         values |= {f"simulated/{name}": value for name, value in simulated.items()}
         about |= errors(values)
+    about["warnings"] = prediction_warnings(values)
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     data["amplitude"].attrs["units"] = amplitude_unit(case)
     return data
+
+
+def prediction_warnings(values: dict[str, np.ndarray]) -> list[str]:
+    """Sentences on predictions that have not converged; ``values`` (amplitude,) by name in ``LAYOUT``."""
+    warnings = []
+    change = values["predicted/change"]
+    moving = change > CLOSE
+    if moving.any():
+        warnings.append(
+            f"at {int(moving.sum())} of {len(change)} amplitudes the iteration still changes the waves, by"
+            f" {float(change.max()):.2g} of the linear one at most: sites that are close together feel each other too"
+            " strongly for it"
+        )
+    unsolved = int(np.sum(values["predicted/solved"] == 0))
+    if unsolved:
+        warnings.append(f"at {unsolved} of {len(change)} amplitudes the linear equations of its last step are unsolved")
+    defect = np.abs(values["predicted/defect"])
+    open_budget = int(np.sum(defect > LARGEST_DEFECT))
+    if open_budget:
+        warnings.append(
+            f"at {open_budget} of {len(change)} amplitudes the energy that the sites take from the drive's wave is not"
+            f" that which their runs alone give, by {float(defect.max()):.2g} of the work at most: the sites are too"
+            " close together to be composed"
+        )
+    return warnings
 
 
 def _predicted(
     network: Network, sites: SiteResponses, amplitudes: np.ndarray, linear: Record, driven: int
 ) -> dict[str, np.ndarray]:
     """Predicted values at every amplitude, by their names in ``LAYOUT``; ``driven`` is the drive's band from 0."""
-    onset = 1 / max(linear["reached"])
+    onset = onset_of(linear)
     untouched = np.array(linear["bands"]) / linear["work"]
     losses = network.losses
     absorbed_before = 0.0
-    rows: dict[str, list[Any]] = {"bands": [], "dissipated": [], "z": [], "change": []}
+    rows: dict[str, list[Any]] = {"bands": [], "dissipated": [], "z": [], "change": [], "solved": [], "defect": []}
     if losses:
         absorbed_before = losses.absorbed_without_contacts() / linear["work"]
         rows["dashpots"] = []
@@ -153,6 +188,8 @@ def _predicted(
         absorbed = absorbed_before
         z = amplitude * np.array(linear["reached"])
         change = 0.0
+        solved = True
+        defect = 0.0
         if amplitude > onset:
             composition = network.compose(float(amplitude), sites)
             bands += composition.into / work
@@ -160,6 +197,8 @@ def _predicted(
             absorbed += composition.absorbed / work
             z = composition.z
             change = composition.change
+            solved = composition.solved
+            defect = composition.defect / work
 
         # Energies add up to the work: one of them is what the others leave.
         if losses:
@@ -174,6 +213,8 @@ def _predicted(
         rows["dissipated"].append(dissipated)
         rows["z"].append(z)
         rows["change"].append(change)
+        rows["solved"].append(int(solved))
+        rows["defect"].append(defect)
     predicted = {name: np.array(column) for name, column in rows.items()}
     return predicted | _sums(predicted["bands"], driven)
 

@@ -17,7 +17,7 @@ from vipetsc.case.kinds import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import Record
 from vipetsc.lattice import pass_bands
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, StudyError
 from vipetsc.spectra import ModalParts
 from vipetsc.studies.pair_motion import ContactSpan, PairMotion
 from vipetsc.studies.rays import BINS
@@ -72,11 +72,22 @@ class Records(NamedTuple):
     largest: float
 
 
+def onset_of(linear: Record) -> float:
+    """The amplitude in N whose linear wave just touches a site, from the ``linear`` run's record.
+
+    Raises StudyError if that run moves no site.
+    """
+    reached = max(linear["reached"])
+    if not reached > 0:
+        raise StudyError("the linear wave moves no site before the run ends; set a later time.end, or other sites")
+    return float(1 / reached)
+
+
 def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
     """The amplitudes (amplitude,) in N, in rising order."""
     if case.predict.amplitudes:
         return np.unique(case.predict.amplitudes)
-    onset = 1 / max(linear["reached"])
+    onset = onset_of(linear)
     return np.geomspace(onset, case.predict.span * onset, case.predict.count)
 
 

@@ -20,7 +20,7 @@ from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.result import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
-from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
+from vipetsc.parallel import StoppedError, StopRequest, StudyError, on_every_rank, on_root
 from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
@@ -129,7 +129,7 @@ class RecordedRuns:
         """Compute the missing records of ``keys``; ``work`` returns that of a key. Collective.
 
         All ranks of a team call ``work`` for the same key. With ``allow_failures`` a run that fails is recorded with
-        its ``reason``; otherwise it raises RuntimeError on all ranks once the others have ended. Raises as ``compute``,
+        its ``reason``; otherwise it raises StudyError on all ranks once the others have ended. Raises as ``compute``,
         and StoppedError on all ranks after a request to stop; what has ended by then is recorded. ``what`` names the
         runs in messages and in the bar that ``progress`` shows.
         """
@@ -147,7 +147,7 @@ class RecordedRuns:
 
         def check() -> None:
             if reasons:
-                raise RuntimeError(f"one of the {what} failed: {reasons[0]}")
+                raise StudyError(f"one of the {what} failed: {reasons[0]}")
 
         on_root(self.comm, check)
 

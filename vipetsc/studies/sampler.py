@@ -1,7 +1,10 @@
 """Samplers of designs: CMA-ES for one objective, NSGA-II for two; the same designs from the same seed.
 
 A sampler is asked for a generation of points (design, variable) in the unit cube, and is then told their losses
-(design, objective) in the same order, which it makes small. Neither draws from numpy's global state.
+(design, objective), which it makes small, and their excess (design,), by how much constraints are missed in sum: inf
+for a design that failed. A design that misses none is better than all that miss any, and of two that do the one with
+the smaller excess is better (Deb 2000, Comput. Methods Appl. Mech. Eng. 186, 311). Neither draws from numpy's global
+state.
 """
 
 from typing import Any
@@ -22,7 +25,7 @@ class CmaEs:
 
     The search begins at the point ``start`` (variable,) of the unit cube, with the standard deviation ``step`` along
     each of the ``directions`` (variable, direction); points beyond the cube are mirrored into it. When it has
-    contracted it begins again at the best point, with twice the population, up to ``LARGEST`` times the first.
+    contracted it begins again at the best point so far, with twice the population, up to ``LARGEST`` times the first.
     ``steps`` (variable,) are the distances of neighbouring whole numbers in the cube, 0 for real variables; the
     direction of a whole number must be its own axis. ``population`` is the size of the first generation, by default
     what ``cma`` takes for the number of variables.
@@ -41,7 +44,9 @@ class CmaEs:
         self._step = step
         self._steps = steps
         self._directions = directions
-        self._best: tuple[float, np.ndarray] = np.inf, start
+        # Compared in this order: what misses no constraint comes first.
+        self._least = (np.inf, np.inf)
+        self._best = start
         self._begin(population)
         self._first = int(self._search.popsize)
 
@@ -59,7 +64,7 @@ class CmaEs:
         if population:
             options["popsize"] = population
         # The search runs in coordinates along the directions, with the best point as their origin.
-        self._centre = self._best[1]
+        self._centre = self._best
         self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
@@ -70,12 +75,30 @@ class CmaEs:
         self._points = 1 - np.abs(1 - unbounded % 2)
         return self._points
 
-    def tell(self, losses: np.ndarray) -> None:
-        """Take the losses (design, 1) of the generation that was asked for, and begin again if it has contracted."""
-        least = int(np.argmin(losses[:, 0]))
-        if losses[least, 0] < self._best[0]:
-            self._best = float(losses[least, 0]), self._points[least]
-        self._search.tell(self._asked, losses[:, 0].tolist())
+    def know_start(self, losses: np.ndarray, excess: float) -> None:
+        """Take the losses (1,) and the ``excess`` of the start, which is not one of the points that are asked for."""
+        if np.isfinite(losses).all():
+            self._least = (excess, float(losses[0]))
+
+    def tell(self, losses: np.ndarray, excess: np.ndarray) -> None:
+        """Take the losses (design, 1) and the ``excess`` (design,) of the generation that was asked for.
+
+        Begins again if the search has contracted.
+        """
+        order = np.lexsort((losses[:, 0], excess))
+        first = int(order[0])
+        least = (float(excess[first]), float(losses[first, 0]))
+        if least < self._least:
+            self._least = least
+            self._best = self._points[first]
+
+        # The search looks at the order of the values in a generation alone, and ends where they are all equal. Designs
+        # that miss a constraint come behind the others, at any distance.
+        missed = order[excess[order] > 0]
+        values = losses[:, 0].copy()
+        worst = np.max(losses[excess == 0, 0], initial=0.0)
+        values[missed] = worst + (1 + abs(worst)) * np.arange(1, len(missed) + 1)
+        self._search.tell(self._asked, values.tolist())
         if self._search.stop():
             self._begin(min(2 * len(self._asked), LARGEST * self._first))
 
@@ -95,7 +118,7 @@ class Nsga2:
         first = start + step * np.random.default_rng(seed).standard_normal((population, len(start)))
         # The start itself, which a search that is stopped early must not miss.
         first[0] = start
-        self._problem = Problem(n_var=len(start), n_obj=objectives, xl=0.0, xu=1.0)
+        self._problem = Problem(n_var=len(start), n_obj=objectives, n_ieq_constr=1, xl=0.0, xu=1.0)
         self._search = NSGA2(pop_size=population, sampling=np.clip(first, 0.0, 1.0))
         self._search.setup(self._problem, termination=NoTermination(), seed=seed)
 
@@ -104,12 +127,17 @@ class Nsga2:
         self._asked = self._search.ask()
         return np.array(self._asked.get("X"), float)
 
-    def tell(self, losses: np.ndarray) -> None:
-        """Take the losses (design, objective) of the generation that was asked for."""
+    def know_start(self, losses: np.ndarray, excess: float) -> None:
+        """Do nothing: the start is one of the points that are asked for."""
+
+    def tell(self, losses: np.ndarray, excess: np.ndarray) -> None:
+        """Take losses (design, objective) and ``excess`` (design,) of the generation that was asked for."""
         from pymoo.core.evaluator import Evaluator
         from pymoo.problems.static import StaticProblem
 
-        Evaluator().eval(StaticProblem(self._problem, F=losses), self._asked)
+        # Losses of a design that failed are not compared, but must be numbers.
+        finite = np.where(np.isfinite(losses), losses, 0.0)
+        Evaluator().eval(StaticProblem(self._problem, F=finite, G=excess[:, None]), self._asked)
         self._search.tell(infills=self._asked)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 from vipetsc.case.amplitude import amplitude_unit
@@ -76,6 +77,7 @@ def prediction_table(data: xr.Dataset) -> str:
 
     lines.append(f"first contact ({unit}): {data.attrs['onset_amplitude']:.4g}")
     lines += [f"{text}: {data.attrs[key]:.4g}" for key, text in SUMMARY.items() if key in data.attrs]
+    lines += [f"warning: {text}" for text in json.loads(data.attrs.get("warnings", "[]"))]
     return "\n".join(lines)
 
 
