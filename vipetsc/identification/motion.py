@@ -122,9 +122,7 @@ class SampledModel:
             chain = replace(model.chain, sites=(), clearances=(), pairs=())
             model = replace(model, chain=chain, laws=(), gaps=())
         atol = tuple(RTOL / model.rtol * value for value in model.atol)
-        # Half an interval more than the last sample: rounding does not lose it.
-        end = (count + 0.5) * interval
-        model = replace(model, sample_interval=interval, end=end, rtol=RTOL, atol=(atol[0], atol[1]))
+        model = replace(model, sample_interval=interval, end=count * interval, rtol=RTOL, atol=(atol[0], atol[1]))
 
         dofs = model.chain.cell.dofs
         points = [PointTable(name=f"mass{mass}", cell=mass // dofs + 1, mass=mass % dofs + 1) for mass in self.watched]
