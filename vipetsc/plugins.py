@@ -18,6 +18,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from vipetsc import register
 from vipetsc.register import PARTS, PartError, RegisteredPart
 
@@ -89,6 +91,18 @@ def call(part: RegisteredPart, function: Callable[..., Any], *arguments: Any) ->
         if isinstance(error, PROGRAMMING):
             raise PartError(text) from error
         raise PartFailure(text) from error
+
+
+def number_of(part: RegisteredPart, value: Any, what: str = "value") -> float:
+    """Return the real number that a function of a ``part`` has returned; raises PartError for any other ``value``.
+
+    ``what`` names it in the message.
+    """
+    array = np.asarray(value)
+    if array.ndim or array.dtype.kind not in "biuf":
+        given = f"the {part.kind} {part.name!r} of {part.file} returns {value!r}"
+        raise PartError(f"{given} as its {what}; a real number is needed")
+    return float(array)
 
 
 def is_file(name: str) -> bool:

@@ -28,8 +28,8 @@ def measured() -> xr.Dataset:
         "bands/mass": variable("cell", [4e-3, 2e-3], "kg", "mass"),
         # In xarray's DataTree a group inherits the root's coordinate of that name in its place.
         "bands/cell": variable("bands/part", np.array([7, 7, 3], np.int8), "1", "not the coordinate of the root"),
-        "coarse/time": variable("coarse/time", [0.0, 1.0], "s", "a time of the group's own"),
-        "coarse/total": variable("coarse/time", [3.0, 4.0], "J", "kinetic energy"),
+        "coarse/step": variable("coarse/step", [0.0, 1.0], "s", "a time of the group's own"),
+        "coarse/total": variable("coarse/step", [3.0, 4.0], "J", "kinetic energy"),
         "law": variable("law", ["hertz", "bilinear"], "1", "contact law"),
         "ibtet": variable((), 0.25, "1", "transfer", start=0.5),
     }
@@ -54,7 +54,7 @@ def test_what_is_written_is_read_back(tmp_path):
         assert data.attrs["bands/start"] == 0.5
 
         # The group's own coordinate selects, although the root has one of the same name.
-        assert data["coarse/total"].sel({"coarse/time": 1.0}).item() == 4.0
+        assert data["coarse/total"].sel({"coarse/step": 1.0}).item() == 4.0
         assert data["velocity"].sel(cell=7, time=0.5).item() == 3.0
         assert data["bands/energy"].sel({"bands/part": 2}).values.tolist() == [0, 1, 0]
 
@@ -188,3 +188,18 @@ def test_it_loads_neither_petsc_nor_mpi():
     code = "import sys, vipetsc.io.netcdf; print(*{'petsc4py', 'mpi4py'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+@pytest.mark.parametrize(("below", "above"), [("g/cell", "cell"), ("g/h/part", "g/part"), ("g/h/cell", "cell")])
+def test_a_file_is_one_that_xarray_opens_as_a_tree(tmp_path, below, above):
+    """A tree of groups inherits dimensions: a dimension of the name of one above it is refused when it is written."""
+    path = tmp_path / "file.h5"
+    write_netcdf(path, measured())
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        assert tree["bands"]["energy"].dims == ("part", "time")
+
+    data = xr.Dataset({name: variable(name, np.arange(float(len(name))), "1", "number") for name in (below, above)})
+    with pytest.raises(ValueError, match=f"{below} has the name of the dimension {above}"):
+        write_netcdf(path, data)
+    with xr.open_datatree(path, engine="h5netcdf"):
+        pass

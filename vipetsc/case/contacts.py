@@ -106,8 +106,9 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
             first.setdefault(law.law, replace(law, stiffness=law.stiffness or 1.0))
     for name, law in first.items():
         reason = check_law(law)
-        if reason:
-            yield Problem(path_of(contacts, "law"), name, reason)
+        part = registered_law(name)
+        if reason and part:
+            yield Problem(path_of(contacts, "law"), name, f"in {part.file}: {reason}")
 
 
 def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:

@@ -1,14 +1,13 @@
 """Laws and factors that users' modules register: what is wrong with their parameters, and with their formulas."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from vipetsc.case.section import Problem
 from vipetsc.lattice import Contact
 from vipetsc.lattice.contact import registered_factor, registered_law
-from vipetsc.plugins import call
+from vipetsc.plugins import call, number_of
 from vipetsc.register import Parameter
 from vipetsc.wording import with_unit
 
@@ -71,7 +70,7 @@ def check_law_parameters(
 
 
 def check_law(law: Contact) -> str:
-    """The first defect of the formulas of a registered ``law`` with its parameters, in words; empty without one."""
+    """Return the first defect of the formulas of a registered ``law`` in words; empty without one."""
     try:
         force = law.elastic_force(DEPTHS)
         slope = law.elastic_slope(DEPTHS)
@@ -118,7 +117,7 @@ def check_factors(path: str, names: Iterable[str], restitutions: Iterable[float]
         factor = registered_factor(name or "")
         if factor is None or restitution < factor.least_restitution:
             continue
-        value: Any = call(factor, factor.function, restitution)
-        if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value >= 0):
-            remedy = f"gives c = {value!r} for the restitution {restitution:g}; a number from 0 is needed"
+        value = number_of(factor, call(factor, factor.function, restitution), "factor c")
+        if not 0 <= value < np.inf:
+            remedy = f"in {factor.file} gives c = {value:g} for the restitution {restitution:g}; it must be 0 or more"
             yield Problem(path, name, remedy)

@@ -17,7 +17,7 @@ from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.lattice import ToneBurst, Waveform
 from vipetsc.lattice.drive import impulse, main_frequency, ramped, sampled
-from vipetsc.plugins import call
+from vipetsc.plugins import call, number_of
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 from vipetsc.wording import counted
 
@@ -210,6 +210,8 @@ def waveform_record(name: str) -> WaveformRecord:
         if not isinstance(built, get_args(Waveform)):
             returned = f"the waveform {part.name!r} of {part.file} returns {built!r}"
             raise PartError(f"{returned}; a waveform of vipetsc.lattice.drive is needed")
+        if not np.isfinite(built.peak):
+            raise PartError(f"the waveform {part.name!r} of {part.file} has a force that is not a finite number")
         return cast(Waveform, built)
 
     def describe(drive: "OneDrive") -> str:
@@ -218,11 +220,11 @@ def waveform_record(name: str) -> WaveformRecord:
 
     def frequency(drive: "OneDrive", highest: float) -> float:
         assert part.frequency
-        value = call(part, part.frequency, drive, *numbers(drive))
-        if not (isinstance(value, int | float | np.number) and value > 0):
+        value = number_of(part, call(part, part.frequency, drive, *numbers(drive)), "frequency")
+        if not 0 < value < np.inf:
             given = f"the frequency of the waveform {part.name!r} of {part.file} is {value!r}"
             raise PartError(f"{given}; a positive number in rad/s is needed")
-        return float(min(value, highest))
+        return min(value, highest)
 
     return WaveformRecord(
         build=build,

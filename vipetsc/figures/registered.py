@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from vipetsc import plugins
 from vipetsc.case.parts import module_names
 from vipetsc.figures.sources import FILES, SWEEP
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.style import SCREEN, Drawing
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
 
+MOST_PIXELS = 20_000  # 1.6 GB for a square picture
 RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", *(file.name for file in FILES.values()))
 
 
@@ -38,7 +39,7 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
             continue
         for part in parts:
             if isinstance(part, FigurePart) and part.source == source:
-                draw = partial(_drawn, part)
+                draw = partial(drawn, part)
                 if source == SWEEP:
                     draw = partial(_each_sweep, draw)
                 figures[part.name] = draw
@@ -59,11 +60,16 @@ def _modules(folder: Path) -> list[str]:
     return []
 
 
-def _drawn(part: FigurePart, *results: Any) -> Figure:
+def drawn(part: FigurePart, *results: Any) -> Figure:
     """The figure of a ``part``; raises PartError for one that fails, or returns something else."""
     figure = plugins.call(part, part.function, *results)
     if not isinstance(figure, Figure):
         raise PartError(f"the figure {part.name!r} of {part.file} returns {figure!r}; a Figure is needed")
+    width, height = figure.get_size_inches() * SCREEN
+    # Written so that NaN is refused, too.
+    if not 1 <= width <= MOST_PIXELS or not 1 <= height <= MOST_PIXELS:
+        size = f"{width:g} x {height:g} pixels at {SCREEN} dpi; at most {MOST_PIXELS} on either side are drawn"
+        raise PartError(f"the figure {part.name!r} of {part.file} has {size}")
     return figure
 
 

@@ -78,8 +78,9 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
     """Add the variables and attributes of ``data`` to ``file``; an attribute that is a dict or a list becomes JSON.
 
     All ranks that have the file open must call it with the same data; one of them has to ``write`` the values. Raises
-    ValueError if a dimension has no coordinate.
+    ValueError if a dimension has no coordinate, or the name of another one further up.
     """
+    _check_dimensions(data)
     # Coordinates come first, because variables are attached to their scales.
     indexes = data.indexes
     variables = data.variables
@@ -108,6 +109,20 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
         if isinstance(value, dict | list):
             value = json.dumps(value)
         _put_attribute(node, key, value)
+
+
+def _check_dimensions(data: xr.Dataset) -> None:
+    """Raise ValueError for a dimension of a group that has the name of one of a group above it, or of the root.
+
+    In a tree of groups, as ``xarray.open_datatree`` makes it, a group inherits the dimensions above it.
+    """
+    for name in map(str, data.dims):
+        group, _, own_name = name.rpartition("/")
+        while group:
+            group = group.rpartition("/")[0]
+            above = _path(group, own_name)
+            if above in data.dims:
+                raise ValueError(f"the dimension {name} has the name of the dimension {above}; choose another name")
 
 
 def add_variable(

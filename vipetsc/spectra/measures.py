@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from vipetsc.plugins import call, only, registered
-from vipetsc.register import MEASURE, PARTS, MeasurePart, PartError, reserve
+from vipetsc.plugins import call, number_of, only, registered
+from vipetsc.register import MEASURE, PARTS, MeasurePart, reserve
 from vipetsc.spectra import histories
 from vipetsc.spectra.histories import History, SteadyAmplitude, SteadyDrive
 
@@ -164,10 +164,7 @@ def _number_of_part(part: MeasurePart, record: RunRecord) -> float | None:
     value = call(part, part.function, record)
     if value is None:
         return None
-    array = np.asarray(value)
-    if array.ndim or array.dtype.kind not in "biuf":
-        raise PartError(f"the measure {part.name!r} of {part.file} returns {value!r}; a number, or None, is needed")
-    return float(array)
+    return number_of(part, value)
 
 
 def _foreign(run: xr.Dataset) -> set[str]:

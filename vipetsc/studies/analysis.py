@@ -70,9 +70,9 @@ LAYOUT = (
         "entropy/masked": MEASURES["entropy/masked"].row,
         "entropy/joint": MEASURES["entropy/joint"].row,
         "entropy/error": MEASURES["entropy/error"].row,
-        "entropy/cell": ("entropy/cell", "1", "cell"),
-        "entropy/local": ("entropy/snapshot entropy/cell", "bit", "entropy over wavenumbers at a cell"),
-        "entropy/weight": ("entropy/snapshot entropy/cell", "m2/s2", "wavelet energy at a cell"),
+        "entropy/at_cell": ("entropy/at_cell", "1", "cell"),
+        "entropy/local": ("entropy/snapshot entropy/at_cell", "bit", "entropy over wavenumbers at a cell"),
+        "entropy/weight": ("entropy/snapshot entropy/at_cell", "m2/s2", "wavelet energy at a cell"),
         "partition/snapshot": ("partition/snapshot", "s", "time of a snapshot"),
         "partition/bin": ("partition/bin", "1", "wavenumber bin"),
         "partition/bound": ("partition/bound", "1", "bound of a bin"),
@@ -352,7 +352,7 @@ def _entropies(
 
     if maps:
         size = -(-entropy.local.shape[1] // options.pixels)
-        values["entropy/cell"] = spectra.block_means(record.cells[:: options.cell_stride], size, 0)
+        values["entropy/at_cell"] = spectra.block_means(record.cells[:: options.cell_stride], size, 0)
         values["entropy/local"] = spectra.block_means(entropy.local, size, 1).astype(np.float32)
         values["entropy/weight"] = spectra.block_means(entropy.weight, size, 1).astype(np.float32)
     return values
