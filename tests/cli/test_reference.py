@@ -53,8 +53,10 @@ def test_schema_and_texts_have_the_keys_of_the_validator():
     # The sets are equal: no key lacks a schema, and no schema describes a key that was removed.
     assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == expected
 
-    with_keys = {name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names}
-    assert {name: set(texts) for name, texts in keys.texts().items()} == with_keys
+    properties = [item.get("properties", {}) for item in schema["$defs"].values()]
+    undescribed = [key for table in properties for key, item in table.items() if not item.get("description")]
+    # Sections whose keys vary are described where they do not.
+    assert set(undescribed) <= set(SECTIONS)
 
 
 def test_the_chapter_on_keys_has_those_of_the_validator():

@@ -28,7 +28,7 @@ from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_l
 from vipetsc.case.plain import TOO_DEEP, is_deeper, plain_table, wrong_keys
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
-from vipetsc.case.section import is_within
+from vipetsc.case.section import described, is_within
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
@@ -58,7 +58,7 @@ class CaseFile(Section):
     the case without a file, if there is one.
     """
 
-    name: str
+    name: str = described("name of the output folder runs/NAME; default: the name of the file")
     plugins: PluginsTable | None = None
 
     verb: ClassVar[str] = ""

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.schema import OutputTable, Positive
+from vipetsc.case.section import described
 
 # Bloch problems (lambda, eta, kappa) of one reading: the four bands of so many are 640 MB in memory and on disk.
 LARGEST = 20_000_000
@@ -16,9 +17,9 @@ LARGEST = 20_000_000
 class GridTable(Section):
     """``count`` evenly spaced values from ``first`` to ``last``."""
 
-    first: Positive = 0.1
-    last: Positive = 1.0
-    count: Annotated[int, Field(ge=2)] = 37
+    first: Positive = described("first value", 0.1)
+    last: Positive = described("last value", 1.0)
+    count: Annotated[int, Field(ge=2)] = described("number of values, evenly spaced", 37)
 
     def values(self) -> np.ndarray:
         """The values (count,), rounded to remove errors in the last digits."""
@@ -28,8 +29,10 @@ class GridTable(Section):
 class EtaTable(GridTable):
     """The grid of eta; the value 1 is left out, because the host mass m (1 - eta) vanishes there."""
 
-    first: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    last: Annotated[float, Field(gt=0, le=1)] = 1.0
+    first: Annotated[float, Field(gt=0, lt=1)] = described("first value", 0.1)
+    last: Annotated[float, Field(gt=0, le=1)] = described(
+        "last value; the value 1, at which the host has no mass, is left out", 1.0
+    )
 
     def values(self) -> np.ndarray:
         """The values (eta,) below 1, where the host has mass."""
@@ -43,10 +46,12 @@ class DesignTable(Section):
     One map of the search is computed for each reading.
     """
 
-    readings: list[Literal["printed", "calibrated"]] = Field(["printed", "calibrated"], min_length=1)
-    lam: GridTable = Field(GridTable(), alias="lambda")
-    eta: EtaTable = EtaTable()
-    wavenumbers: Annotated[int, Field(ge=3)] = 101
+    readings: list[Literal["printed", "calibrated"]] = described(
+        "readings of the paper's parameters that are searched", ["printed", "calibrated"], min_length=1
+    )
+    lam: GridTable = described("grid of lambda", GridTable(), alias="lambda")
+    eta: EtaTable = described("grid of eta", EtaTable())
+    wavenumbers: Annotated[int, Field(ge=3)] = described("wavenumbers from 0 to pi", 101)
 
 
 class DesignCase(CaseFile):

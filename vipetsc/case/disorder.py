@@ -16,6 +16,7 @@ from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.inhomogeneity_sections import Deviation
 from vipetsc.case.schema import CONTACTS, LatticeTable
+from vipetsc.case.section import described
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Spring, UnitCell
 
@@ -33,15 +34,17 @@ class DisorderTable(Section):
     For each cell: ``cells``, by quantity; the resolved case contains the request instead of the values.
     """
 
-    seed: Annotated[int, Field(ge=0)] = 0
-    clearance: Deviation | None = None
-    sites: Deviation | None = None
-    restitution: Deviation | None = None
-    stiffness: Deviation | None = None
-    modulus: Deviation | None = None
-    masses: Deviation | None = None
-    springs: Deviation | None = None
-    cells: dict[str, Deviation] | None = None
+    seed: Annotated[int, Field(ge=0)] = described("seed of the random numbers", 0)
+    clearance: Deviation | None = described("scatter of each site's clearance", None)
+    sites: Deviation | None = described("scatter of each site's cell, rounded to a cell", None)
+    restitution: Deviation | None = described("scatter of each site's restitution", None)
+    stiffness: Deviation | None = described("scatter of the contact stiffness of all sites", None)
+    modulus: Deviation | None = described("scatter of Young's modulus of all contacts", None)
+    masses: Deviation | None = described("scatter of the cell's masses, the same in all cells", None)
+    springs: Deviation | None = described("scatter of the cell's springs, the same in all cells", None)
+    cells: dict[str, Deviation] | None = described(
+        'scatter that differs from cell to cell, by quantity, as "masses[2]" = { relative = 0.01 }', None
+    )
 
     def quantities(self) -> dict[str, Deviation]:
         """Deviations of the scattered quantities except those of ``cells``, by name."""

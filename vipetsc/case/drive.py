@@ -10,6 +10,7 @@ from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.registered import check_parameters
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import LatticeTable, TimeTable
+from vipetsc.case.section import described
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
 from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, wave_bands, waves_at
 
@@ -26,7 +27,7 @@ class DriveTable(OneDrive):
     of the motion.
     """
 
-    more: list[OneDrive] | None = None
+    more: list[OneDrive] | None = described("further drives, `[[drive.more]]`, with the same keys", None)
 
     @property
     def every(self) -> list[tuple[str, OneDrive]]:

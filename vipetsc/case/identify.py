@@ -15,6 +15,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
+from vipetsc.case.section import described
 from vipetsc.case.sought import (
     OF_CELL,
     OF_EITHER_SIGN,
@@ -44,21 +45,20 @@ Each has two unknowns, by which the motion is differentiated: 400 columns of 400
 class IdentifyTable(Section):
     """Parameters are fitted to ``records`` over windows that grow, from one or several starts.
 
-    The first window ends with the model's contact number ``impacts`` in each record, and each window has ``growth``
-    times as many contacts as the one before. ``starts``: the first start is that of the unknowns, the others are drawn
-    between their bounds by Latin hypercube sampling with ``seed``. ``steps``: evaluations of a window, at most.
-    ``confidence`` is that of the intervals; ``profile``: values of each parameter for which all others are fitted.
+    The first start is that of the unknowns; the others are drawn between their bounds by Latin hypercube sampling.
     """
 
-    records: list[RecordTable] = Field([])
-    unknowns: list[UnknownTable] = Field([])
-    impacts: int = Field(4, ge=1)
-    growth: Annotated[float, Field(gt=1, le=100)] = 1.6
-    starts: int = Field(1, ge=1, le=10_000)
-    seed: int = Field(1, ge=0)
-    steps: int = Field(30, ge=1, le=10_000)
-    confidence: Annotated[float, Field(gt=0, lt=1)] = 0.9
-    profile: int = Field(5, ge=0, le=1000)
+    records: list[RecordTable] = described("measured records", [])
+    unknowns: list[UnknownTable] = described("parameters that are sought", [])
+    impacts: int = described("contacts of the model in the first window", 4, ge=1)
+    growth: Annotated[float, Field(gt=1, le=100)] = described("contacts of a window over those of the one before", 1.6)
+    starts: int = described("number of starts; all but the first are drawn between the bounds", 1, ge=1, le=10_000)
+    seed: int = described("seed of the starts", 1, ge=0)
+    steps: int = described("largest number of evaluations of the model in one window", 30, ge=1, le=10_000)
+    confidence: Annotated[float, Field(gt=0, lt=1)] = described("confidence of the intervals", 0.9)
+    profile: int = described(
+        "values of each parameter at which all others are fitted; 0: no profiles", 5, ge=0, le=1000
+    )
 
 
 class IdentifyCase(StudyCase):

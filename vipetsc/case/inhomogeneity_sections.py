@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from vipetsc.case.case_file import Section
+from vipetsc.case.section import described
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -17,9 +18,11 @@ class Deviation(Section):
     Their mean is the case's value with every ``distribution``; ``uniform`` ends sqrt(3) deviations from it.
     """
 
-    relative: NotNegative | None = None
-    absolute: NotNegative | None = None
-    distribution: Literal["normal", "uniform", "lognormal"] = "normal"
+    relative: NotNegative | None = described("standard deviation over the value", None)
+    absolute: NotNegative | None = described("standard deviation", None, unit="unit of the value")
+    distribution: Literal["normal", "uniform", "lognormal"] = described(
+        "distribution; its mean is the value of the case", "normal"
+    )
 
     @model_validator(mode="after")
     def _one_size(self) -> Self:
@@ -62,23 +65,23 @@ class Deviation(Section):
 class Profile(Section):
     """A quantity that varies linearly from the ``first`` cell to the ``last``."""
 
-    first: Finite
-    last: Finite
+    first: Finite = described("value in the first cell", unit="unit of the value")
+    last: Finite = described("value in the last cell; linear in between", unit="unit of the value")
 
 
 class Defects(Section):
     """A quantity that has another ``value``, or ``factor`` times its value, in some ``cells`` (from 1)."""
 
-    cells: list[int] = Field(min_length=1)
-    value: Finite | None = None
-    factor: Finite | None = None
+    cells: list[int] = described("cells with another value", min_length=1)
+    value: Finite | None = described("value in these cells", None, unit="unit of the value")
+    factor: Finite | None = described("value in these cells over that in the other cells, instead of `value`", None)
 
 
 class ScatterTable(Section):
     """The request of ``[disorder.cells]`` in a resolved case: the ``seed`` and the deviation of each quantity."""
 
-    seed: Annotated[int, Field(ge=0)]
-    quantities: dict[str, Deviation]
+    seed: Annotated[int, Field(ge=0)] = described("seed of the random numbers")
+    quantities: dict[str, Deviation] = described("standard deviation of each quantity that scatters from cell to cell")
 
 
 class AbsorbingTable(Section):
@@ -88,10 +91,18 @@ class AbsorbingTable(Section):
     ``reflection``.
     """
 
-    end: Literal["left", "right", "both"] = "right"
-    cells: Annotated[int, Field(ge=1)] | None = None
-    strength: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    reflection: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    end: Literal["left", "right", "both"] = described("which end absorbs", "right")
+    cells: Annotated[int, Field(ge=1)] | None = described(
+        "number of absorbing cells; by default determined from `reflection`", None
+    )
+    strength: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = described(
+        "dashpot constant to ground over the mass in the last cell; by default determined from `reflection`",
+        None,
+        unit="1/s",
+    )
+    reflection: Annotated[float, Field(gt=0, lt=1)] = described(
+        "largest fraction of the energy sent by the drive that may be reflected", 1e-3
+    )
 
 
 AnyProfile = list[Finite] | Profile | Defects

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
+from vipetsc.case.section import described
 from vipetsc.io.names import readable, resolved_path
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
@@ -59,43 +60,54 @@ KINDS = {
 class StrikeTable(Section):
     """The initial ``velocity`` in m/s of one ``mass`` of a ``cell`` (from 1)."""
 
-    cell: int = Field(ge=1)
-    mass: int = Field(1, ge=1)
-    velocity: Finite
+    cell: int = described("cell of the mass", ge=1)
+    mass: int = described("number of the mass in the cell", 1, ge=1)
+    velocity: Finite = described("velocity of this mass at t = 0", unit="m/s")
 
 
 class InitialTable(Section):
     """The state of the lattice at t = 0.
 
-    ``zero``: at rest. ``mode``: mode ``number`` of the lattice without contacts, from 1, lowest first, or the one
-    ``near`` a frequency in rad/s, at its turning point. ``packet``: Gaussian, of the waves of a ``band`` about a
-    ``wavenumber``, centred at the ``cell``, with a standard deviation of ``width`` cells, which travels to higher cells
-    (``direction`` 1) or lower cells (-1). Both have an ``amplitude``, the largest displacement of the packet's envelope
-    or of the mode in m, or an ``energy`` in J. ``velocity``: the ``mass`` of a ``cell``, and the masses in ``more``,
-    have a ``velocity`` in m/s, and all other masses are at rest. ``file``: the state in the file ``path``: of a run at
-    ``time`` in s, of a branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in it
-    are at rest; its ``sha256`` is filled in. The ``frequency`` in rad/s of the motion, to which tolerances and measures
-    refer if nothing is driven, and the ``amplitude`` of a state or of struck masses are filled in, too.
+    A mode begins at its turning point. A packet is Gaussian, of the waves of a band about a wavenumber. Masses that are
+    not struck, and cells that a file lacks, are at rest.
     """
 
-    kind: Literal["zero", "mode", "packet", "velocity", "file"] = "zero"
-    number: int | None = Field(None, ge=1)
-    near: Positive | None = None
-    band: int | None = Field(None, ge=1)
-    wavenumber: Wavenumber | None = None
-    cell: int | None = Field(None, ge=1)
-    width: Annotated[float, Field(ge=1, le=1e4)] | None = None
-    direction: Literal[1, -1] | None = None
-    amplitude: Positive | None = None
-    energy: Positive | None = None
-    path: str | None = None
-    time: Annotated[float, Field(ge=0)] | None = None
-    orbit: int | None = Field(None, ge=1)
-    sha256: str | None = None
-    mass: int | None = Field(None, ge=1)
-    velocity: Finite | None = None
-    more: list[StrikeTable] | None = None
-    frequency: Positive | None = None
+    kind: Literal["zero", "mode", "packet", "velocity", "file"] = described(
+        "initial state: rest, a linear mode, a wave packet, struck masses, or a state from a file", "zero"
+    )
+    number: int | None = described("mode: number of the mode; the lowest is 1", None, ge=1)
+    near: Positive | None = described(
+        "mode: frequency to which the mode is nearest, instead of a number", None, unit="rad/s"
+    )
+    band: int | None = described("packet: pass band of its waves", None, ge=1)
+    wavenumber: Wavenumber | None = described(
+        'packet: mean wavenumber; multiples of pi as "5pi/9"', None, unit="rad/cell"
+    )
+    cell: int | None = described("packet: cell at its centre; velocity: cell of the struck mass", None, ge=1)
+    width: Annotated[float, Field(ge=1, le=1e4)] | None = described(
+        "packet: standard deviation of the envelope", None, unit="cells"
+    )
+    direction: Literal[1, -1] | None = described("packet: towards higher cells (1) or lower cells (-1)", None)
+    amplitude: Positive | None = described(
+        "mode or packet: largest displacement; filled in for a file or a velocity", None, unit="m"
+    )
+    energy: Positive | None = described("mode or packet: energy, instead of an amplitude", None, unit="J")
+    path: str | None = described(
+        "file: path of a run, a branch or a state; a relative one: in the folder of the case file, else in"
+        " the current folder",
+        None,
+    )
+    time: Annotated[float, Field(ge=0)] | None = described(
+        "file of a run: time of the sample; default: the last sample", None, unit="s"
+    )
+    orbit: int | None = described("file of a branch: number of the orbit, from 1; default: the last", None, ge=1)
+    sha256: str | None = described("file: its SHA-256 hash, filled in", None)
+    mass: int | None = described("velocity: number of the struck mass in its cell; default: 1", None, ge=1)
+    velocity: Finite | None = described("velocity: velocity of the struck mass at t = 0", None, unit="m/s")
+    more: list[StrikeTable] | None = described("velocity: further struck masses, `[[initial.more]]`", None)
+    frequency: Positive | None = described(
+        "frequency of the motion, to which tolerances refer where nothing is driven; filled in", None, unit="rad/s"
+    )
 
     def __hash__(self) -> int:
         # Engines keep their tables by model, whose hash includes this one; the list ``more`` has none.

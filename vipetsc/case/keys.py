@@ -1,13 +1,10 @@
 """Every key of a case file: as a JSON schema for editors, and as a chapter of the manual.
 
-Types, bounds and defaults come from the sections, units and texts from ``keys.toml``; a test compares the two.
+All of it comes from the fields of the sections (``section.described``).
 """
 
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
-from functools import cache
-from importlib.resources import files
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -18,7 +15,7 @@ from vipetsc.case.case_file import Table
 from vipetsc.case.schema import MULTIPLE_OF_PI
 from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.case.waveforms import DEFAULT, WAVEFORMS, waveform_record
-from vipetsc.lattice.contact import PARAMETERS, registered_law
+from vipetsc.lattice.contact import registered_law
 from vipetsc.plugins import only
 from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
 from vipetsc.wording import with_unit
@@ -27,24 +24,6 @@ TITLE = "Every key of a case file"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INDEX = re.compile(r"\[\d+\]")  # of an entry of a list in a path
 Schema = dict[str, Any]
-
-
-@cache
-def texts() -> dict[str, dict[str, list[str]]]:
-    """Unit and text of every key, by the name of its class."""
-    described = tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
-    # Parameters of elastic laws are described where the laws are.
-    for key, parameter in PARAMETERS.items():
-        described["ContactsTable"][key] = [parameter.unit, parameter.text]
-        described["PerSiteTable"][key] = [parameter.unit, f"{key} of each site"]
-    described["OneDrive"] = {key: text for key, text in described["DriveTable"].items() if key != "more"}
-    return described
-
-
-def unit_and_text(name: str, key: str) -> tuple[str, str]:
-    """Unit and text of a key of the class ``name``; empty if there is none."""
-    unit, text = texts().get(name, {}).get(key, ("", ""))
-    return unit, text
 
 
 def unit_of(path: str, case: Table) -> str:
@@ -67,7 +46,7 @@ def unit_of(path: str, case: Table) -> str:
         table = _table_of(table, key)
     if table is None or not keys:
         return ""
-    unit, _ = unit_and_text(table.__name__, keys[-1])
+    unit = _unit_in(table, keys[-1])
     # Such a text says on what the unit depends.
     if " of " in unit or " or " in unit:
         return ""
@@ -97,6 +76,14 @@ def _parameter_of(path: str, case: Table) -> Parameter | None:
     return None
 
 
+def _unit_in(table: type[BaseModel], key: str) -> str:
+    """Return the unit of a ``key`` of a ``table``; empty for one without, or for a key that it does not have."""
+    for name, about in table.model_fields.items():
+        if key == (about.alias or name) and isinstance(about.json_schema_extra, dict):
+            return str(about.json_schema_extra.get("unit", ""))
+    return ""
+
+
 def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
     """The class of the table that ``key`` of a ``table`` is; None where it is no table."""
     if table is None or key not in table.model_fields:
@@ -111,23 +98,31 @@ def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None
 
 
 def json_schema(modules: Sequence[str] = ()) -> Schema:
-    """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key.
+    """Return the JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key.
 
     The names of parts are the shipped ones and those of imported ``modules``.
     """
+    schema = _schema_with_units(modules)
+    for table in schema["$defs"].values():
+        for item in table.get("properties", {}).values():
+            if "unit" in item:
+                item["description"] = with_unit(item["description"], item.pop("unit"))
+    return schema
+
+
+def _schema_with_units(modules: Sequence[str] = ()) -> Schema:
+    """Return the schema of ``json_schema`` in which the ``unit`` of a key stands beside its ``description``."""
     of_class = {table.__name__: table for table in SECTIONS.values()}
     # One call for all sections: a class that several sections contain is defined once.
     with only(modules):
         _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
     classes: Schema = whole["$defs"]
-    for name, schema in classes.items():
+    for schema in classes.values():
         for key, item in schema.get("properties", {}).items():
-            unit, text = unit_and_text(name, key)
             # pydantic's titles only repeat the keys.
             item.pop("title", None)
             if key == "wavenumber":
                 item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
-            item["description"] = with_unit(text, unit)
         # A schema shows the first paragraph of the docstring.
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
@@ -135,14 +130,14 @@ def json_schema(modules: Sequence[str] = ()) -> Schema:
     varied = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
     classes["SweepTable"]["properties"] |= {key: {"type": "object"} for key in sorted(varied)}
     sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in SECTIONS.items()}
-    named = {"type": "string", "description": texts()["CaseFile"]["name"][1]}
+    named = {"type": "string", "description": Case.model_fields["name"].description}
     about = {"$schema": DIALECT, "title": "case file of vipetsc", "type": "object", "additionalProperties": False}
     return about | {"properties": {"name": named} | sections, "$defs": classes}
 
 
 def chapter() -> str:
     """The manual's chapter with a table of the keys of every section, those of tables within it below it."""
-    schema = json_schema()
+    schema = _schema_with_units()
     lines = [
         f"# {TITLE}",
         "",
@@ -171,7 +166,6 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     if rows:
         yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
     for key, item in rows:
-        unit, text = unit_and_text(name, key)
         default = item.get("default")
         # No default is shown for an optional key, nor for a list that is empty by default: their texts say what holds
         # without them. A table that is a default is shown by its own keys.
@@ -180,7 +174,7 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
             shown_default = "required"
         elif default not in (None, []) and "{" not in str(default):
             shown_default = f"`{_toml(default)}`"
-        yield f"| `{key}` | {_kind(item)} | {unit} | {shown_default} | {text} |"
+        yield f"| `{key}` | {_kind(item)} | {item['unit']} | {shown_default} | {item['description']} |"
         inner += [(f"{path}.{key}", reference) for reference in _references(item)]
     yield ""
     for where, reference in inner:

@@ -14,6 +14,7 @@ from vipetsc.case.contacts import gaps_of_sites, lists_of, path_of, values_of_si
 from vipetsc.case.kinds import SiteKinds, lesser_clearances, mean_clearance, site_kinds
 from vipetsc.case.resolve import check_cell, with_preset
 from vipetsc.case.schema import PRESETS, Positive
+from vipetsc.case.section import described
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.study import with_fastest_engine
 from vipetsc.case.warnings import wave_warnings
@@ -33,27 +34,41 @@ SLOWEST = 1e-9
 class LawTable(Section):
     """How the scattering law of one site is computed.
 
-    The law is that of the kind of ``site``, a number in the list of the sites (by default the site nearest to the
-    drive). A kind is a contact law with its restitution, the ratio of the clearances on both sides, and the masses that
-    the contact joins. ``clearance`` in m is the lesser one, by default the geometric mean of the sites of that kind.
-    ``distance`` is the number of cells from the driven cell to the site, by default that of the nearest site, or
-    without sites the length of the burst; it is so large that the burst ends before a wave returns from the site. The
-    law is a function of z, the largest relative displacement over the clearance, up to ``largest``. Points are added
-    until all fractions between neighbouring points are straight lines over log z, within ``tolerance`` or the scatter,
-    or until neighbours are closer than ``finest``. At each point ``samples`` runs with amplitudes that differ from it
-    by up to the fraction ``jitter`` give mean and scatter. A run ends ``settle`` durations of the burst after the slow
-    waves reach the site.
+    The law is that of one kind of site: a contact law with its restitution, the ratio of the clearances on both sides,
+    and the masses that the contact joins. It is a function of z, the largest relative displacement over the clearance.
+    Points are added until all fractions between neighbouring points are straight lines over log z, within ``tolerance``
+    or the scatter.
     """
 
-    site: int | None = Field(None, ge=1)
-    clearance: Positive | None = None
-    distance: int | None = Field(None, ge=1)
-    largest: Annotated[float, Field(gt=1, le=1e6)] = 128.0
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    finest: Annotated[float, Field(ge=1e-9, lt=1)] = 1e-3
-    samples: int = Field(3, ge=1, le=1000)
-    jitter: Annotated[float, Field(ge=0, lt=0.5)] = 0.01
-    settle: Annotated[float, Field(ge=1, le=1e3)] = 1.5
+    site: int | None = described(
+        "number of a site, from 1: the law is that of its kind; default: the site nearest to the drive", None, ge=1
+    )
+    clearance: Positive | None = described(
+        "clearance of the single site; default: geometric mean over the sites", None, unit="m"
+    )
+    distance: int | None = described(
+        "cells from the driven cell to the site; default: that of the nearest site, or without sites the"
+        " length of the burst",
+        None,
+        unit="cells",
+        ge=1,
+    )
+    largest: Annotated[float, Field(gt=1, le=1e6)] = described(
+        "largest z, the relative displacement of the linear wave over the clearance", 128.0
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = described(
+        "largest deviation of a fraction of the energy from linear interpolation over log z between points", 0.01
+    )
+    finest: Annotated[float, Field(ge=1e-9, lt=1)] = described(
+        "largest distance in log z of neighbouring points between which no further one is added", 1e-3
+    )
+    samples: int = described("runs at each point, for mean and scatter", 3, ge=1, le=1000)
+    jitter: Annotated[float, Field(ge=0, lt=0.5)] = described(
+        "largest relative deviation of the amplitudes of these runs", 0.01
+    )
+    settle: Annotated[float, Field(ge=1, le=1e3)] = described(
+        "time from the arrival of slow waves at the site to the end of a run, in lengths of the burst", 1.5
+    )
 
 
 class NearestSite(NamedTuple):

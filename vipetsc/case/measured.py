@@ -14,6 +14,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.schema import Finite, Positive
+from vipetsc.case.section import described
 from vipetsc.io.names import resolved_path
 from vipetsc.io.tables import TableError, read_table
 from vipetsc.wording import counted
@@ -32,19 +33,17 @@ Place = int | str  # of a column: its number from 1, or its name
 
 
 class SensorTable(Section):
-    """A ``quantity`` at a ``mass`` of a ``cell``, or the force of a ``drive``, in a ``column`` of the record.
+    """A ``quantity`` at a ``mass`` of a ``cell``, or the force of a ``drive``, in a ``column`` of the record."""
 
-    ``column``: a name or a number from 1 in a table of text, a dataset (with "[3]" behind it its third column) in HDF5.
-    Values times ``factor`` are in SI units, and so is ``noise``, the standard deviation of their errors.
-    """
-
-    quantity: Literal["displacement", "velocity", "acceleration", "force"]
-    column: Place
-    cell: int | None = Field(None, ge=1)
-    mass: int | None = Field(None, ge=1)
-    drive: int | None = Field(None, ge=1)
-    factor: Finite = 1.0
-    noise: Positive | None = None
+    quantity: Literal["displacement", "velocity", "acceleration", "force"] = described("what the sensor measures")
+    column: Place = described("column: name or number from 1; of HDF5 a dataset, with [3] behind it its third column")
+    cell: int | None = described("cell of the sensor, from 1", None, ge=1)
+    mass: int | None = described("mass of the cell, from 1; default: 1", None, ge=1)
+    drive: int | None = described("for a force: number of the drive, from 1; default: 1", None, ge=1)
+    factor: Finite = described("factor that makes the values SI units", 1.0)
+    noise: Positive | None = described(
+        "standard deviation of the errors, in SI units; default: estimated from the residuals", None
+    )
 
     @property
     def name(self) -> str:
@@ -57,27 +56,32 @@ class SensorTable(Section):
 class RecordTable(Section):
     """A measurement: its ``file``, the times, and what the ``sensors`` recorded.
 
-    ``time``: the column of times, which are in s when multiplied by ``time_factor``; instead, ``rate`` in Hz. The drive
-    begins at the record's time ``offset``, with the lattice at rest or in the motion of ``[initial]``; for bounds
-    [low, high] the offset is sought. ``begin`` and ``end``: the first and the last time that are used, in s.
-    ``initial``: keys in which the initial motion differs from that of the case, or "estimate" for a lattice that moves
-    already: the displacements and velocities of all masses at the first time are estimated with the parameters.
-    ``drive``: keys in which the drive differs from that of the case. ``contact``: whether anything touched. The
-    ``sha256`` of the file is filled in.
+    ``initial`` = "estimate": the displacements and velocities of all masses at the first time are estimated with the
+    parameters.
     """
 
-    file: str
-    sha256: str | None = None
-    time: Place | None = None
-    time_factor: Positive = 1.0
-    rate: Positive | None = None
-    offset: Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)] = 0.0
-    begin: Finite | None = None
-    end: Finite | None = None
-    initial: Literal["estimate"] | dict[str, Any] = Field({})
-    drive: dict[str, Any] = Field({})
-    contact: bool = True
-    sensors: list[SensorTable] = Field(min_length=1)
+    file: str = described(
+        "file with the record: a table of text, or HDF5 (.h5, .hdf5, .nc); a relative path: in the folder"
+        " of the case file, else in the current folder"
+    )
+    sha256: str | None = described("SHA-256 hash of the file, filled in", None)
+    time: Place | None = described("column of the times: name or number from 1; of HDF5 a dataset", None)
+    time_factor: Positive = described("factor that makes the times seconds", 1.0)
+    rate: Positive | None = described("sample rate, in place of time", None, unit="Hz")
+    offset: Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)] = described(
+        "time of the record at which the drive begins, or bounds [low, high] of an unknown one", 0.0, unit="s"
+    )
+    begin: Finite | None = described("first time of the record that is used", None, unit="s")
+    end: Finite | None = described("last time of the record that is used", None, unit="s")
+    initial: Literal["estimate"] | dict[str, Any] = described(
+        "keys of [initial] that differ in this record, or `estimate` for a lattice that moves already", {}
+    )
+    drive: dict[str, Any] = described("keys of [drive] that differ in this record, such as amplitude", {})
+    contact: bool = described(
+        "whether contacts may close; false: a record at an amplitude at which nothing touches, which is fitted first",
+        True,
+    )
+    sensors: list[SensorTable] = described("what was measured", min_length=1)
 
 
 class Measured(NamedTuple):

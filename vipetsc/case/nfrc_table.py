@@ -6,6 +6,7 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.schema import Finite, Positive, once
+from vipetsc.case.section import described
 from vipetsc.case.varied_key import is_key
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
@@ -15,52 +16,83 @@ IsolaSearch = Literal["amplitudes", "sweeps", "breathers"]
 class NfrcTable(Section):
     """Steady responses of the sites to an incident ``wave`` of a ``band``, or to a ``force`` on the driven mass.
 
-    With ``drive.end`` the force is that of a wall that moves.
-
-    Curves run ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site,
-    over the clearance there; of a force: N; of a wall: m) or the frequency (rad/s), within the ``range`` [low, high].
-    There is one for each value of the other in ``fixed`` (frequencies: by default the drive's; amplitudes must be
-    given), each of the ``restitutions`` (by default that of ``[contacts]``), and each combination of the values of
-    further keys in ``family``, which are lists or ranges as in ``[sweep]``. Over the path of a key
-    (``contacts.clearance``, in the key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the case is
-    resolved anew at each value.
-
-    The lattice is ``infinite``, or ends where its cells do: always if it has dashpots or cells that differ, and under a
-    force also by default if contacts join other masses than the cell's pair. With ``open_ends`` equal cells without end
-    take the place of its absorbing ends. ``harmonics`` is the number of the last one; motions that are not
-    ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too.
-
-    Besides folds, ``special_points`` are located: Neimark-Sacker, period-doubling and branch points where states become
-    stable or unstable, or ``all`` where the number of growing perturbations changes. At ``isolas`` places within the
-    range isolated curves are looked for as ``isola_search`` says: by ``amplitudes`` up to ``isola_reach`` times larger
-    or smaller, from the motion in ``sweeps`` up and down of ``isola_periods`` periods from one place to the next, or
-    near ``breathers``, the free motions of the lattice without loss. Steps are in units of the clearance and of the
-    amplitude that touches, or half the range of frequencies.
+    With ``drive.end`` the force is that of a wall that moves. The amplitude of a wave is the relative displacement that
+    it alone would make at the first site, over the clearance there. There is a curve for each value in ``fixed``, each
+    of the ``restitutions``, and each combination of the values in ``family``; over the path of a key the case is
+    resolved anew at each value. Motions that are not ``symmetric``, w(t + T/2) = -w(t), have even harmonics too. Steps
+    are in units of the clearance and of the amplitude that touches, or half the range of frequencies.
     """
 
-    source: Literal["wave", "force"] = "wave"
-    infinite: bool | None = None
-    open_ends: bool = False
-    band: Annotated[int, Field(ge=1)] | None = None
-    direction: Literal["forward", "backward"] = "forward"
-    over: str = "amplitude"
-    range: list[Finite] = Field([0.5, 2.0], min_length=2, max_length=2)
-    fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
-    restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
-    family: dict[str, Any] | None = None
-    harmonics: int = Field(41, ge=1, le=2000)
-    symmetric: bool | None = None
-    isolas: int = Field(0, ge=0, le=1000)
-    isola_search: Annotated[list[IsolaSearch], AfterValidator(once)] = Field(["amplitudes"], min_length=1)
-    isola_reach: float = Field(10.0, gt=1, le=1e3)
-    isola_periods: int = Field(100, ge=1, le=1_000_000)
-    special_points: Literal["stability", "all"] = "stability"
-    points: int = Field(1000, ge=1)
-    first_step: Positive = 0.02
-    smallest_step: Positive = 1e-9
-    largest_step: Positive = 0.1
-    tolerance: Positive = 1e-11
-    max_newton: int = Field(10, ge=1)
+    source: Literal["wave", "force"] = described(
+        "source of the motion: an incident wave, or a harmonic force on the driven mass of `[drive]`", "wave"
+    )
+    infinite: bool | None = described(
+        "whether the lattice continues to infinity beyond both ends, which a wave requires; default: true"
+        " for equal cells without dashpots, but under a force only with contacts of the cell's pair",
+        None,
+    )
+    open_ends: bool = described(
+        "whether the lattice goes on for ever in the place of its absorbing ends, which then reflect"
+        " nothing at any frequency",
+        False,
+    )
+    band: Annotated[int, Field(ge=1)] | None = described(
+        "pass band of the wave; default: the one with the largest group velocity at the frequency", None
+    )
+    direction: Literal["forward", "backward"] = described(
+        "direction of the wave: towards higher or lower cells", "forward"
+    )
+    over: str = described(
+        "parameter that varies along a curve: amplitude, frequency, or the path of a key (`contacts.clearance`)",
+        "amplitude",
+    )
+    range: list[Finite] = described(
+        "[low, high] of this parameter: amplitude (of a wave over the first clearance, of a force in N, of"
+        " a wall in m), rad/s, or the key's unit",
+        [0.5, 2.0],
+        min_length=2,
+        max_length=2,
+    )
+    fixed: Annotated[list[Positive], AfterValidator(once)] = described(
+        "values of the parameter that does not vary, one curve each. Over the amplitude: frequencies in"
+        " rad/s; default: that of the drive. Over the frequency or a key: amplitudes, which are required",
+        [],
+    )
+    restitutions: Annotated[list[Restitution], AfterValidator(once)] = described(
+        "values of the restitution, one curve each; default: that of `[contacts]`", []
+    )
+    family: dict[str, Any] | None = described(
+        "further keys of the case with their values (lists or ranges, as in `[sweep]`); curves for each combination",
+        None,
+    )
+    harmonics: int = described("number of the last harmonic", 41, ge=1, le=2000)
+    symmetric: bool | None = described("odd harmonics only: w(t + T/2) = -w(t)", None)
+    isolas: int = described(
+        "number of places within the range at which isolated curves (isolas) are looked for; 0: none", 0, ge=0, le=1000
+    )
+    isola_search: Annotated[list[IsolaSearch], AfterValidator(once)] = described(
+        "how isolated curves are looked for: over other amplitudes, or by sweeps of the frequency up and"
+        " down in time, or near breathers, free motions without loss",
+        ["amplitudes"],
+        min_length=1,
+    )
+    isola_reach: float = described(
+        "factor up to which amplitudes are larger or smaller that are followed to isolated curves", 10.0, gt=1, le=1e3
+    )
+    isola_periods: int = described(
+        "periods of the drive from one place to the next of a sweep in time", 100, ge=1, le=1_000_000
+    )
+    special_points: Literal["stability", "all"] = described(
+        "special points other than folds: where states become stable or unstable, or all where the number"
+        " of growing perturbations changes",
+        "stability",
+    )
+    points: int = described("largest number of points of a curve", 1000, ge=1)
+    first_step: Positive = described("first arclength step, in clearances and scaled parameters", 0.02)
+    smallest_step: Positive = described("arclength step below which a curve ends", 1e-9)
+    largest_step: Positive = described("largest arclength step", 0.1)
+    tolerance: Positive = described("largest norm of the residual over the clearance", 1e-11)
+    max_newton: int = described("largest number of Newton steps", 10, ge=1)
 
     @property
     def varies_key(self) -> bool:

@@ -6,6 +6,7 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.schema import Finite, Positive, once
+from vipetsc.case.section import described
 
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
@@ -23,26 +24,26 @@ FEW_MASSES = 100
 class LinearSpringTable(Section):
     """A spring between masses ``start`` and ``end`` (1-based; ``start`` 0 is the ground), N/m."""
 
-    start: Annotated[int, Field(ge=0)]
-    end: Annotated[int, Field(ge=1)]
-    stiffness: Positive
+    start: Annotated[int, Field(ge=0)] = described("mass at one end; 0 is the ground")
+    end: Annotated[int, Field(ge=1)] = described("mass at the other end")
+    stiffness: Positive = described("stiffness", unit="N/m")
 
 
 class SmoothSpringTable(Section):
     """Force ``quadratic`` z^2 + ``cubic`` z^3 (N/m^2, N/m^3) between two masses, as in ``LinearSpringTable``."""
 
-    start: Annotated[int, Field(ge=0)]
-    end: Annotated[int, Field(ge=1)]
-    cubic: Finite = 0.0
-    quadratic: Finite = 0.0
+    start: Annotated[int, Field(ge=0)] = described("mass at one end; 0 is the ground")
+    end: Annotated[int, Field(ge=1)] = described("mass at the other end")
+    cubic: Finite = described("coefficient of z^3 in the force", 0.0, unit="N/m^3")
+    quadratic: Finite = described("coefficient of z^2 in the force", 0.0, unit="N/m^2")
 
 
 class DashpotTable(Section):
     """A dashpot of ``damping`` in N s/m between two masses, as in ``LinearSpringTable``."""
 
-    start: Annotated[int, Field(ge=0)]
-    end: Annotated[int, Field(ge=1)]
-    damping: Positive
+    start: Annotated[int, Field(ge=0)] = described("mass at one end; 0 is the ground")
+    end: Annotated[int, Field(ge=1)] = described("mass at the other end")
+    damping: Positive = described("force over the difference of velocities", unit="N s/m")
 
 
 class PairTable(Section):
@@ -52,19 +53,21 @@ class PairTable(Section):
     these contacts.
     """
 
-    host: Annotated[int, Field(ge=0)]
-    resonator: Annotated[int, Field(ge=1)]
-    clearance: Annotated[float, Field(ge=0)]
+    host: Annotated[int, Field(ge=0)] = described("mass with the stops; 0 is the ground")
+    resonator: Annotated[int, Field(ge=1)] = described("mass between them")
+    clearance: Annotated[float, Field(ge=0)] = described("clearance", unit="m")
 
 
 class SystemTable(Section):
     """The section [nnm.own]: masses in kg, linear and smooth springs, dashpots, contact pairs (law: ``[contacts]``)."""
 
-    masses: list[Positive] = Field(min_length=1)
-    springs: list[LinearSpringTable] = Field(min_length=1)
-    smooth: list[SmoothSpringTable] = Field([])
-    dashpots: list[DashpotTable] = Field([])
-    contacts: list[PairTable] = Field([])
+    masses: list[Positive] = described("masses, numbered from 1", unit="kg", min_length=1)
+    springs: list[LinearSpringTable] = described("linear springs", min_length=1)
+    smooth: list[SmoothSpringTable] = described("springs with quadratic and cubic forces", [])
+    dashpots: list[DashpotTable] = described(
+        "dashpots, which take energy along branches of the motions without them", []
+    )
+    contacts: list[PairTable] = described("contacts, with the law of [contacts]", [])
 
 
 class Guards(Section):
@@ -80,69 +83,107 @@ class Guards(Section):
     2e-6 in 200 points at least.
     """
 
-    half_trace: Annotated[float, Field(ge=0)] = 0.5
-    contacts: Annotated[int, Field(ge=0)] = 1
-    corrector: Annotated[float, Field(ge=0)] = 0.05
-    turn: Annotated[float, Field(ge=0)] = 0.2
-    turn_relative: Annotated[float, Field(ge=0)] = 0.25
-    standstill: Annotated[int, Field(ge=0)] = 200
-    advance: Positive = 1e-9
+    half_trace: Annotated[float, Field(ge=0)] = described(
+        "change of asinh of a Floquet half-trace; 0 disables a guard", 0.5
+    )
+    contacts: Annotated[int, Field(ge=0)] = described("number of contact episodes that appear or disappear", 1)
+    corrector: Annotated[float, Field(ge=0)] = described("length of the correction over that of the step", 0.05)
+    turn: Annotated[float, Field(ge=0)] = described("angle between tangents, in the chart of the step", 0.2, unit="rad")
+    turn_relative: Annotated[float, Field(ge=0)] = described(
+        "angle between tangents, in the chart relative", 0.25, unit="rad"
+    )
+    standstill: Annotated[int, Field(ge=0)] = described(
+        "number of points within `advance` of each other after which a branch ends", 200
+    )
+    advance: Positive = described("distance of such points, in units of the orbit's size", 1e-9)
 
 
 class NnmTable(Section):
     """Nonlinear normal modes.
 
-    ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites),
-    ``own`` (``[nnm.own]``), or ``condensed`` (the lattice of any length, by harmonics of its sites alone). The
-    ``method`` condensed treats ``reduced``, ``chain`` and ``own`` by harmonics too. ``modes`` are the linear modes
-    (from 1, lowest first) from which branches begin. Those of a condensed lattice, and others where it is given, begin
-    at ``start_frequency`` in rad/s, outside the pass bands, with contact at ``start_sites`` (numbers of sites from 1;
-    those that move in the opposite direction are negative). Condensed motions have at most ``harmonics``, as many as
-    keep the part left out below ``truncation``.
-
-    ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is that in which the energy goes first.
-    ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are stored in
-    addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows the
-    branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting`` "krylov" does
-    without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
-    lattice so many of the largest ``multipliers`` (true: 8) are found. Where dashpots or contacts dissipate, points
-    have the loss along the motion without loss, and the force on the mass ``forced`` that makes up for it: [cell, mass]
-    of a lattice, else [mass].
+    The ``method`` condensed treats the systems ``reduced``, ``chain`` and ``own`` by harmonics, too. Where dashpots or
+    contacts dissipate, points have the loss along the motion without loss, and the force on the mass ``forced`` that
+    makes up for it.
     """
 
-    system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
-    method: Literal["shooting", "condensed"] = "shooting"
-    start_frequency: list[Positive] = Field([])
-    start_sites: list[int] = Field([])
-    harmonics: int = Field(1023, ge=15)
-    truncation: Positive = 1e-7
-    custom: SystemTable | None = Field(None, alias="own")
-    forced: list[Annotated[int, Field(ge=1)]] | None = Field(None, min_length=1, max_length=2)
-    modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = Field([1, 2], min_length=1)
-    shooting: Literal["auto", "dense", "krylov"] = "auto"
-    multipliers: bool | Annotated[int, Field(ge=1)] = False
-    map: Literal["auto", "quarter", "half", "whole"] = "auto"
-    flow: Literal["compiled", "tsrk", "newmark"] = "compiled"
-    jacobian: Literal["variational", "differences"] = "variational"
-    chart: Literal["auto", "relative", "logarithmic", "grazing"] = "relative"
-    start_energy: Positive | Literal["auto"] = "auto"
-    energy: list[Annotated[float, Field(ge=0)]] = Field([0.0, 1e9], min_length=2, max_length=2)
-    frequency: list[Annotated[float, Field(ge=0)]] = Field([0.0, 1e9], min_length=2, max_length=2)
-    direction: Literal["up", "down", "both"] = "up"
-    points: int = Field(20000, ge=1)
-    first_step: Positive = 1e-3
-    smallest_step: Positive = 1e-13
-    largest_step: Positive = 0.1
-    tolerance: Positive = 1e-13
-    max_newton: int = Field(7, ge=1)
-    locate: bool = True
-    locate_grazing: bool = True
-    orbits_at: list[Positive] = Field([])
-    compare: list[Literal["compiled", "tsrk", "newmark"]] = Field([])
-    switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = Field([])
-    switch_points: int = Field(100, ge=1)
-    switch_amplitude: Positive = 1e-3
-    guards: Guards = Guards()
+    system: Literal["reduced", "chain", "own", "condensed"] = described(
+        "the paper's reduced model, the lattice with its sites (chain; condensed: any length), or a"
+        " user-defined system (own)",
+        "reduced",
+    )
+    method: Literal["shooting", "condensed"] = described(
+        "shooting, or harmonic balance condensed onto contacts and nonlinear springs", "shooting"
+    )
+    start_frequency: list[Positive] = described(
+        "frequencies outside the pass bands at which branches of a lattice begin, instead of modes", [], unit="rad/s"
+    )
+    start_sites: list[int] = described(
+        "sites, numbered from 1, in contact at the start; negative: on the negative side", []
+    )
+    harmonics: int = described("largest number of the last harmonic", 1023, ge=15)
+    truncation: Positive = described("largest fraction of a motion in the neglected harmonics", 1e-7)
+    custom: SystemTable | None = described("masses, springs and contacts of a user-defined system", None, alias="own")
+    forced: list[Annotated[int, Field(ge=1)]] | None = described(
+        "mass whose force in resonance is computed where something dissipates: [cell, mass], or [mass] without cells",
+        None,
+        min_length=1,
+        max_length=2,
+    )
+    modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = described(
+        "linear modes from which branches start; the lowest is 1", [1, 2], min_length=1
+    )
+    shooting: Literal["auto", "dense", "krylov"] = described(
+        "solver for the orbits of a chain: dense matrices, or Newton-Krylov on all ranks (auto: beyond 100 masses)",
+        "auto",
+    )
+    multipliers: bool | Annotated[int, Field(ge=1)] = described(
+        "number of the largest Floquet multipliers of the whole lattice computed at each point; true: 8", False
+    )
+    map: Literal["auto", "quarter", "half", "whole"] = described(
+        "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
+    )
+    flow: Literal["compiled", "tsrk", "newmark"] = described(
+        "integrator: compiled Dormand-Prince 8(5,3), PETSc's 8vr, or Newmark's method with 2000 steps per period",
+        "compiled",
+    )
+    jacobian: Literal["variational", "differences"] = described(
+        "derivative of the map, from variational equations or finite differences", "variational"
+    )
+    chart: Literal["auto", "relative", "logarithmic", "grazing"] = described(
+        "unknowns: displacements over the clearance, their logarithms, or square roots of the distance to"
+        " contact; auto: grazing near contact",
+        "relative",
+    )
+    start_energy: Positive | Literal["auto"] = described(
+        "energy of the first point; auto: small enough for a linear mode", "auto", unit="J"
+    )
+    energy: list[Annotated[float, Field(ge=0)]] = described(
+        "range of energies; a branch ends outside it", [0.0, 1e9], unit="J", min_length=2, max_length=2
+    )
+    frequency: list[Annotated[float, Field(ge=0)]] = described(
+        "range of frequencies; a branch ends outside it", [0.0, 1e9], unit="Hz", min_length=2, max_length=2
+    )
+    direction: Literal["up", "down", "both"] = described("initial direction of the energy", "up")
+    points: int = described("largest number of points of a branch", 20000, ge=1)
+    first_step: Positive = described("first step along the branch, in units of the chart", 1e-3)
+    smallest_step: Positive = described("step size below which a branch has failed", 1e-13)
+    largest_step: Positive = described("largest step size", 0.1)
+    tolerance: Positive = described("largest scaled residual of an orbit", 1e-13)
+    max_newton: int = described("largest number of Newton steps of a correction", 7, ge=1)
+    locate: bool = described("whether folds, branch points and changes of stability are located", True)
+    locate_grazing: bool = described("whether orbits that graze a stop are located", True)
+    orbits_at: list[Positive] = described(
+        "energies at which orbits are stored, wherever the branch passes them", [], unit="J"
+    )
+    compare: list[Literal["compiled", "tsrk", "newmark"]] = described(
+        "further flows that correct every fourth point, for comparison", []
+    )
+    switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = described(
+        "kinds of special points at which crossing branches are followed", []
+    )
+    switch_points: int = described("number of points of a crossing branch", 100, ge=1)
+    switch_amplitude: Positive = described("first step onto a crossing branch, in units of the chart", 1e-3)
+    guards: Guards = described("limits on a step", Guards())
 
     def is_krylov(self, dofs: int, is_linear: bool = True) -> bool:
         """Whether orbits of a lattice of so many masses, with linear springs or others, are shot without matrices."""

@@ -12,6 +12,7 @@ from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.case.schema import Finite, Positive
+from vipetsc.case.section import described
 from vipetsc.lattice import pass_bands, wave_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 
@@ -27,24 +28,34 @@ Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 class MeasuredTable(Section):
     """A measure of a design: of a band or a part of one, at some amplitudes.
 
-    Three measures are energies at the run's end, over the energy that the lattice received (the drive's work, and the
-    energy of its motion at t = 0): ``upper_share_at_end`` in the pass bands above the driven one, ``band_share`` in the
-    pass band ``band`` or in ``part`` of it in rad/s, ``transmitted`` beyond the last site. Others are ``ibtet``, the
-    energy-weighted ``entropy`` in bit, and any other number of a run by its name: ``peak_velocity/tip`` of a point,
-    ``band_transmission/base-tip`` with the ``band``. The ``worst`` or the ``mean`` over the ``amplitudes`` counts:
-    those of the drive, or of the motion at t = 0 where nothing is driven, by default the case's.
-
-    Measures that begin with ``response/`` are those of the curves of ``[nfrc]``: the largest value of a curve, or with
-    ``below`` the width of the widest range of the parameter in which the value is below that level; in ``part`` of the
-    range of ``[nfrc]``. Of several curves the ``worst`` or the ``mean`` counts.
+    Energies are those at the run's end, over the energy that the lattice received (the drive's work, and the energy of
+    its motion at t = 0). ``response/...`` is the largest value of a curve of ``[nfrc]``, or with ``below`` the width of
+    the widest range in which it is below that level.
     """
 
-    measure: Literal[OF_SEARCHES] | str = "upper_share_at_end"  # type: ignore[valid-type]  # the names above
-    band: int | None = Field(None, ge=1)
-    part: Pair | None = None
-    amplitudes: list[Positive] = Field([])
-    over: Literal["worst", "mean"] = "worst"
-    below: Positive | None = None
+    # The names above.
+    measure: Literal[OF_SEARCHES] | str = described(  # type: ignore[valid-type]
+        "fraction of the work at the end in the upper bands, in one band, or beyond the last site; or"
+        " ibtet, entropy (bit), or the name of any measure of a run; or response/ and a quantity of"
+        " the curves of [nfrc]",
+        "upper_share_at_end",
+    )
+    band: int | None = described("for band_share and measures with a value per band: the pass band", None, ge=1)
+    part: Pair | None = described(
+        "for band_share: a part of that band; for responses a part of nfrc.range, in its unit", None, unit="rad/s"
+    )
+    amplitudes: list[Positive] = described(
+        "amplitudes of the drive at which the measure is evaluated, or of the motion at t = 0 where"
+        " nothing is driven (m, or m/s of the first struck mass); default: that of the case",
+        [],
+        unit="N or as the drive",
+    )
+    over: Literal["worst", "mean"] = described(
+        "whether the worst value or the mean over the amplitudes, or the curves, counts", "worst"
+    )
+    below: Positive | None = described(
+        "for responses: the width of the widest range in which the response is below this level, in its unit", None
+    )
 
     @property
     def name(self) -> str:
@@ -79,7 +90,7 @@ class MeasuredTable(Section):
 class ObjectiveTable(MeasuredTable):
     """An objective: a measure, and the ``goal`` to maximise or minimise it."""
 
-    goal: Literal["maximise", "minimise"] = "maximise"
+    goal: Literal["maximise", "minimise"] = described("whether the measure is maximised or minimised", "maximise")
 
     def describe(self, unit: str) -> str:
         """The objective in words; amplitudes have a ``unit``."""
@@ -89,8 +100,8 @@ class ObjectiveTable(MeasuredTable):
 class ConstraintTable(MeasuredTable):
     """Bounds of a measure, in its unit: it is to be ``at_least`` or ``at_most`` so much, or both."""
 
-    at_least: Finite | None = None
-    at_most: Finite | None = None
+    at_least: Finite | None = described("lower bound, in the unit of the measure", None)
+    at_most: Finite | None = described("upper bound, in the unit of the measure", None)
 
     def describe(self, unit: str) -> str:
         """The constraint in words; amplitudes have a ``unit``."""

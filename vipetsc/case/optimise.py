@@ -16,7 +16,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTable, ObjectiveTable, measured_problems
 from vipetsc.case.schema import Positive
 from vipetsc.case.search_space import SearchSpace, case_of, search_space
-from vipetsc.case.section import is_within
+from vipetsc.case.section import described, is_within
 from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.variable_problems import variable_problems, variable_warnings
 from vipetsc.case.variables import Variable, VariablesTable
@@ -27,26 +27,30 @@ AMPLITUDES = ("drive.amplitude", "initial.amplitude", "initial.energy", "initial
 
 
 class OptimiseTable(Section):
-    """A search for designs: of one ``objective`` by CMA-ES, of two by NSGA-II, which finds a Pareto front.
+    """A search for designs: of one ``objective`` by CMA-ES, of two by NSGA-II, which finds a Pareto front."""
 
-    Designs are to meet each ``constraint``. ``start``: the case, or clearances ``matched`` to its wave by the
-    scattering law of a site; ``budget``: number of designs, the case among them; ``population``: designs of a
-    generation; ``step``: first standard deviation over the range between the bounds; ``samples``: draws of
-    ``[disorder]`` with which each design is run, and over which the mean counts; ``curve``: amplitudes at which the
-    best designs are compared; ``ranks``: how many ranks compute a run together.
-    """
-
-    variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))
-    objective: list[ObjectiveTable] = Field([ObjectiveTable.model_validate({})], min_length=1, max_length=2)
-    constraint: list[ConstraintTable] | None = None
-    start: Literal["case", "matched"] = "case"
-    budget: int = Field(100, ge=2, le=MOST_DESIGNS)
-    population: int | None = Field(None, ge=4)
-    step: Annotated[float, Field(gt=0, le=1)] = 0.2
-    seed: int = Field(1, ge=0)
-    samples: int = Field(1, ge=1, le=10_000)
-    curve: list[Positive] = Field([])
-    ranks: int = Field(1, ge=1)
+    variables: VariablesTable = described(
+        "quantities that vary", default_factory=lambda: VariablesTable.model_validate({})
+    )
+    objective: list[ObjectiveTable] = described(
+        "one objective (CMA-ES), or two (NSGA-II, a Pareto front)",
+        [ObjectiveTable.model_validate({})],
+        min_length=1,
+        max_length=2,
+    )
+    constraint: list[ConstraintTable] | None = described("bounds of measures that a design must satisfy", None)
+    start: Literal["case", "matched"] = described(
+        "initial design: the case, or clearances matched to its wave by the scattering law of one site", "case"
+    )
+    budget: int = described("number of designs, including the case", 100, ge=2, le=MOST_DESIGNS)
+    population: int | None = described("number of designs per generation", None, ge=4)
+    step: Annotated[float, Field(gt=0, le=1)] = described(
+        "initial standard deviation over the range between the bounds", 0.2
+    )
+    seed: int = described("seed of the search", 1, ge=0)
+    samples: int = described("samples of [disorder] for each design, whose mean counts", 1, ge=1, le=10_000)
+    curve: list[Positive] = described("amplitudes at which the best designs are compared", [], unit="N or as the drive")
+    ranks: int = described("number of ranks per run", 1, ge=1)
 
     @property
     def measured(self) -> list[MeasuredTable]:

@@ -11,11 +11,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from vipetsc import plugins, register
-from vipetsc.case.section import Problem, Section
+from vipetsc.case.section import Problem, Section, described
 from vipetsc.process import launched_rank
 from vipetsc.register import RegisteredPart
 
@@ -27,19 +27,23 @@ NAMING = ("contacts", "drive", "sweep")  # sections whose keys may name a part
 class PartTable(Section):
     """A part that a module registers, as the resolved case records it."""
 
-    module: str
-    version: str
-    sha256: str
+    module: str = described("module that registers the part")
+    version: str = described("version of the module")
+    sha256: str = described("SHA-256 hash of the source file")
 
 
 class PluginsTable(Section):
-    """Modules that register parts: files (.py), entry points of the group `vipetsc.plugins`, or importable modules.
+    """Modules that register parts: files (.py), entry points of the group `vipetsc.plugins`, or importable modules."""
 
-    ``parts`` are recorded when the case is read, by their kind and name.
-    """
-
-    modules: list[str] = Field([], min_length=1)
-    parts: dict[str, dict[str, PartTable]] | None = None
+    modules: list[str] = described(
+        "modules that register laws, waveforms and other parts: Python files (.py; a relative path: in the"
+        " folder of the case file, else in the current folder), entry points, or importable modules",
+        [],
+        min_length=1,
+    )
+    parts: dict[str, dict[str, PartTable]] | None = described(
+        "parts that the modules register, by kind and name, filled in", None
+    )
 
 
 @dataclass(frozen=True)

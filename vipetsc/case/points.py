@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section
+from vipetsc.case.section import described
 
 NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point, which is part of names in result files
 # Points are recorded at every sample, whatever the stride of the fields: displacement, velocity and acceleration of a
@@ -16,9 +17,11 @@ MOST_POINTS = 1000
 class PointTable(Section):
     """A ``mass`` of a ``cell``, both counted from 1, whose motion is recorded under its ``name``."""
 
-    name: Annotated[str, Field(pattern=NAME, max_length=40)]
-    cell: int = Field(ge=1)
-    mass: int = Field(1, ge=1)
+    name: Annotated[str, Field(pattern=NAME, max_length=40)] = described(
+        "name of the point in files and measures: letters, digits, underscores"
+    )
+    cell: int = described("cell of the point", ge=1)
+    mass: int = described("number of the mass in the cell", 1, ge=1)
 
 
 def masses_remedy(dofs: int) -> str:

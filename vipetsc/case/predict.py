@@ -9,6 +9,7 @@ from pydantic import Field
 from vipetsc.case.case_file import Problem, Section, Valid
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
+from vipetsc.case.section import described
 from vipetsc.case.warnings import end_warnings, length_warnings, wave_warnings
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice.packet import narrow_fraction
@@ -23,18 +24,24 @@ NARROW = 0.95
 
 
 class PredictTable(Section):
-    """``amplitudes`` of the drive, in N or for a moved wall in m, at which the lattice is predicted.
+    """``amplitudes`` of the drive, in N or for a moved wall in m, at which the lattice is predicted."""
 
-    By default there are ``count``, log-spaced from the amplitude of the first contact to ``span`` times it.
-
-    ``points``: number of runs with a single site. ``simulate``: also simulate the same amplitudes, for comparison.
-    """
-
-    amplitudes: list[Positive] = Field([], max_length=MOST)
-    count: int = Field(19, ge=1, le=MOST)
-    span: Annotated[float, Field(gt=1, le=1e6)] = 100.0
-    points: int = Field(24, ge=16, le=1000)
-    simulate: bool = True
+    amplitudes: list[Positive] = described(
+        "amplitudes of the drive at which the lattice is predicted, in m of a wall that moves",
+        [],
+        unit="N or m",
+        max_length=MOST,
+    )
+    count: int = described(
+        "without `amplitudes`: number of amplitudes, log-spaced from the first contact", 19, ge=1, le=MOST
+    )
+    span: Annotated[float, Field(gt=1, le=1e6)] = described(
+        "without `amplitudes`: largest amplitude over that of the first contact", 100.0
+    )
+    points: int = described(
+        "number of runs with a single site, from which the prediction is composed", 24, ge=16, le=1000
+    )
+    simulate: bool = described("whether the lattice is also simulated at these amplitudes, for comparison", True)
 
 
 class PredictCase(LawCase):

@@ -5,12 +5,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-from pydantic import Field
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
+from vipetsc.case.section import described
 from vipetsc.io.names import readable, resolved_path
 from vipetsc.io.tables import read_table
 from vipetsc.lattice.drive import Interpolation
@@ -20,17 +20,24 @@ MOST_SAMPLES = 100_000
 
 
 class SamplesTable(Section):
-    """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``.
+    """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``."""
 
-    The samples of a file are filled in, with its ``sha256``. ``interpolation``: how they are joined.
-    """
-
-    file: str | None = None
-    dataset: str | None = None
-    sha256: str | None = None
-    time: list[Finite] = Field([], max_length=MOST_SAMPLES)
-    value: list[Finite] = Field([], max_length=MOST_SAMPLES)
-    interpolation: Interpolation = "monotone"
+    file: str | None = described(
+        "CSV or text file with columns of time and value, or an HDF5 file; a relative path: in the folder"
+        " of the case file, else in the current folder",
+        None,
+    )
+    dataset: str | None = described("dataset of shape (sample, 2) in an HDF5 file", None)
+    sha256: str | None = described("SHA-256 hash of the file, filled in", None)
+    time: list[Finite] = described("times of the samples, instead of a file", [], unit="s", max_length=MOST_SAMPLES)
+    value: list[Finite] = described(
+        "values of the samples, which are multiplied by `amplitude`", [], max_length=MOST_SAMPLES
+    )
+    interpolation: Interpolation = described(
+        "between samples: cubics that stay between neighbouring values (monotone), straight lines, or a"
+        " cubic spline, for smooth and evenly sampled waveforms",
+        "monotone",
+    )
 
 
 def with_samples(table: Table) -> tuple[Table, list[Problem]]:

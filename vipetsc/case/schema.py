@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.case.points import MOST_POINTS, PointTable
+from vipetsc.case.section import described
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 
@@ -119,13 +120,17 @@ class SpringTable(Section):
     Its force at the elongation z is ``stiffness`` z + ``quadratic`` z^2 + ``cubic`` z^3.
     """
 
-    start: int
-    end: int
-    stiffness: Finite
-    next_cell: bool = False
-    damping: Finite | None = None
-    quadratic: Finite | None = None
-    cubic: Finite | None = None
+    start: int = described("mass at one end")
+    end: int = described("mass at the other end")
+    stiffness: Finite = described("stiffness", unit="N/m")
+    next_cell: bool = described("whether `end` is in the next cell", False)
+    damping: Finite | None = described("constant of a dashpot parallel to the spring", None, unit="N s/m")
+    quadratic: Finite | None = described(
+        "coefficient of the elongation squared in the force; in single cells: lattice.profiles", None, unit="N/m^2"
+    )
+    cubic: Finite | None = described(
+        "coefficient of the elongation cubed in the force; in single cells: lattice.profiles", None, unit="N/m^3"
+    )
 
     def spring(self) -> Spring:
         """The spring, with 0-based indices."""
@@ -143,10 +148,12 @@ class SpringTable(Section):
 class CellTable(Section):
     """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground."""
 
-    masses: list[Finite] = Field(min_length=1)
-    springs: list[SpringTable] = Field([])
-    contact: list[int] | None = Field(None, min_length=2, max_length=2)
-    grounding: list[Finite] | None = None
+    masses: list[Finite] = described("masses of the cell, numbered from 1", unit="kg", min_length=1)
+    springs: list[SpringTable] = described("springs of the cell", [])
+    contact: list[int] | None = described(
+        "host and resonator, the two masses with stops between them", None, min_length=2, max_length=2
+    )
+    grounding: list[Finite] | None = described("dashpot from each mass to ground", None, unit="N s/m")
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
@@ -164,11 +171,17 @@ class DampingTable(Section):
     the ratio of bands, by number; ``grounding`` (dof) and ``springs`` (spring) are the dashpots in N s/m fitted to it.
     """
 
-    mass: NotNegative = 0.0
-    stiffness: NotNegative = 0.0
-    loss: dict[str, Annotated[float, Field(ge=0, lt=1)]] | None = None
-    grounding: list[NotNegative] | None = None
-    springs: list[NotNegative] | None = None
+    mass: NotNegative = described("dashpot constant to ground over the mass", 0.0, unit="1/s")
+    stiffness: NotNegative = described("dashpot constant parallel to each spring over its stiffness", 0.0, unit="s")
+    loss: dict[str, Annotated[float, Field(ge=0, lt=1)]] | None = described(
+        "loss ratio of each band (twice the damping ratio), as { 2 = 0.02 }; instead of mass and stiffness", None
+    )
+    grounding: list[NotNegative] | None = described(
+        "dashpots from the cell's masses to ground that are fitted to `loss`, filled in", None, unit="N s/m"
+    )
+    springs: list[NotNegative] | None = described(
+        "dashpots parallel to the cell's springs that are fitted to `loss`, filled in", None, unit="N s/m"
+    )
 
     def fitted(self, cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
         """The dashpots (dof,) to ground and (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``.
@@ -184,17 +197,30 @@ class DampingTable(Section):
 class LatticeTable(Section):
     """The lattice: a ``preset`` or a ``cell``, the number of cells, the ends, the reading of the parameters."""
 
-    preset: Literal["four-band", "diatomic"] | None = None
-    cell: CellTable | None = None
-    cells: int = Field(300, ge=1, le=MOST_CELLS)
-    ends: Literal["fixed", "free", "periodic"] = "fixed"
-    reading: Literal["printed", "calibrated"] = "calibrated"
-    lam: Positive | None = Field(None, alias="lambda")
-    eta: Annotated[float, Field(gt=0, lt=1)] | None = None
-    damping: DampingTable | None = None
-    profiles: dict[str, list[Finite] | Profile | Defects] | None = None
-    scatter: ScatterTable | None = None
-    absorbing: AbsorbingTable | None = None
+    preset: Literal["four-band", "diatomic"] | None = described(
+        "one of the paper's cells; it also gives defaults for contacts and drive", None
+    )
+    cell: CellTable | None = described("a user-defined cell, instead of a preset", None)
+    cells: int = described("number of cells; 600 in the preset diatomic", 300, ge=1, le=MOST_CELLS)
+    ends: Literal["fixed", "free", "periodic"] = described("what the first and the last cell are attached to", "fixed")
+    reading: Literal["printed", "calibrated"] = described(
+        "parameters of a preset: as printed in the paper, or calibrated to reproduce its figures", "calibrated"
+    )
+    lam: Positive | None = described(
+        "parameter of the preset four-band: stiffness of the resonator's spring over that of another"
+        " spring of the cell",
+        None,
+        alias="lambda",
+    )
+    eta: Annotated[float, Field(gt=0, lt=1)] | None = described(
+        "parameter of the preset four-band: the resonator's fraction of the mass of host and resonator", None
+    )
+    damping: DampingTable | None = described("proportional dashpots, or dashpots fitted to a loss of each band", None)
+    profiles: dict[str, list[Finite] | Profile | Defects] | None = described(
+        'quantities that vary from cell to cell, by name, as "masses[2]" or "springs[1].cubic"', None
+    )
+    scatter: ScatterTable | None = described("the request of [disorder.cells], filled in", None)
+    absorbing: AbsorbingTable | None = described("an end with dashpots that absorb waves", None)
 
     @property
     def nonlinear_keys(self) -> list[str]:
@@ -246,41 +272,68 @@ class LatticeTable(Section):
 class TimeTable(Section):
     """Time: end in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
-    ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``; ``propagator`` takes exact linear steps, with
-    contact forces collocated; ``auto`` is the propagator where it applies. ``atol``, the absolute tolerance: ``scaled``
-    is 0.1 rtol times the displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the
-    amplitude, and a number holds for displacements (m) and velocities (m/s). ``samples`` is the number of samples from
-    0 to the end, instead of their interval.
+    The tolerance ``scaled`` is 0.1 rtol times the displacement and the velocity of the drive's linear wave, ``paper``
+    is 1e-9 times the amplitude; a number holds for displacements (m) and velocities (m/s).
     """
 
-    end: Positive | Literal["traverse"] = "traverse"
-    engine: Literal["ts", "propagator", "auto"] = "ts"
-    method: Method = "8vr"
-    rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = 1e-10
-    atol: Positive | Literal["scaled", "paper"] = "scaled"
-    sample_interval: Positive | Literal["auto"] = "auto"
-    samples: int | None = Field(None, ge=2, le=10**9)
+    end: Positive | Literal["traverse"] = described(
+        'end of the run; "traverse": length of the burst plus the travel time of the wave through the'
+        " lattice, down to the last sample before it",
+        "traverse",
+        unit="s",
+    )
+    engine: Literal["ts", "propagator", "auto"] = described(
+        "Runge-Kutta steps (ts), exact linear steps (propagator), or the propagator where it applies,"
+        " otherwise ts (auto)",
+        "ts",
+    )
+    method: Method = described("PETSc's Runge-Kutta method for ts", "8vr")
+    rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = described("relative tolerance", 1e-10)
+    atol: Positive | Literal["scaled", "paper"] = described(
+        'absolute tolerance; "scaled": 0.1 rtol times the linear wave of the drive, "paper": 1e-9 times the amplitude',
+        "scaled",
+        unit="m, m/s",
+    )
+    sample_interval: Positive | Literal["auto"] = described(
+        'time between samples, shortened where an `end` in s is not a whole number of intervals; "auto"'
+        " resolves the top band",
+        "auto",
+        unit="s",
+    )
+    samples: int | None = described("number of samples from 0 to the end, instead of an interval", None, ge=2, le=10**9)
 
 
 class OutputTable(Section):
-    """Stored part of the fields (cells of the ``window``, every n-th cell, every n-th sample), and who writes it.
+    """Stored part of the fields (cells of the ``window``, every n-th cell, every n-th sample), and who writes it."""
 
-    ``writer``: ``gather`` sends samples to rank 0, ``parallel`` has every rank write its own cells,
-    ``auto`` takes ``parallel`` when a run's fields exceed 2 GiB. Besides the fields, the motion of named ``points`` and
-    with ``forces`` the force of every contact are recorded at every sample; ``transmission`` are pairs of points.
-    """
-
-    fields: Annotated[list[Literal["displacement", "velocity"]], AfterValidator(once)] = Field(
-        ["displacement", "velocity"]
+    fields: Annotated[list[Literal["displacement", "velocity"]], AfterValidator(once)] = described(
+        "fields that are stored", ["displacement", "velocity"]
     )
-    window: list[int] | None = Field(None, min_length=2, max_length=2)
-    every: int = Field(1, ge=1, le=MOST_STRIDE)
-    stride: int = Field(1, ge=1, le=MOST_STRIDE)
-    writer: Literal["auto", "gather", "parallel"] = "auto"
-    figures: bool = True
-    points: list[PointTable] | None = Field(None, max_length=MOST_POINTS)
-    transmission: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
-    forces: bool | None = None
+    window: list[int] | None = described(
+        "first and last cell that are stored; default: all cells", None, min_length=2, max_length=2
+    )
+    every: int = described("every n-th cell is stored", 1, ge=1, le=MOST_STRIDE)
+    stride: int = described("every n-th sample is stored", 1, ge=1, le=MOST_STRIDE)
+    writer: Literal["auto", "gather", "parallel"] = described(
+        "rank 0 collects and writes all samples (gather), or each rank writes its own cells (parallel);"
+        " auto: parallel from 2 GiB of fields",
+        "auto",
+    )
+    figures: bool = described("whether pictures are drawn", True)
+    points: list[PointTable] | None = described(
+        "named masses whose motion is stored at every sample, independently of the stored cells; `nfrc`:"
+        " in every state",
+        None,
+        max_length=MOST_POINTS,
+    )
+    transmission: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = described(
+        "pairs of points, [from, to], for which the transmission is measured", None
+    )
+    forces: bool | None = described(
+        "whether the force of each contact is stored at every sample; `nfrc`: largest forces of contacts"
+        " and on fixed walls",
+        None,
+    )
 
     def of_points(self) -> dict[str, Any]:
         """The keys about named points, for a run of which nothing else is kept."""
@@ -290,22 +343,25 @@ class OutputTable(Section):
 class AnalysisTable(Section):
     """Resolution of the measures. Strides of 1 leave nothing out; ``analysis.h5`` states the error of larger strides.
 
-    Energies above the pass bands are taken at every ``band_stride``-th sample; entropies at every
-    ``snapshot_stride``-th snapshot, of which there are 500 at most, and in every ``cell_stride``-th cell; energies of
-    the linear modes at every ``modal_stride``-th sample, and before and after contacts. ``pixels``: most rows and
-    columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that size. A steady amplitude
-    is that of the last ``steady_periods`` of the drive, if it differs from those of the two windows before by no more
-    than the fraction ``steady_tolerance``.
+    A steady amplitude is that of the last ``steady_periods`` of the drive.
     """
 
-    band_stride: int = Field(10, ge=1, le=MOST_STRIDE)
-    snapshot_stride: int = Field(2, ge=1, le=MOST_STRIDE)
-    cell_stride: int = Field(2, ge=1, le=MOST_STRIDE)
-    modal_stride: int = Field(50, ge=1, le=MOST_STRIDE)
-    pixels: int = Field(600, ge=2, le=MOST_STRIDE)
-    memory: Positive = 1.0
-    steady_periods: int | None = Field(None, ge=1, le=MOST_STRIDE)
-    steady_tolerance: Annotated[float, Field(gt=0, lt=1)] | None = None
+    band_stride: int = described("samples between two energies above the pass bands", 10, ge=1, le=MOST_STRIDE)
+    snapshot_stride: int = described(
+        "entropy and partition are computed at every n-th of at most 500 snapshots", 2, ge=1, le=MOST_STRIDE
+    )
+    cell_stride: int = described("entropy is computed in every n-th cell", 2, ge=1, le=MOST_STRIDE)
+    modal_stride: int = described(
+        "samples between two modal energies, apart from those near contacts", 50, ge=1, le=MOST_STRIDE
+    )
+    pixels: int = described("largest number of rows and columns of a map", 600, ge=2, le=MOST_STRIDE)
+    memory: Positive = described("amount of a field that is read at a time", 1.0, unit="GiB")
+    steady_periods: int | None = described(
+        "drive periods in each window for the steady amplitude; default: 10", None, ge=1, le=MOST_STRIDE
+    )
+    steady_tolerance: Annotated[float, Field(gt=0, lt=1)] | None = described(
+        "largest relative difference between three windows for a steady amplitude; default: 0.01", None
+    )
 
 
 # PETSc 3.25 renamed these options: their names there, and the ones before.

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 LONGEST_VALUE = 200  # characters of a value that a message shows
 
@@ -35,3 +35,12 @@ class Section(BaseModel):
     """A table of a case file: strict types, no unknown keys, immutable."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def described(text: str, default: Any = ..., *, unit: str = "", **bounds: Any) -> Any:
+    """Return the field of a key: a ``text`` that says what it means, its ``default``, its ``unit``, and its ``bounds``.
+
+    The schema for editors, the manual's chapter of all keys and the axes of pictures take text and unit from here.
+    Without a default the key is required; ``bounds`` are other arguments of pydantic's ``Field``.
+    """
+    return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)

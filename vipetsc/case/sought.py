@@ -13,6 +13,7 @@ from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.schema import Finite
+from vipetsc.case.section import described
 from vipetsc.lattice import UnitCell, pass_bands
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
@@ -42,10 +43,8 @@ UNITS = {
 class UnknownTable(Section):
     """A ``quantity`` that is sought within ``bounds`` in SI units, from ``start`` on, by default that of the case.
 
-    ``of``: "all" sites, masses or springs have one value in common, "each" has one of its own, or each of the listed
-    groups of their numbers (from 1) has one. ``scale``: whether derivatives and steps are those of the logarithm or of
-    the value. ``dashpot`` is parallel to a spring, ``grounding`` a dashpot between a mass and the ground; ``quadratic``
-    and ``cubic`` are terms of a spring's force; ``amplitude`` is that of the first drive.
+    ``dashpot`` is parallel to a spring, ``grounding`` a dashpot between a mass and the ground; ``quadratic`` and
+    ``cubic`` are terms of a spring's force; ``amplitude`` is that of the first drive.
     """
 
     quantity: Literal[
@@ -61,11 +60,18 @@ class UnknownTable(Section):
         "dashpot",
         "grounding",
         "amplitude",
-    ]
-    bounds: Annotated[list[Finite], Field(min_length=2, max_length=2)]
-    of: Literal["all", "each"] | list[list[int]] = "all"
-    scale: Literal["logarithmic", "linear"] | None = None
-    start: float | list[float] | None = None
+    ] = described("what is sought: of contact sites, of masses or springs of the cell, or the amplitude of the drive")
+    bounds: Annotated[list[Finite], Field(min_length=2, max_length=2)] = described("lower and upper bound, in SI units")
+    of: Literal["all", "each"] | list[list[int]] = described(
+        "one value for all, one for each, or one for each group of numbers, from 1", "all"
+    )
+    scale: Literal["logarithmic", "linear"] | None = described(
+        "coordinate of the fit; default: linear for restitution, exponent, quadratic and cubic, otherwise logarithmic",
+        None,
+    )
+    start: float | list[float] | None = described(
+        "value at which the fit begins, or one for each value; default: that of the case", None
+    )
 
 
 class SoughtParameter(NamedTuple):

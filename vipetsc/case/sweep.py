@@ -13,12 +13,12 @@ from typing import Any, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.html import html_table
 from vipetsc.case.schema import number
+from vipetsc.case.section import described
 from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 from vipetsc.wording import counted, shortened
@@ -30,18 +30,16 @@ MOST_TRIED_SITES = 200_000
 
 
 class SweepTable(Section):
-    """Measures, stored fields and ranks of the members of a sweep, in addition to the keys that vary.
+    """Measures, stored fields and ranks of the members of a sweep, in addition to the keys that vary."""
 
-    ``measures``: what is measured of every run: ``entropy`` over wavenumbers (the paper's section II), ``transfer``
-    between bands (section III); ``motion`` asks for neither, but for what every run is measured for: the largest force
-    and the motion of named points. ``fields``: keep every run's full fields and analysis. ``ranks``: how many ranks
-    compute a run together. ``zip``: groups of keys that vary together.
-    """
-
-    measures: list[Literal["entropy", "transfer", "motion"]] = Field(["entropy", "transfer"], min_length=1)
-    fields: bool = False
-    ranks: int = Field(1, ge=1)
-    zip: list[list[str]] = Field([])
+    measures: list[Literal["entropy", "transfer", "motion"]] = described(
+        "measures of each run: entropy over wavenumbers, transfer between bands; motion: neither of them",
+        ["entropy", "transfer"],
+        min_length=1,
+    )
+    fields: bool = described("whether fields and analysis of each run are stored", False)
+    ranks: int = described("number of ranks per run", 1, ge=1)
+    zip: list[list[str]] = described("groups of keys that vary together", [])
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.objective import Pair
+from vipetsc.case.section import described
 from vipetsc.case.value_ranges import leaves
 
 SECTIONS = ("lattice", "contacts", "drive", "initial", "time", "output")  # whose keys may vary
@@ -18,28 +19,34 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 class VariablesTable(Section):
     """The variables by name, each with bounds [low, high], and those that are keys of the case, by their sections.
 
-    By name: ``clearance`` in m of each site independently, or ``profile``, those of the first and of the last site with
-    the others log-spaced between; ``sites``: the cells (1-based), whole numbers that differ; ``restitution``;
-    ``masses`` in kg and ``springs`` in N/m of the cell by their number in it (from 1). All except sites and restitution
-    are searched by their logarithm.
-
-    Keys of ``lattice``, ``contacts``, ``drive``, ``initial``, ``time`` and ``output`` have a range, { log = [low,
-    high] }, { linear = [low, high] } or { whole = [low, high] }, or a list of the values that they may take. A range of
-    a key that is a list in the case, as all of ``contacts.each`` are, is one of each entry.
+    All named variables except sites and restitution are searched by their logarithm. A range of a key that is a list in
+    the case, as all of ``contacts.each`` are, is one of each entry.
     """
 
-    clearance: Pair | None = None
-    profile: Pair | None = None
-    sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
-    restitution: Annotated[list[Fraction], Field(min_length=2, max_length=2)] | None = None
-    masses: dict[str, Pair] = Field({})
-    springs: dict[str, Pair] = Field({})
-    lattice: dict[str, Any] | None = None
-    contacts: dict[str, Any] | None = None
-    drive: dict[str, Any] | None = None
-    initial: dict[str, Any] | None = None
-    time: dict[str, Any] | None = None
-    output: dict[str, Any] | None = None
+    clearance: Pair | None = described("bounds of each site's clearance", None, unit="m")
+    profile: Pair | None = described(
+        "bounds of the clearances of the first and the last site; the others are log-spaced in between", None, unit="m"
+    )
+    sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = described(
+        "first and last cell in which a site may be", None
+    )
+    restitution: Annotated[list[Fraction], Field(min_length=2, max_length=2)] | None = described(
+        "bounds of the restitution", None
+    )
+    masses: dict[str, Pair] = described("bounds of masses, by their number in the cell", {}, unit="kg")
+    springs: dict[str, Pair] = described("bounds of stiffnesses, by the spring's number in the cell", {}, unit="N/m")
+    lattice: dict[str, Any] | None = described(
+        "keys of [lattice] that vary: { log, linear or whole = [low, high] }, or a list of values", None
+    )
+    contacts: dict[str, Any] | None = described(
+        "keys of [contacts] that vary, likewise; a range of a key that is a list varies every entry", None
+    )
+    drive: dict[str, Any] | None = described("keys of [drive] that vary, likewise", None)
+    initial: dict[str, Any] | None = described("keys of [initial] that vary, likewise", None)
+    time: dict[str, Any] | None = described("keys of [time] that vary, likewise", None)
+    output: dict[str, Any] | None = described(
+        "keys of [output] that vary, likewise, such as the cells of named points", None
+    )
 
     def keys_of_case(self) -> dict[str, Any]:
         """The ranges and the lists of values of keys of the case, by the keys' paths."""

@@ -15,6 +15,7 @@ from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
+from vipetsc.case.section import described
 from vipetsc.lattice import ToneBurst, Waveform
 from vipetsc.lattice.drive import impulse, main_frequency, ramped, sampled
 from vipetsc.plugins import call, number_of
@@ -245,27 +246,53 @@ def is_sine(name: Any) -> bool:
 
 
 class OneDrive(Section):
-    """A waveform of a force on one mass, or of the motion of an end's wall.
+    """A waveform of a force on one mass, or of the motion of an end's wall."""
 
-    ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
-    """
-
-    waveform: Annotated[str, PartName(WAVEFORM, tuple(WAVEFORMS))] | None = None
-    amplitude: Finite = 1.0
-    cycles: int = Field(CYCLES, ge=1)
-    envelope: Literal["paper", "hann"] = "paper"
-    ramp: Positive | None = None
-    duration: Positive | None = None
-    bandwidth: Finite | None = None
-    samples: SamplesTable | None = None
-    parameters: dict[str, Finite] | None = None
-    frequency: Positive | None = None
-    wavenumber: Wavenumber | None = None
-    band: Annotated[int, Field(ge=1)] | None = None
-    at: Literal["max-group-velocity"] | None = None
-    cell: int = Field(1, ge=1)
-    mass: int = Field(1, ge=1)
-    end: Literal["left", "right"] | None = None
+    waveform: Annotated[str, PartName(WAVEFORM, tuple(WAVEFORMS))] | None = described(
+        "waveform (default: tone burst); the chapter on drives lists the keys of each", None
+    )
+    amplitude: Finite = described(
+        "amplitude of the force; of an impulse, its time integral; of a moving end, in m", 1.0, unit="N, N s or m"
+    )
+    cycles: int = described("number of cycles of the burst", CYCLES, ge=1)
+    envelope: Literal["paper", "hann"] = described("the paper's Hann window, or one of half its amplitude", "paper")
+    ramp: Positive | None = described(
+        "rise time of a harmonic drive, a chirp or a step, and fall time before its end; default: 10"
+        " periods, or 0.1 of a chirp",
+        None,
+        unit="s",
+    )
+    duration: Positive | None = described(
+        "length of a chirp or an impulse; end of a harmonic drive or a step, which by default do not end",
+        None,
+        unit="s",
+    )
+    bandwidth: Finite | None = described(
+        "width of the linear frequency sweep of a chirp, centred at `frequency`; a negative value sweeps downwards",
+        None,
+        unit="rad/s",
+    )
+    samples: SamplesTable | None = described(
+        "samples of the waveform, joined as `samples.interpolation` says; 0 before the first and after the"
+        " last, where a wall that moves stays in its place",
+        None,
+    )
+    parameters: dict[str, Finite] | None = described(
+        "parameters of a waveform that a module of [plugins] registers", None, unit="that of the parameter"
+    )
+    frequency: Positive | None = described(
+        "angular frequency, of a chirp its centre; alternatively `wavenumber` or `at`, with `band`", None, unit="rad/s"
+    )
+    wavenumber: Wavenumber | None = described(
+        'wavenumber of the wave in `band`; multiples of pi as "5pi/9"', None, unit="rad/cell"
+    )
+    band: Annotated[int, Field(ge=1)] | None = described("pass band of the wave; the lowest is 1", None)
+    at: Literal["max-group-velocity"] | None = described("position of the wave in `band`", None)
+    cell: int = described("the driven cell", 1, ge=1)
+    mass: int = described("the driven mass in that cell", 1, ge=1)
+    end: Literal["left", "right"] | None = described(
+        "the end whose wall moves with the waveform, instead of a force on a mass", None
+    )
 
     @property
     def kind(self) -> str:
