@@ -65,12 +65,6 @@ def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_pr
     assert_same_bits(datasets(tmp_path / "run/run.h5"), datasets(tmp_path / "again/run.h5"))
 
 
-def test_the_format_of_a_file_is_its_own(tmp_path):
-    """An ensemble's file has the version of its own format, 2."""
-    run_sweep(Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0]}}}), tmp_path, MPI.COMM_SELF)
-    assert attributes(tmp_path / "ensemble.h5")["format_version"] == 2
-
-
 def test_petsc_options_stand_in_the_origin(petsc_options):
     petsc_options(ts_monitor="ascii:nowhere.txt")
     assert "-ts_monitor ascii:nowhere.txt" in io_folder.origin()["petsc_options"]

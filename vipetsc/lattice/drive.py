@@ -382,7 +382,8 @@ def sampled(
     return Pieces.of(amplitude, frequency, duration, table)
 
 
-def _joined(times: np.ndarray, values: np.ndarray, interpolation: Interpolation) -> scipy.interpolate.PPoly:
+# The annotation is a text: evaluated, it would load scipy.interpolate with the package.
+def _joined(times: np.ndarray, values: np.ndarray, interpolation: Interpolation) -> "scipy.interpolate.PPoly":
     """Return the polynomials between samples ``values`` (sample,) at ``times`` (sample,)."""
     if interpolation == "linear":
         return scipy.interpolate.PPoly(np.array([np.diff(values) / np.diff(times), values[:-1]]), times)
