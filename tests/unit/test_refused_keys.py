@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase
+from vipetsc.case.case_file import sections_in
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics.propagator.step_choice import refusal
 
@@ -224,3 +227,21 @@ def test_a_precompression_is_named_as_it_is_given():
     stops = {"sites": [4], "clearance": 1e-5, "precompression": 3e-5, "side": "plus", "restitution": 0.7}
     with pytest.raises(CaseError, match=r"contacts\.precompression = 3e-05: site 1: a precompressed contact"):
         small_case(contacts=stops)
+
+
+def test_every_union_is_read_by_the_shape_of_its_value():
+    """A union without the mark would give the errors of all of its types, with pydantic's own names in their paths."""
+    waiting = list(SECTIONS.values())
+    seen = set()
+    while waiting:
+        table = waiting.pop()
+        if table in seen:
+            continue
+        seen.add(table)
+        for name, field in table.model_fields.items():
+            waiting += sections_in(field.annotation)
+            key = field.alias or name
+            with pytest.raises(ValidationError) as caught:
+                table.model_validate({key: object()})
+            assert len([item for item in caught.value.errors() if item["loc"][:1] == (key,)]) <= 1, key
+    assert len(seen) > 40

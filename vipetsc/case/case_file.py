@@ -23,12 +23,12 @@ from vipetsc.case.case_error import CaseError as CaseError
 from vipetsc.case.changes import put as put
 from vipetsc.case.changes import with_overrides as with_overrides
 from vipetsc.case.named_files import with_absolute_names
-from vipetsc.case.nearest_type import BRANCH, of_nearest_type
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
 from vipetsc.case.plain import TOO_DEEP, is_deeper, plain_table, wrong_keys
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
 from vipetsc.case.section import described, is_within
+from vipetsc.case.shapes import MARK
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
@@ -337,10 +337,11 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     try:
         section = kind(**table)
     except ValidationError as error:
-        for item in of_nearest_type(error.errors(include_url=False)):
+        for item in error.errors(include_url=False):
             problem = _problem_of(kind, name, item)
             problems.setdefault(problem.key, problem)
-            invalid.add(item["loc"][0])
+            # A problem of the section as a whole leaves none of its keys.
+            invalid.update(item["loc"][:1] or table)
 
     # The type of a value comes first: of a value that is not of its key's type the range says nothing.
     mistyped = tuple(problems)
@@ -368,10 +369,10 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
     path = name
     for part in item["loc"]:
-        # Items count from 1. The names of types that pydantic tried are no part of a key's path.
+        # Items count from 1. The names of shapes are no part of a key's path.
         if isinstance(part, int):
             path += f"[{part + 1}]"
-        elif not BRANCH.fullmatch(part):
+        elif not part.startswith(MARK):
             path += f".{part}"
     if item["type"] == "extra_forbidden":
         fields = _section_at(kind, item["loc"][:-1]).model_fields
@@ -410,7 +411,7 @@ def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]
             kind = choices[0]
         # A class name in the path says which of the sections that the key before it may have was tried.
         for choice in choices:
-            if choice.__name__ == key:
+            if f"{MARK}{choice.__name__}" == key:
                 kind = choice
                 break
     return kind

@@ -15,6 +15,7 @@ from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.schema import Finite, Positive
 from vipetsc.case.section import described
+from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.io.names import resolved_path
 from vipetsc.io.tables import TableError, read_table
 from vipetsc.wording import counted
@@ -29,7 +30,7 @@ UNEVEN = 0.05
 HDF5 = (".h5", ".hdf5", ".nc")
 UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
 
-Place = int | str  # of a column: its number from 1, or its name
+Place = Annotated[int | str, BY_SHAPE]  # of a column: its number from 1, or its name
 
 
 class SensorTable(Section):
@@ -68,12 +69,12 @@ class RecordTable(Section):
     time: Place | None = described("column of the times: name or number from 1; of HDF5 a dataset", None)
     time_factor: Positive = described("factor that makes the times seconds", 1.0)
     rate: Positive | None = described("sample rate, in place of time", None, unit="Hz")
-    offset: Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)] = described(
+    offset: Annotated[Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)], BY_SHAPE] = described(
         "time of the record at which the drive begins, or bounds [low, high] of an unknown one", 0.0, unit="s"
     )
     begin: Finite | None = described("first time of the record that is used", None, unit="s")
     end: Finite | None = described("last time of the record that is used", None, unit="s")
-    initial: Literal["estimate"] | dict[str, Any] = described(
+    initial: Annotated[Literal["estimate"] | dict[str, Any], BY_SHAPE] = described(
         "keys of [initial] that differ in this record, or `estimate` for a lattice that moves already", {}
     )
     drive: dict[str, Any] = described("keys of [drive] that differ in this record, such as amplitude", {})

@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field
 from vipetsc.case.case_file import Section
 from vipetsc.case.schema import Finite, Positive, once
 from vipetsc.case.section import described
+from vipetsc.case.shapes import BY_SHAPE
 
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
@@ -136,7 +137,7 @@ class NnmTable(Section):
         "solver for the orbits of a chain: dense matrices, or Newton-Krylov on all ranks (auto: beyond 100 masses)",
         "auto",
     )
-    multipliers: bool | Annotated[int, Field(ge=1)] = described(
+    multipliers: Annotated[bool | Annotated[int, Field(ge=1)], BY_SHAPE] = described(
         "number of the largest Floquet multipliers of the whole lattice computed at each point; true: 8", False
     )
     map: Literal["auto", "quarter", "half", "whole"] = described(
@@ -154,7 +155,7 @@ class NnmTable(Section):
         " contact; auto: grazing near contact",
         "relative",
     )
-    start_energy: Positive | Literal["auto"] = described(
+    start_energy: Annotated[Positive | Literal["auto"], BY_SHAPE] = described(
         "energy of the first point; auto: small enough for a linear mode", "auto", unit="J"
     )
     energy: list[Annotated[float, Field(ge=0)]] = described(

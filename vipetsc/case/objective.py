@@ -2,9 +2,9 @@
 
 import difflib
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, WithJsonSchema
 
 from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
@@ -18,6 +18,8 @@ from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 
 # Measures that only searches have; all others are numbers of every run, by their names.
 OF_SEARCHES = ("upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted")
+# What editors propose: these, and any text.
+MEASURES: dict[str, Any] = {"anyOf": [{"enum": list(OF_SEARCHES), "type": "string"}, {"type": "string"}]}
 ABOVE_DRIVEN = ("upper_share_at_end", "ibtet")  # of the energy in the bands above the driven one
 FILE_AMPLITUDE = "a state from a file is taken as it is, with the amplitude that it has"
 # Numbers of a run's analysis that do not describe the lattice's motion.
@@ -33,8 +35,7 @@ class MeasuredTable(Section):
     the widest range in which it is below that level.
     """
 
-    # The names above.
-    measure: Literal[OF_SEARCHES] | str = described(  # type: ignore[valid-type]
+    measure: Annotated[str, WithJsonSchema(MEASURES)] = described(
         "fraction of the work at the end in the upper bands, in one band, or beyond the last site; or"
         " ibtet, entropy (bit), or the name of any measure of a run; or response/ and a quantity of"
         " the curves of [nfrc]",

@@ -12,6 +12,7 @@ from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.case.points import MOST_POINTS, PointTable
 from vipetsc.case.section import described
+from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 
@@ -216,7 +217,7 @@ class LatticeTable(Section):
         "parameter of the preset four-band: the resonator's fraction of the mass of host and resonator", None
     )
     damping: DampingTable | None = described("proportional dashpots, or dashpots fitted to a loss of each band", None)
-    profiles: dict[str, list[Finite] | Profile | Defects] | None = described(
+    profiles: dict[str, Annotated[list[Finite] | Profile | Defects, BY_SHAPE]] | None = described(
         'quantities that vary from cell to cell, by name, as "masses[2]" or "springs[1].cubic"', None
     )
     scatter: ScatterTable | None = described("the request of [disorder.cells], filled in", None)
@@ -276,7 +277,7 @@ class TimeTable(Section):
     is 1e-9 times the amplitude; a number holds for displacements (m) and velocities (m/s).
     """
 
-    end: Positive | Literal["traverse"] = described(
+    end: Annotated[Positive | Literal["traverse"], BY_SHAPE] = described(
         'end of the run; "traverse": length of the burst plus the travel time of the wave through the'
         " lattice, down to the last sample before it",
         "traverse",
@@ -289,12 +290,12 @@ class TimeTable(Section):
     )
     method: Method = described("PETSc's Runge-Kutta method for ts", "8vr")
     rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = described("relative tolerance", 1e-10)
-    atol: Positive | Literal["scaled", "paper"] = described(
+    atol: Annotated[Positive | Literal["scaled", "paper"], BY_SHAPE] = described(
         'absolute tolerance; "scaled": 0.1 rtol times the linear wave of the drive, "paper": 1e-9 times the amplitude',
         "scaled",
         unit="m, m/s",
     )
-    sample_interval: Positive | Literal["auto"] = described(
+    sample_interval: Annotated[Positive | Literal["auto"], BY_SHAPE] = described(
         'time between samples, shortened where an `end` in s is not a whole number of intervals; "auto"'
         " resolves the top band",
         "auto",

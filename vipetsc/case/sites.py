@@ -8,6 +8,7 @@ from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
 from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
 from vipetsc.case.section import described
+from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
 from vipetsc.register import DISSIPATION, LAW
 
@@ -122,10 +123,10 @@ class ContactsTable(ElasticLaw):
     parameters: dict[str, Finite] | None = described(
         "parameters of a law that a module of [plugins] registers", None, unit="that of the parameter"
     )
-    sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[int] | Span = described(
+    sites: Annotated[Annotated[int, Field(ge=0, le=MOST_SITES)] | list[int] | Span, BY_SHAPE] = described(
         "cells with stops: a number of sites spread as in the paper, a list of cells, or an even spacing", 0
     )
-    clearance: NotNegative | list[NotNegative] | ClearanceSpan | None = described(
+    clearance: Annotated[NotNegative | list[NotNegative] | ClearanceSpan, BY_SHAPE] | None = described(
         "clearance of all sites, of each site, or log-spaced; default: the preset's", None, unit="m"
     )
     clearance_minus: NotNegative | None = described(

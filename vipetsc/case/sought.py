@@ -14,6 +14,7 @@ from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.schema import Finite
 from vipetsc.case.section import described
+from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.lattice import UnitCell, pass_bands
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
@@ -62,14 +63,14 @@ class UnknownTable(Section):
         "amplitude",
     ] = described("what is sought: of contact sites, of masses or springs of the cell, or the amplitude of the drive")
     bounds: Annotated[list[Finite], Field(min_length=2, max_length=2)] = described("lower and upper bound, in SI units")
-    of: Literal["all", "each"] | list[list[int]] = described(
+    of: Annotated[Literal["all", "each"] | list[list[int]], BY_SHAPE] = described(
         "one value for all, one for each, or one for each group of numbers, from 1", "all"
     )
     scale: Literal["logarithmic", "linear"] | None = described(
         "coordinate of the fit; default: linear for restitution, exponent, quadratic and cubic, otherwise logarithmic",
         None,
     )
-    start: float | list[float] | None = described(
+    start: Annotated[float | list[float], BY_SHAPE] | None = described(
         "value at which the fit begins, or one for each value; default: that of the case", None
     )
 
