@@ -208,7 +208,7 @@ def test_beads_have_no_bands_and_no_waves():
 
 @pytest.mark.parametrize(
     ("cells", "frequency", "reason"),
-    [(3, 500.0, "3 cells are fewer than the 9"), (60, 2e5, "is too long for 3e+05 rad/s")],
+    [(3, 500.0, "3 cells, fewer than the 9"), (60, 2e5, "is too long for 3e+05 rad/s")],
 )
 def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, reason):
     """The propagator refuses lattices shorter than its reach and sample intervals too long for their frequencies."""
@@ -245,3 +245,18 @@ def test_every_union_is_read_by_the_shape_of_its_value():
                 table.model_validate({key: object()})
             assert len([item for item in caught.value.errors() if item["loc"][:1] == (key,)]) <= 1, key
     assert len(seen) > 40
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("grounding", [1e6, 1e12])
+@pytest.mark.parametrize("cells", [4, 30])
+def test_a_step_that_is_far_too_long_is_refused_without_an_overflow(grounding, cells):
+    """Without springs no interval of samples is too coarse, and a dashpot's rate times it may be any number."""
+    case = Case.from_table(
+        unsprung_table(
+            lattice={"cell": {"masses": [1.0], "grounding": [grounding]}, "cells": cells},
+            time={"end": 1e7, "sample_interval": 1e6},
+        )
+    )
+    assert "is too long for" in refusal(case.model())
+    assert dict(run_rows(case, 1))["engine"].startswith("ts")

@@ -86,7 +86,10 @@ class StepSeries:
         """Bound on what ``terms`` terms leave out of a state of unit amplitude: see the module's docstring."""
         # The first power of time that the velocity's series leaves out.
         k = 2 * terms - 1
-        return self.omega_max_h**k / factorial(k) * (1 + self.omega_max_h)
+        # Of a step that is far too long the power overflows: no number of terms is enough.
+        with np.errstate(over="ignore"):
+            power = np.float64(self.omega_max_h) ** k
+        return float(power / factorial(k) * (1 + self.omega_max_h))
 
     @property
     def _outermost(self) -> int:

@@ -15,6 +15,7 @@ from vipetsc.dynamics.propagator.groups import group_dofs, spans_cells
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
 from vipetsc.lattice import Chain, ToneBurst, nonlinear_numbers
+from vipetsc.wording import counted
 
 # The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
 LARGEST_OMEGA_H = 3.2
@@ -99,11 +100,11 @@ def _no_step(model: Model) -> str:
     """Why not even the shortest step suits ``model``: too few cells for its band, or waves too fast for its series."""
     series = _series(model, MOST_PARTS)
     step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
-    if model.chain.cells < series.width:
-        return f"{model.chain.cells} cells are fewer than the {series.width} cells that {step} couples"
-
     fastest = max(series.omega_max_h / series.interval, _fastest_burst(model))
-    return f"{step} is too long for {fastest:.5g} rad/s, of the drive or the lattice"
+    # Asked first: the width of a series that is far too long overflows.
+    if fastest * series.interval > LARGEST_OMEGA_H:
+        return f"{step} is too long for {fastest:.5g} rad/s, of the drive or the lattice"
+    return f"the lattice has {counted(model.chain.cells, 'cell')}, fewer than the {series.width} that {step} couples"
 
 
 def refusal(model: Model) -> str | None:
