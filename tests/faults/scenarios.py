@@ -99,7 +99,7 @@ sites = [7]
 [nnm]
 system = "chain"
 start_frequency = [1600.0]
-frequency = [240.0, 290.0]
+frequency = [1508.0, 1822.0]
 energy = [1e-4, 10.0]
 points = 3
 first_step = 1e-2

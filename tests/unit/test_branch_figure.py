@@ -31,7 +31,10 @@ EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
 def branch_of(**columns: np.ndarray | list) -> xr.Dataset:
     """Return a branch with these values (point,)."""
-    return xr.Dataset({name: ("point", values) for name, values in columns.items()})
+    branch = xr.Dataset({name: ("point", values) for name, values in columns.items()})
+    if "multiplier_max" in branch:
+        branch["multiplier_max"].attrs["unstable_beyond"] = 1.5
+    return branch
 
 
 def test_a_branch_is_drawn_through_its_points_along_its_tangents():
@@ -64,7 +67,8 @@ def test_a_branch_is_drawn_through_its_points_along_its_tangents():
 def test_an_unstable_part_is_drawn_from_its_first_point_to_its_last():
     """The curve has several points for each step; those of the part's last step go to the end of the step."""
     energy = np.geomspace(1.0, 2.0, 8)
-    multiplier = np.where((np.arange(8) >= 3) & (np.arange(8) <= 5), 2.0, 1.0)
+    # Beyond 1 and up to the file's threshold a point is stable.
+    multiplier = np.where((np.arange(8) >= 3) & (np.arange(8) <= 5), 2.0, 1.4)
     branch = branch_of(
         energy=energy,
         frequency=energy**0.1,

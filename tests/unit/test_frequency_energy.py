@@ -33,7 +33,9 @@ def branch_of(frequency: np.ndarray, grazing: int = GRAZING) -> xr.Dataset:
         "resonance": np.zeros(POINTS, int),
         "multiplier_max": np.ones(POINTS),
     }
-    return xr.Dataset({name: ("point", values) for name, values in columns.items()})
+    branch = xr.Dataset({name: ("point", values) for name, values in columns.items()})
+    branch["multiplier_max"].attrs["unstable_beyond"] = 1.01
+    return branch
 
 
 def drawn(branch: xr.Dataset) -> Axes:

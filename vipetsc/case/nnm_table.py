@@ -162,7 +162,7 @@ class NnmTable(Section):
         "range of energies; a branch ends outside it", [0.0, 1e9], unit="J", min_length=2, max_length=2
     )
     frequency: list[Annotated[float, Field(ge=0)]] = described(
-        "range of frequencies; a branch ends outside it", [0.0, 1e9], unit="Hz", min_length=2, max_length=2
+        "range of frequencies; a branch ends outside it", [0.0, 1e9], unit="rad/s", min_length=2, max_length=2
     )
     direction: Literal["up", "down", "both"] = described("initial direction of the energy", "up")
     points: int = described("largest number of points of a branch", 20000, ge=1)

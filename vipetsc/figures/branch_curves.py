@@ -15,9 +15,6 @@ from vipetsc.figures import style
 # Points of the curve drawn for each step of a branch. A step turns by about 0.2 rad at most (``nnm.guards``): the
 # corners between its eight chords are 0.025 rad, which no eye sees.
 FINE = 8
-# An orbit with a Floquet multiplier of a larger modulus is drawn as unstable: a stable one has some of modulus 1, which
-# come out with rounding errors.
-UNSTABLE = 1.0 + 1e-6
 
 
 def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -109,15 +106,20 @@ def lowest(branch: xr.Dataset) -> np.ndarray:
 def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
     """Draw the whole branch in blue; over it vermilion where it is unstable, grey where no multiplier was computed.
 
-    A step between a stable and an unstable point is blue.
+    A point is unstable if its largest multiplier is beyond the threshold that the file has with it. A step between a
+    stable and an unstable point is blue.
     """
     energy, frequency = smooth(branch)
     multiplier = branch["multiplier_max"].values
-    stable_label = "stable" if np.any(multiplier <= UNSTABLE) else None
+    unstable_beyond = branch["multiplier_max"].attrs["unstable_beyond"]
+    stable_label = "stable" if np.any(multiplier <= unstable_beyond) else None
     # The whole branch first, so that no gap opens between a stable part and an unstable one.
     axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=stable_label)
 
-    parts = ((multiplier > UNSTABLE, style.VERMILION, "unstable"), (np.isnan(multiplier), style.GREY, "not computed"))
+    parts = (
+        (multiplier > unstable_beyond, style.VERMILION, "unstable"),
+        (np.isnan(multiplier), style.GREY, "not computed"),
+    )
     for is_part, colour, label in parts:
         if len(energy) > len(is_part):
             # The curve has been smoothed: the points of a step, and the one at its end, belong to the part if both ends

@@ -30,7 +30,7 @@ from vipetsc.lattice.compliance import IncidentWave, WaveCompliance
 from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.dense_compliance import DenseCompliance
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
-from vipetsc.lattice.modal_compliance import ModalCompliance
+from vipetsc.lattice.modal_compliance import ComplianceError, ModalCompliance
 from vipetsc.lattice.modes import Modes, linear_modes
 from vipetsc.lattice.open_compliance import OpenCompliance
 from vipetsc.lattice.spring_places import SpringPlace, nonlinear_numbers, nonlinear_places

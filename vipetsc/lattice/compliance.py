@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands, waves_at
 from vipetsc.lattice.chain import Chain, Pair
+from vipetsc.lattice.modal_compliance import ComplianceError
 from vipetsc.lattice.unit_loads import unit_loads
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
@@ -141,12 +142,12 @@ class WaveCompliance:
     def incident(self, omega: float, band: int, direction: int = 1) -> IncidentWave:
         """The wave of ``band`` (from 1) at ``omega`` in rad/s that carries energy to higher (+1) or lower (-1) cells.
 
-        Raises ValueError if there is none, or if the contact pair does not move relatively in it.
+        Raises ComplianceError if there is none, or if the contact pair does not move relatively in it.
         """
         cell = self.chain.cell
         wavenumbers = [kappa for number, kappa, _ in waves_at(cell, omega) if number == band]
         if not wavenumbers:
-            raise ValueError(f"no wave of band {band} has the frequency {omega:g} rad/s")
+            raise ComplianceError(f"no wave of band {band} has the frequency {omega:g} rad/s")
 
         waves = bloch_waves(cell, np.array([omega], complex))
         half = waves.factor.shape[1] // 2
@@ -158,7 +159,7 @@ class WaveCompliance:
         pairs = self.chain.contact_pairs
         relative = _relative_motion(pairs[0], shape, factor)
         if abs(relative) < AT_REST * np.abs(shape).max():
-            raise ValueError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
+            raise ComplianceError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
         # A pair like the first one moves as it does, but for the phase.
         ratios = [1.0 if pair == pairs[0] else _relative_motion(pair, shape, factor) / relative for pair in pairs]
 

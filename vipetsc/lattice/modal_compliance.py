@@ -38,6 +38,10 @@ MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute w
 ACCURACY = 1e-8
 
 
+class ComplianceError(ValueError):
+    """A lattice has no compliance at a frequency, or none that its modes represent."""
+
+
 class Poles(NamedTuple):
     """A sum over ``poles`` (pole,) in 1/s: ``output`` (dofs, pole) and ``input`` (pole, dofs), see ``ModalCompliance``.
 
@@ -58,8 +62,8 @@ class ModalCompliance:
     of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
     ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none.
 
-    Raises ValueError for more than ``MOST_DOFS`` masses, and where the damping is so close to critical that the modes
-    do not represent the motion.
+    Raises ComplianceError for more than ``MOST_DOFS`` masses, and where the damping is so close to critical that the
+    modes do not represent the motion.
     """
 
     chain: Chain
@@ -69,7 +73,7 @@ class ModalCompliance:
     def __post_init__(self) -> None:
         dofs = self.chain.cells * self.chain.cell.dofs
         if dofs > MOST_DOFS:
-            raise ValueError(f"a lattice of {dofs} masses: all modes are computed of up to {MOST_DOFS}")
+            raise ComplianceError(f"a lattice of {dofs} masses: all modes are computed of up to {MOST_DOFS}")
 
     @cached_property
     def springs(self) -> list[SpringPlace]:
@@ -212,7 +216,7 @@ class ModalCompliance:
 
     @cached_property
     def _poles(self) -> Poles:
-        """All poles of the lattice; raises ValueError where they do not represent it."""
+        """All poles of the lattice; raises ComplianceError where they do not represent it."""
         chain = self.chain
         masses = chain.masses()
         root = 1 / np.sqrt(masses)
@@ -238,7 +242,7 @@ class ModalCompliance:
         return poles
 
     def _check(self, poles: Poles) -> None:
-        """Compare the sum over ``poles`` with a direct solution; raises ValueError where they differ."""
+        """Compare the sum over ``poles`` with a direct solution; raises ComplianceError where they differ."""
         chain = self.chain
         omega = float(np.median(np.abs(poles.poles)))
         dynamic = self.stiffness + 1j * omega * chain.damping_rows(0, chain.cells)
@@ -249,7 +253,7 @@ class ModalCompliance:
         u = poles.output @ ((poles.input @ force) / (1j * omega - poles.poles))
         u = u - poles.rigid @ (poles.rigid.T @ force) / omega**2
         if not np.abs(u - direct).max() <= ACCURACY * np.abs(direct).max():
-            raise ValueError(
+            raise ComplianceError(
                 "a mode is damped so close to critically that its two rates agree; change a dashpot a little"
             )
 

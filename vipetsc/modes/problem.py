@@ -12,15 +12,19 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 
-class FlowError(RuntimeError):
+class NoMotionError(RuntimeError):
+    """There is no periodic motion here, or Newton's method does not find it. Nothing else counts as "not found"."""
+
+
+class FlowError(NoMotionError):
     """The equations cannot be evaluated at these unknowns, as where a flow does not cover the requested time."""
 
 
-class ContinuationError(RuntimeError):
-    """The branch cannot go on; the message says where, why, and which option to turn."""
+class ContinuationError(NoMotionError):
+    """The branch cannot go on; the message says where, why, and which key to change."""
 
 
-class StartError(ValueError):
+class StartError(NoMotionError):
     """There is no periodic orbit to begin a branch with; raised on all ranks that search for one together."""
 
 
@@ -70,7 +74,7 @@ S = TypeVar("S", bound=Solution)
 class SpecialKind(Generic[S]):
     """A kind of special point: where ``test`` changes sign, by more than a ``floor`` on both sides.
 
-    ``seek`` (frame, guess, left, right) solves equations for the point's unknowns and raises ArithmeticError where they
+    ``seek`` (frame, guess, left, right) solves equations for the point's unknowns and raises NoMotionError where they
     have no solution; for a kind without such equations the sign change is bracketed. ``accept`` says whether a point
     that was found is of the kind, where the test alone does not tell. ``finish`` (point, left, right) adds the
     quantities that only such points have.

@@ -256,6 +256,15 @@ class System:
         # A rigid-body motion has an eigenvalue of zero, which rounding may make negative.
         return np.sqrt(np.maximum(squared, 0)), shapes * signs
 
+    def moves(self, mode: int) -> np.ndarray:
+        """The elongations (contacts + springs,) of contacts and smooth springs in a mass-normalised mode.
+
+        They are 0 where a node of the mode leaves rounding alone.
+        """
+        shape = self.linear_modes()[1][:, mode]
+        elongations = np.vstack([self.contact_rows, self.spring_rows]) @ shape
+        return np.where(np.abs(elongations) > LEAST_REACH * np.abs(shape).max(), elongations, 0.0)
+
     def branch_name(self, mode: int) -> str:
         """Name of the branch of ``mode`` (0-based): in-phase or out-of-phase for two masses, else its number."""
         if self.dofs != 2:
@@ -290,14 +299,30 @@ class System:
 
     def grazing_energy(self, mode: int) -> float:
         """Energy in J at which linear mode ``mode`` (0-based) first closes or opens a contact; inf if it never does."""
-        omega, shapes = self.linear_modes()
-        shape = shapes[:, mode]
-        reach = np.abs(self.contact_rows @ shape)
-        moves = reach > LEAST_REACH * np.abs(shape).max()
+        omega, _ = self.linear_modes()
+        reach = np.abs(self.moves(mode)[: len(self.contacts)])
+        moves = reach > 0
         nearest = np.abs(self.clearances.min(axis=1))
         amplitude = (nearest[moves] / reach[moves]).min(initial=np.inf)
         if not np.isfinite(amplitude):  # times omega = 0 of a rigid-body motion it would be no number
             return np.inf
+        return float(0.5 * omega[mode] ** 2 * amplitude**2)
+
+    def nonlinear_energy(self, mode: int, fraction: float) -> float:
+        """Energy in J at which smooth springs exert a ``fraction`` of the linear force in a mode; inf if they never do.
+
+        At the amplitude a of the mass-normalised shape the linear force is omega^2 a, and the springs exert
+        sum_j |r_j| (|q_j| (r_j a)^2 + |c_j| |r_j a|^3), where r_j is the elongation of the spring in the shape.
+        """
+        omega, _ = self.linear_modes()
+        reach = np.abs(self.moves(mode)[len(self.contacts) :])
+        quadratic = sum(r**3 * abs(s.law.quadratic) for r, s in zip(reach, self.springs, strict=True))
+        cubic = sum(r**4 * abs(s.law.cubic) for r, s in zip(reach, self.springs, strict=True))
+        if not (quadratic or cubic):
+            return np.inf
+        # The positive root of cubic a^2 + quadratic a = fraction omega^2.
+        allowed = fraction * omega[mode] ** 2
+        amplitude = 2 * allowed / (quadratic + np.sqrt(quadratic**2 + 4 * cubic * allowed))
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def closed_frequencies(self) -> np.ndarray:

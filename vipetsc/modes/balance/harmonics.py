@@ -40,6 +40,7 @@ from vipetsc.compiled import kernel
 from vipetsc.lattice import Spring
 from vipetsc.modes.balance.arcs import arcs, common, cut, minima
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.problem import NoMotionError
 
 # Samples per period of the last harmonic. Quintic Hermite interpolation over a step h has an error of at most
 # h^6 max|z^(6)| / (6! 2^6): here (2 pi/24)^6/46080 = 7e-9 of the last harmonic, less of all others.
@@ -311,7 +312,7 @@ class SiteForces:
     def series(self, z: np.ndarray, omega: float) -> ForceSeries:
         """The forces of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
 
-        Raises ArithmeticError where a dissipative contact never separates: it has no onset.
+        Raises NoMotionError where a dissipative contact never separates: it has no onset.
         """
         series = ForceSeries(self.pairs, z.shape[1] - 1)
         # No motion is larger than the sum of its harmonics: a contact within its clearances needs no samples.
@@ -353,7 +354,7 @@ class SiteForces:
         law = stops.law
         c = law.damping
         if c and arc.length >= 2 * np.pi:
-            raise ArithmeticError("a dissipative contact never separates, so that it has no approach velocity")
+            raise NoMotionError("a dissipative contact never separates, so that it has no approach velocity")
 
         # The slope z'_minus in m/rad with which the arc begins, and z''/z' there, 0 where the motion only touches.
         at_onset = np.empty((1, 3))

@@ -44,19 +44,24 @@ from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.balance.high_orders import KeptOrders, highest_in_contact, kept_orders
 from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one
 from vipetsc.modes.balance.shifted_compliance import Compliance
+from vipetsc.modes.point import UNSTABLE_BEYOND
+from vipetsc.modes.problem import NoMotionError
 
 # Growth rate over Om up to which a motion counts as stable: 0.06 % a period.
 LEAST = 1e-4
-# The same for a finite system without damping, 1 % a period. D has poles at the exponents of the linear modes, which
-# lie at Re lambda = -decay Om or below. The line Re lambda = const on which D is followed keeps this distance from
-# them.
-LEAST_OF_FINITE = 1.6e-3
+# The same for a finite system without damping, 1 % a period, as for all normal modes. D has poles at the exponents of
+# the linear modes, which lie at Re lambda = -decay Om or below. The line Re lambda = const on which D is followed keeps
+# this distance from them.
+LEAST_OF_FINITE = np.log(UNSTABLE_BEYOND) / (2 * np.pi)
 # Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow. In
 # the tests of stability a tenth fewer determinants are taken with them than without.
 LINES = (0.1, 0.02)
 # Intervals of half a strip, 0 <= Im lambda <= Om/2, at first. With 12 the tests take 4 % fewer determinants in a tenth
 # more rounds, with 48 a tenth more, and nothing else changes.
 COARSE = 24
+# Exponents whose compliances are kept: those of the coarse grids on all lines come to 150. Of 12 contacts with all
+# harmonics up to 121 they take 140 MB.
+MOST_KEPT = 256
 # Halvings, at most, of an interval in which D turns by more than ``TURN``: the finest is 1e-6 Om long.
 FINEST = 14
 # Largest turn of D in rad from one position to the next: at pi its sense would be ambiguous.
@@ -241,8 +246,17 @@ class Hill:
             at = np.array([mu for *_, mu in new])
             g = self.compliance.at(((orders - 1j * at[:, None]) * self.omega).ravel())
             parts = g.reshape(len(new), len(orders), *g.shape[1:])
-            self._compliances |= dict(zip(new, parts, strict=True))
-        return [self._compliances[key] for key in keys]
+            # Copies, since a view would keep the compliances of all new exponents.
+            self._compliances |= {key: part.copy() for key, part in zip(new, parts, strict=True)}
+        found = [self._compliances[key] for key in keys]
+
+        # Those used last are kept. Exponents of the coarse grid come again with every motion, those of refined
+        # intervals and of the secant method mostly do not.
+        for key in keys:
+            self._compliances[key] = self._compliances.pop(key)
+        for key in list(self._compliances)[:-MOST_KEPT]:
+            del self._compliances[key]
+        return found
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om; of the latest motion the line of ``least`` is kept."""
@@ -306,11 +320,11 @@ class Hill:
     def near(self, series: ForceSeries, guess: complex) -> complex:
         """lambda/Om of the complex pair to which the secant method goes from a ``guess``, that of a motion near by.
 
-        Raises ArithmeticError if it goes to none within 1 of the guess.
+        Raises NoMotionError if it goes to none within 1 of the guess.
         """
         zero = self._zero(series, guess, [])
         if zero is None or not REAL < zero.imag < 0.5 - REAL:
-            raise ArithmeticError("no complex pair of multipliers is found near that of the state before")
+            raise NoMotionError("no complex pair of multipliers is found near that of the state before")
         return zero
 
     def fastest(self, series: ForceSeries) -> complex | None:

@@ -20,7 +20,7 @@ from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.hill import Hill, least_growth
+from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
@@ -29,7 +29,7 @@ from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import FlowError, PeriodicProblem
+from vipetsc.modes.problem import FlowError, NoMotionError, PeriodicProblem, StartError
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
@@ -123,12 +123,16 @@ class CondensedMethod(NnmMethod):
         """The motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
         if self.system is not None and not self.options.start_frequency:
             system = self.system
-            omega, shapes = system.linear_modes()
+            elongations = system.moves(job)
+            if not elongations.any():
+                raise StartError(
+                    f"mode {job + 1} has a node at every contact and nonlinear spring, and is linear at all energies: "
+                    'choose another one (nnm.modes), or nnm.method = "shooting"'
+                )
+            omega = float(system.linear_modes()[0][job])
             energy = start_energy(self.options, system, job)
             check_start(system, job, energy)
-            amplitude = np.sqrt(2 * energy) / omega[job]
-            rows = np.vstack([system.contact_rows, system.spring_rows])
-            return self.motions.from_mode(rows @ shapes[:, job] * amplitude, float(omega[job]))
+            return self.motions.from_mode(elongations * np.sqrt(2 * energy) / omega, omega)
         signs = np.zeros(self.motions.forces.pairs)
         numbers = self.options.start_sites or [1]
         signs[np.abs(numbers) - 1] = np.sign(numbers)
@@ -141,8 +145,8 @@ class CondensedMethod(NnmMethod):
             omega = 2 * np.pi / start.period
             bands = wave_bands(self.chain.cell)
             # In a band the breather radiates; a gap has no end above the highest band and begins at 0 below the lowest.
-            low = max((band.high for band in bands if band.high < omega), default=0.0) / (2 * np.pi)
-            high = min((band.low for band in bands if band.low > omega), default=np.inf) / (2 * np.pi)
+            low = max((band.high for band in bands if band.high < omega), default=0.0)
+            high = min((band.low for band in bands if band.low > omega), default=np.inf)
             bounds = [max(low, options.frequency[0]), min(high, options.frequency[1])]
             options = options.model_copy(update={"frequency": bounds})
         return guarded_steps(problem, options, done)
@@ -174,10 +178,7 @@ class CondensedMethod(NnmMethod):
             _, largest = self._orbits.stability(self._orbits.arc(u, point.period))
         except FlowError:
             return np.nan
-        # Slower growth counts as none, as in Hill's method.
-        if np.log(largest) > 2 * np.pi * least_growth(finite=True):
-            return largest
-        return 1.0
+        return largest
 
     @cached_property
     def _orbits(self) -> Shooting:
@@ -250,7 +251,7 @@ def with_condensed_loss(motions: ConservativeMotions, dissipation: Dissipation, 
     lossy = SiteForces([stops._replace(law=law) for stops, law in contacts])
     loss = np.nan
     # A dissipative contact that never separates has no approach velocity, by which its damping divides.
-    with suppress(ArithmeticError):
+    with suppress(NoMotionError):
         loss = float(lossy.series(balance.unpack(point.x)[: lossy.pairs], omega).loss.sum())
 
     count = max(dissipation.damping.shape[0], (dissipation.forced or 0) + 1)

@@ -14,7 +14,7 @@ from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, StartError
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System, elastic_stops
 from vipetsc.parallel import StopRequest
@@ -26,7 +26,7 @@ class LatticeMethod(NnmMethod):
     kind = ORBITS
     shared = True
     # All ranks raise these together; any other exception may be one rank's alone, and ends the program on all.
-    failures = ContinuationError, FlowError, StartError
+    failures = (NoMotionError,)
 
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)

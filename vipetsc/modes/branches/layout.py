@@ -9,7 +9,7 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
-from vipetsc.modes.point import OF_LOSSES, QUANTITIES, Point
+from vipetsc.modes.point import OF_LOSSES, QUANTITIES, UNSTABLE_BEYOND, Point
 from vipetsc.modes.problem import S
 
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 unknown"
@@ -62,6 +62,7 @@ def orbit_variables(branch: Branch[Point]) -> Variables:
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
     for name, (stored, _, units, text) in QUANTITIES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
+    data["multiplier_max"].attrs["unstable_beyond"] = UNSTABLE_BEYOND
     return data | _losses(branch) | _multipliers(branch.points)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
-from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, S
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S
 from vipetsc.parallel import StopRequest
 
 Monitor = Callable[[S], str | None]
@@ -42,7 +42,7 @@ class Method(ABC, Generic[S]):
     kind: ClassVar[str]
     shared: ClassVar[bool] = False
     # Where the derivative is singular a motion has no unique tangent.
-    failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError, np.linalg.LinAlgError)
+    failures: ClassVar[tuple[type[Exception], ...]] = (NoMotionError, np.linalg.LinAlgError)
     counts_start: ClassVar[bool] = False
     keeps_empty: ClassVar[bool] = True
     finishes_interrupted: ClassVar[bool] = False

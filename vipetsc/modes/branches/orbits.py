@@ -22,7 +22,7 @@ from vipetsc.modes.continuation.guards import OrbitProblem
 from vipetsc.modes.continuation.special import at_energy
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import PeriodicProblem
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.maps import MAPS, ShootingMap
@@ -35,10 +35,13 @@ from vipetsc.parallel import StopRequest
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
-# Energy in J of the first point where the mode touches no contact, and what divides the energy at which it touches.
-# Below that the motion of linear springs is linear: the numbers decide where a branch begins, not its course.
-ANY_ENERGY = 1e-3
+# What divides the energy at which a mode first touches a contact, and the largest force of springs that are not linear
+# over the linear force: a branch begins below both. Its start is then linear, or almost: the numbers decide where a
+# branch begins, not its course. A mode that feels neither is linear at every energy, and begins at the last number in
+# J.
 BELOW_TOUCH = 100
+NONLINEAR_FORCE = 1e-4
+LINEAR_ENERGY = 1e-3
 # How far above the lowest energy asked for a branch begins at least.
 ABOVE_LOWEST = 1.001
 # Beginnings of the findings about orbits that were asked for.
@@ -97,7 +100,7 @@ class NnmMethod(Method[Point]):
                 try:
                     yield at_energy(problem, left, right, energy, self.options.chart)
                 # The branch itself is complete; what it lacks stands in its file as a finding.
-                except ArithmeticError as error:
+                except NoMotionError as error:
                     branch.findings.append(f"{NOT_FOUND} {energy:g} J after point {left.index} is not found: {error}")
             if not passed:
                 branch.findings.append(f"{NOT_PASSED} {energy:g} J")
@@ -122,13 +125,12 @@ def map_of(options: NnmTable, system: System) -> ShootingMap:
 
 
 def start_energy(options: NnmTable, system: System, mode: int) -> float:
-    """Energy in J of the first point of the branch of ``mode`` (from 0): well below the first touch."""
+    """Energy in J of the first point of the branch of ``mode`` (from 0): well below a touch, and almost linear."""
     if options.start_energy != "auto":
         return options.start_energy
-    energy = ANY_ENERGY
-    touching = system.grazing_energy(mode)
-    if math.isfinite(touching):
-        energy = touching / BELOW_TOUCH
+    energy = min(system.grazing_energy(mode) / BELOW_TOUCH, system.nonlinear_energy(mode, NONLINEAR_FORCE))
+    if not math.isfinite(energy):
+        energy = LINEAR_ENERGY
     return max(energy, options.energy[0] * ABOVE_LOWEST)
 
 

@@ -175,8 +175,8 @@ class GuardedSteps:
         if not (low <= point.energy <= high or comes_nearer):
             return point, f"left the energy range {low:g} to {high:g} J"
         low, high = self.control.frequency
-        if not low <= point.frequency <= high:
-            return point, f"left the frequency range {low:g} to {high:g} Hz"
+        if not low <= 2 * np.pi * point.frequency <= high:
+            return point, f"left the frequency range {low:g} to {high:g} rad/s"
         return None
 
     def stuck(self, last: Point, attempt: Attempt | None, verdict: Verdict) -> str:

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.optimize import brentq
 
+from vipetsc.modes.problem import NoMotionError
+
 # Values through which the polynomial goes. More of them lie further away, and say less about the function at its zero.
 POINTS = 4
 
@@ -26,14 +28,14 @@ def bracketed_root(
 
     The search ends where the bracket is no longer than the ``tolerance``. It ends before where the next place is within
     the ``tolerance`` of the last one, and the value there is at most half of the smaller one at the ends. Raises
-    ValueError if the values at both ends have one sign.
+    NoMotionError if the values at both ends have one sign.
     """
     values = {low: value(low), high: value(high)}
     for end in (low, high):
         if values[end] == 0:
             return end
     if not values[low] * values[high] < 0:
-        raise ValueError(f"no change of sign between {low:g} and {high:g}: {values[low]:g} and {values[high]:g}")
+        raise NoMotionError(f"no change of sign between {low:g} and {high:g}: {values[low]:g} and {values[high]:g}")
     # Two places may also be near each other where the function is flat; a value as large as at an end is no zero.
     small = 0.5 * min(abs(number) for number in values.values())
     values |= {place: number for place, number in outside.items() if np.isfinite(number)}

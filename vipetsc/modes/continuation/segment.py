@@ -15,7 +15,7 @@ from typing import Generic, NamedTuple
 import numpy as np
 
 from vipetsc.modes.continuation.bracketed_root import bracketed_root
-from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 
 # A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc. The
 # guess is a cubic between two knots, which misses a circular arc that turns by 0.2 rad, the default guard, by 7e-5 of
@@ -84,20 +84,20 @@ class Segment(Generic[S]):
         return np.asarray(a + s * h * slope_a + s**2 * bend)
 
     def at(self, arclength: float) -> S:
-        """The point at an arclength; raises ArithmeticError if Newton's method fails there or leaves the step."""
+        """The point at an arclength; raises NoMotionError if Newton's method fails there or leaves the step."""
         guess = self._guess(arclength)
         attempt = self.frame.correct(guess, arclength)
         allowed = ROUNDING * self.problem.tolerance
         if attempt.left_domain or not (attempt.converged or attempt.history[-1] <= allowed):
-            raise ArithmeticError(f"{attempt.reason}; residuals {attempt.residuals}")
+            raise NoMotionError(f"{attempt.reason}; residuals {attempt.residuals}")
         # A solution far from the guess lies on another arc.
         if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
-            raise ArithmeticError("Newton's method leaves the step")
+            raise NoMotionError("Newton's method leaves the step")
 
         try:
             direction = self.frame.tangent_at(attempt.xi)
         except np.linalg.LinAlgError as error:
-            raise ArithmeticError(f"no unique tangent: {error}") from None
+            raise NoMotionError(f"no unique tangent: {error}") from None
         point = self.frame.measures(attempt, direction)
         self._add_knot(arclength, attempt.xi, direction)
         return replace(point, index=self.right.index, step=arclength)
@@ -106,7 +106,7 @@ class Segment(Generic[S]):
         """Points of a kind, where its test vanishes and that the kind accepts.
 
         There is one if the test has two signs at the ends. If it has one sign but turns back between them, as the point
-        ``before`` the left one shows, there may be two, one on each side of the turn. Raises ArithmeticError where a
+        ``before`` the left one shows, there may be two, one on each side of the turn. Raises NoMotionError where a
         zero between two signs is not found.
         """
         points = self._zeros(kind, before)
@@ -132,7 +132,7 @@ class Segment(Generic[S]):
             return []
         parts: tuple[Segment[S], ...] = ()
         # The parabola only suggests two zeros. Where no point of the branch is found at the turn, none need be missed.
-        with suppress(ArithmeticError):
+        with suppress(NoMotionError):
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
@@ -140,7 +140,7 @@ class Segment(Generic[S]):
         """The point where the kind's test, of two signs at the ends, vanishes.
 
         The point ``before`` the left one gives a better first estimate. Where Newton's method fails, the search is
-        repeated in the half of the segment that has the zero. Raises ArithmeticError if it fails after ``halvings``
+        repeated in the half of the segment that has the zero. Raises NoMotionError if it fails after ``halvings``
         halvings as well.
         """
         # So that the command line can report what a run is doing (``cli.messages``).
@@ -150,9 +150,9 @@ class Segment(Generic[S]):
             if kind.finish is not None:
                 point = kind.finish(point, self.left, self.right)
             return replace(point, kind=kind.name, step=self.begin + point.step)
-        except (ArithmeticError, ValueError) as error:
+        except NoMotionError as error:
             if halvings == 0:
-                raise ArithmeticError(error) from error
+                raise NoMotionError(error) from error
 
         # Nearer ends give better guesses, and a Newton step that left the segment may stay in its half.
         first, second = self.split()
@@ -168,7 +168,7 @@ class Segment(Generic[S]):
             xi = kind.seek(self.frame, self._guess(0.5 * self.length), self.left, self.right)
             arclength = float(self.frame.tangent @ (xi - self.frame.xi))
             if not 0 < arclength < self.length:
-                raise ArithmeticError("the touch lies outside the step")
+                raise NoMotionError("the touch lies outside the step")
         else:
             value = partial(self._value, kind.test, at)
             arclength = bracketed_root(value, 0.0, self.length, EXACT * self.length, self._value_before(kind, before))
@@ -193,15 +193,15 @@ class Segment(Generic[S]):
         return test(at(arclength))
 
     def split(self, arclength: float | None = None) -> "tuple[Segment[S], Segment[S]]":
-        """The parts before and after an arclength, or about the middle; raises ArithmeticError if there is none."""
+        """The parts before and after an arclength, or about the middle; raises NoMotionError if there is none."""
         places = self.length * MIDDLES
         if arclength is not None:
             places = np.array([arclength])
         for place in places.tolist():
-            with suppress(ArithmeticError):
+            with suppress(NoMotionError):
                 middle = self.at(place)
                 return self.between(self.left, middle, self.begin), self.between(middle, self.right, self.begin + place)
-        raise ArithmeticError("Newton's method fails within the step")
+        raise NoMotionError("Newton's method fails within the step")
 
 
 def _turn(*values: tuple[float, float]) -> float | None:

@@ -2,7 +2,7 @@
 
 from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 
 
 def locate(
@@ -34,7 +34,7 @@ def locate(
             continue
         try:
             points += segment.roots(kind, before)
-        except ArithmeticError as error:
+        except NoMotionError as error:
             if missed is not None:
                 missed.append(f"a {kind.name} after {left.describe()} is not located: {error}")
     return sorted(points, key=lambda p: p.step)
@@ -45,7 +45,7 @@ def at_energy(
 ) -> Point:
     """The orbit of an ``energy`` in J between two consecutive points with less and with more of it.
 
-    It is a point of the kind "regular". Raises ArithmeticError if Newton's method fails.
+    It is a point of the kind "regular". Raises NoMotionError if Newton's method fails.
     """
     kind: SpecialKind[Point] = SpecialKind("regular", lambda p: p.energy / energy - 1)
     return Segment(problem, chart, left, right).root(kind)

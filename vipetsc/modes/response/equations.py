@@ -22,11 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.lattice import IncidentWave
+from vipetsc.lattice import ComplianceError, IncidentWave
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError, SpecialKind
 from vipetsc.modes.response.state import Response
 
 # Relative step of the central difference in frequency. Its relative error is (SLOPE/d)^2 at the relative distance d
@@ -36,7 +36,7 @@ from vipetsc.modes.response.state import Response
 SLOPE = 1e-8
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.
-FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError, np.linalg.LinAlgError
+FAILURES = NoMotionError, ComplianceError, np.linalg.LinAlgError
 
 
 class LinearMotion(NamedTuple):
@@ -99,11 +99,11 @@ class SteadyFrame:
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the state with row . xi = value, (n + 1,); not converged after an ArithmeticError."""
+        """Newton's method for the state with row . xi = value, (n + 1,); not converged after an NoMotionError."""
         equations = self.equations
         try:
             return equations.newton.solve(self, guess, row, value, equations.tolerance)
-        except ArithmeticError as error:
+        except NoMotionError as error:
             return Attempt(False, str(error), [], guess, left_domain=True)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:

@@ -160,7 +160,7 @@ class StatesOverKey(SteadyEquations):
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
         """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
 
-        Raises ArithmeticError without one.
+        Raises NoMotionError without one.
         """
         states, inner = self._at(xi)
         return states.pair_near(inner, guess)

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vipetsc.modes.balance.hill import AT_ZERO, Perturbations, Stability
-from vipetsc.modes.problem import SpecialKind
+from vipetsc.modes.problem import NoMotionError, SpecialKind
 from vipetsc.modes.response.state import Measures, Response
 
 BRANCH_POINT = "branch-point"
@@ -45,7 +45,7 @@ class StatesWithStability(Protocol):
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
         """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
 
-        Raises ArithmeticError without one.
+        Raises NoMotionError without one.
         """
 
     def least_growth(self, xi: np.ndarray) -> float:
@@ -125,7 +125,7 @@ class StabilityChanges:
 
         stable, growing = sorted((self.left, self.right), key=lambda point: states.stability(point.xi).unstable)
         # The pair that grows most slowly at this end is nearest to the line.
-        with suppress(ArithmeticError, IndexError):
+        with suppress(NoMotionError, IndexError):
             exponents[growing.xi.tobytes()] = states.growing_pairs(growing.xi)[0]
             if distance(stable) < 0:
                 return SpecialKind(NEIMARK_SACKER, distance, finish=finish)

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice import ModalCompliance, WaveCompliance
+from vipetsc.lattice import ComplianceError, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
@@ -168,7 +168,7 @@ class SteadyStates(SteadyEquations):
         assert isinstance(self.compliance, WaveCompliance)
         try:
             wave = self.compliance.incident(omega, self.options.band or 0, self.options.towards)
-        except ValueError as error:
+        except ComplianceError as error:
             raise FlowError(str(error)) from None
         z[:, 1] = wave.relative * self._unit()
         return LinearMotion(z, wave)
@@ -256,7 +256,7 @@ class SteadyStates(SteadyEquations):
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
         """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
 
-        Raises ArithmeticError without one.
+        Raises NoMotionError without one.
         """
         omega, _ = self.drive(xi[-1])
         return self.hill(omega).near(self.balance.series(xi[:-1] * self.clearance, omega), guess)

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from vipetsc.modes.problem import FlowError
+from vipetsc.modes.problem import FlowError, NoMotionError
 from vipetsc.modes.shooting.charts import DenseChart, Grazing
 from vipetsc.modes.shooting.flow import Arc
 from vipetsc.modes.shooting.maps import ShootingMap
@@ -47,7 +47,7 @@ class Touch(NamedTuple):
     def nearest(cls, arc: Arc, shooting_map: ShootingMap) -> Self:
         """The two neighbouring changes of an arc that are nearest to each other.
 
-        Without any, the time is NaN, with which ``graze`` raises ArithmeticError.
+        Without any, the time is NaN, with which ``graze`` raises NoMotionError.
         """
         pairs = cls.neighbours(arc, shooting_map.starts_at_rest, shooting_map.ends_at_rest)
         return min(pairs, default=cls(apart=0.0, time=np.nan, contact=0, side=0))
@@ -78,7 +78,7 @@ class Touch(NamedTuple):
 def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touch) -> np.ndarray:
     """Unknowns (n + 1,) of the orbit near ``guess`` where the two changes of a ``touch`` meet.
 
-    Raises ArithmeticError if Newton's method fails, as it does if the time of the ``touch`` is NaN.
+    Raises NoMotionError if Newton's method fails, as it does if the time of the ``touch`` is NaN.
     """
     xi = guess
     time = touch.time
@@ -91,12 +91,12 @@ def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touc
             time = time + later
 
             if not (size <= FURTHEST and 0 <= time <= LATEST * duration):
-                raise ArithmeticError("Newton's method diverges")
+                raise NoMotionError("Newton's method diverges")
             if size <= CLOSE:
                 return xi
     except (FlowError, np.linalg.LinAlgError) as error:
-        raise ArithmeticError(error) from error
-    raise ArithmeticError(f"the touch is not found: last step {size:.1e}")
+        raise NoMotionError(error) from error
+    raise NoMotionError(f"the touch is not found: last step {size:.1e}")
 
 
 def _equations(
