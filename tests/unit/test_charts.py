@@ -10,10 +10,6 @@ from hypothesis import strategies as st
 from tests.models import CLEARANCE, reduced_model
 from vipetsc.lattice import Contact
 from vipetsc.modes.shooting.charts import Chart, Grazing, Logarithmic, Relative
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.graze import Touch, _equations
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import ContactPair, System
 
 # A displacement in clearances, of either sign and never zero, where the logarithmic chart ends.
@@ -96,18 +92,3 @@ def test_the_relative_chart_has_as_many_elongations_as_are_independent(pairs, un
             row = system.contact_rows[unknowns[mass]]
         weights = chart.weights[mass]
         assert weights / np.abs(weights).max() == pytest.approx(row / np.abs(row).max())
-
-
-@pytest.mark.parametrize("contact", [0, 1])
-def test_the_root_of_a_gap_is_that_of_the_contact_that_grazes(contact):
-    """The grazing chart of a mass with two contacts has the root of the gap that closes; the other is no unknown."""
-    system = masses_in_contact((None, 1), (0, 1))
-    # The first contact stands at its clearance of 0.1 m, the other one does not at its 0.11 m.
-    x = np.array([0.3, 0.1, 0.05])
-    chart = Grazing(system, x, 6.0)
-    assert chart.contact == 0
-    shooting = Shooting(Dop853Flow(system), MAPS["quarter"])
-
-    matrix, _, _ = _equations(shooting, chart, chart.encode(x, 6.0), Touch(0.0, 0.0, contact, side=1))
-    root_alone = np.array_equal(matrix[3], np.eye(5)[chart.index])
-    assert root_alone == (contact == 0)

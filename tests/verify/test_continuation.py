@@ -12,14 +12,11 @@ from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
 from tests.verify.conftest import follow
 from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch_checks import is_jump, suspects
-from vipetsc.modes.continuation import segment as segments
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.continuation.special import locate
 from vipetsc.modes.continuation.switching import switch
-from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
-from vipetsc.modes.shooting import shooting as shooting_problem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import resonance
@@ -161,30 +158,16 @@ def test_a_failure_states_where_it_stopped_why_and_what_to_change():
 
 
 @pytest.mark.slow
-def test_contacts_change_at_grazing_points(monkeypatch):
-    """On either side of a grazing point an orbit has the contacts of that end of the step; bisection finds the same."""
+def test_contacts_change_at_grazing_points():
+    """On either side of a grazing point an orbit has the contacts of that end of the step."""
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
     start = linear_start(problem, IN_PHASE, 1e-3)
     points = Continuation(problem, start, NnmTable(energy=[0.0, 25.0], points=20000))
-    # The first dozen of such steps reaches the grazing cascade, where changes of contacts lie closest together. The
-    # branch is followed no further.
+    # The first half dozen of such steps reaches the grazing cascade, where changes of contacts lie closest together.
+    # The branch is followed no further.
     changes = ((a, b) for a, b in itertools.pairwise(points) if a.episodes != b.episodes)
-    steps = list(itertools.islice(changes, 12))
-
-    def grazing_points(segment_ends: list[tuple[Point, Point]]) -> list[Point]:
-        special = [point for a, b in segment_ends for point in locate(problem, a, b, grazing=True)]
-        return [point for point in special if point.kind == "grazing"]
-
-    def fail(*_, **__):
-        raise ArithmeticError("this method fails")
-
-    # Without bisection only grazing points are located; those of other kinds are left out.
-    with monkeypatch.context() as patch:
-        patch.setattr(segments, "bracketed_root", fail)
-        touching = grazing_points(steps)
-
-    assert len(touching) == len(steps)
-    for (a, b), point in zip(steps, touching, strict=True):
+    for a, b in itertools.islice(changes, 6):
+        (point,) = [p for p in locate(problem, a, b, grazing=True) if p.kind == "grazing"]
         segment = Segment(problem, "relative", a, b)
         # Steps of the cascade are as short as 3e-9; the tolerance of Newton's method, and the rounding errors of the
         # BLAS that is installed, place an orbit to some 1e-11.
@@ -195,9 +178,22 @@ def test_contacts_change_at_grazing_points(monkeypatch):
         assert after.episodes == b.episodes
         assert point.episodes == min(a.episodes, b.episodes)
 
-    # Bisection costs many orbits a point: three are enough.
-    monkeypatch.setattr(shooting_problem, "graze", fail)
-    bisected = grazing_points(steps[:3])
-    assert len(bisected) == 3
-    for point, same in zip(touching[:3], bisected, strict=True):
-        assert point.energy == pytest.approx(same.energy, rel=1e-9)
+
+@pytest.mark.parametrize("nudge", [0.0, 1e-9, -1e-9])
+def test_a_crossing_at_a_regular_point_is_found(nudge):
+    """A regular point on a special one, or within rounding of it, hides neither: it is found once."""
+    branch = follow(kerschen_system(), IN_PHASE, 1e-3, energy=[0.0, 500.0])
+    problem = branch.problem
+    points = branch.points
+    for before, left, right in zip(points, points[1:], points[2:], strict=False):
+        special = [p for p in locate(problem, left, right, before=before) if p.kind == "symmetry-breaking"]
+        if special:
+            break
+    (known,) = special
+
+    segment = Segment(problem, "relative", left, right)
+    on_it = replace(segment.at(known.step + nudge * segment.length), kind="regular", step=known.step)
+    first = locate(problem, left, on_it, before=before)
+    second = locate(problem, on_it, replace(right, step=segment.length - known.step), before=left)
+    (found,) = [p for p in [*first, *second] if p.kind == "symmetry-breaking"]
+    assert found.energy == pytest.approx(known.energy, rel=1e-8)

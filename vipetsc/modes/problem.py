@@ -74,16 +74,13 @@ S = TypeVar("S", bound=Solution)
 class SpecialKind(Generic[S]):
     """A kind of special point: where ``test`` changes sign, by more than a ``floor`` on both sides.
 
-    ``seek`` (frame, guess, left, right) solves equations for the point's unknowns and raises NoMotionError where they
-    have no solution; for a kind without such equations the sign change is bracketed. ``accept`` says whether a point
-    that was found is of the kind, where the test alone does not tell. ``finish`` (point, left, right) adds the
-    quantities that only such points have.
+    ``accept`` says whether a point that was found is of the kind, where the test alone does not tell. ``finish``
+    (point, left, right) adds the quantities that only such points have.
     """
 
     name: str
     test: Callable[[S], float]
     floor: float = 0.0
-    seek: "Callable[[Frame[S], np.ndarray, S, S], np.ndarray] | None" = None
     accept: Callable[[S], bool] | None = None
     finish: Callable[[S, S, S], S] | None = None
 

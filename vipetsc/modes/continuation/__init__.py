@@ -11,7 +11,7 @@ each half-trace c = (mu + 1/mu)/2 of the Floquet multipliers mu, of the number o
 step, and of the tangent's direction, in the step's chart and in that named ``relative``.
 
 ``segment`` is the branch between two neighbouring points, on which ``special`` locates special points. They are zeros
-of test functions, which ``bracketed_root`` finds: of dE along the tangent at energy folds, of dT at frequency folds, of
+of test functions, by Brent's method: of dE along the tangent at energy folds, of dT at frequency folds, of
 what half-traces show elsewhere. ``switching`` finds the first point of a branch that crosses at a special point.
 """
 

@@ -13,8 +13,8 @@ from functools import cache, partial
 from typing import Generic, NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
-from vipetsc.modes.continuation.bracketed_root import bracketed_root
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 
 # A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc. The
@@ -118,11 +118,14 @@ class Segment(Generic[S]):
         """The points where the kind's test vanishes."""
         a = kind.test(self.left)
         b = kind.test(self.right)
-        # A value within the floor of zero has no sign to go by.
-        if min(abs(a), abs(b)) <= kind.floor:
+        # A value within the floor of zero has no sign to go by. Where a point of the branch is that near to a special
+        # one, the points on either side of it tell: it is found with the second of these.
+        if abs(b) <= kind.floor:
             return []
+        if abs(a) <= kind.floor:
+            return self._zero_beside_left(kind, before)
         if a * b < 0:
-            return [self.root(kind, before)]
+            return [self.root(kind)]
         # The first point of a branch has no step, and neither have points of files of earlier versions.
         if before is None or not self.left.step:
             return []
@@ -136,17 +139,32 @@ class Segment(Generic[S]):
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
-    def root(self, kind: SpecialKind[S], before: S | None = None, halvings: int = HALVINGS) -> S:
+    def _zero_beside_left(self, kind: SpecialKind[S], before: S | None) -> list[S]:
+        """The zero next to the left point, whose value is within the floor, if those on its two sides differ in sign.
+
+        It lies in this segment or in the one from the point ``before``, as the left point's own sign says.
+        """
+        if before is None:
+            return []
+        value_before = kind.test(before)
+        right = kind.test(self.right)
+        if abs(value_before) <= kind.floor or value_before * right > 0:
+            return []
+        if kind.test(self.left) * right <= 0:
+            return [self.root(kind)]
+        point = self.between(before, self.left).root(kind)
+        return [replace(point, index=self.right.index, step=0.0)]
+
+    def root(self, kind: SpecialKind[S], halvings: int = HALVINGS) -> S:
         """The point where the kind's test, of two signs at the ends, vanishes.
 
-        The point ``before`` the left one gives a better first estimate. Where Newton's method fails, the search is
-        repeated in the half of the segment that has the zero. Raises NoMotionError if it fails after ``halvings``
-        halvings as well.
+        Where Newton's method fails, the search is repeated in the half of the segment that has the zero. Raises
+        NoMotionError if it fails after ``halvings`` halvings as well.
         """
         # So that the command line can report what a run is doing (``cli.messages``).
         sys.audit("vipetsc.landing", kind.name)
         try:
-            point = self._find(kind, before, seek=halvings > 0)
+            point = self._find(kind)
             if kind.finish is not None:
                 point = kind.finish(point, self.left, self.right)
             return replace(point, kind=kind.name, step=self.begin + point.step)
@@ -160,29 +178,12 @@ class Segment(Generic[S]):
             return first.root(kind, halvings=halvings - 1)
         return second.root(kind, halvings=halvings - 1)
 
-    def _find(self, kind: SpecialKind[S], before: S | None, seek: bool) -> S:
-        """The point where a test vanishes, by the kind's own equations if it has some and ``seek``, or bracketed."""
+    def _find(self, kind: SpecialKind[S]) -> S:
+        """The point where a test of two signs at the ends vanishes, by Brent's method."""
         # The root is one of the arclengths at which a value was asked for: its point is not computed twice.
         at = cache(self.at)
-        if seek and kind.seek is not None:
-            xi = kind.seek(self.frame, self._guess(0.5 * self.length), self.left, self.right)
-            arclength = float(self.frame.tangent @ (xi - self.frame.xi))
-            if not 0 < arclength < self.length:
-                raise NoMotionError("the touch lies outside the step")
-        else:
-            value = partial(self._value, kind.test, at)
-            arclength = bracketed_root(value, 0.0, self.length, EXACT * self.length, self._value_before(kind, before))
-        return at(arclength)
-
-    def _value_before(self, kind: SpecialKind[S], before: S | None) -> dict[float, float]:
-        """The kind's test at the arclength of the point ``before`` the left one, if there is one."""
-        if before is None:
-            return {}
-        arclength = float(self.frame.tangent @ (self.frame.encode(before) - self.frame.xi))
-        # Where the branch turns sharply it does not lie before the left one in this direction.
-        if arclength >= 0:
-            return {}
-        return {arclength: kind.test(before)}
+        value = partial(self._value, kind.test, at)
+        return at(float(brentq(value, 0.0, self.length, xtol=EXACT * self.length)))
 
     def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
         """The value of a test at an arclength; at the ends it is that of their points, which need no correction."""

@@ -9,10 +9,9 @@ from vipetsc.modes.grazing import grazing_contacts
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, Frame, SpecialKind
+from vipetsc.modes.problem import ContinuationError, SpecialKind
 from vipetsc.modes.shooting.charts import CHARTS, DenseChart, Relative
 from vipetsc.modes.shooting.flow import Arc, Flow
-from vipetsc.modes.shooting.graze import Touch, graze
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.orbit import resonance
 from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
@@ -191,17 +190,7 @@ class Shooting(ShootingEquations[Arc]):
             return -1.0
 
         if left.episodes != right.episodes:
-            yield SpecialKind("grazing", is_like_right, seek=self.seek_touch, finish=without_touch)
-
-    def seek_touch(self, frame: Frame[Point], guess: np.ndarray, left: Point, right: Point) -> np.ndarray:
-        """Unknowns (n + 1,) of the orbit near ``guess`` (n + 1,) in which one contact grazes.
-
-        The contact is closed (or open, if it is pressed at rest) in only one of the orbits ``left`` and ``right``.
-        """
-        assert isinstance(frame, DenseFrame)
-        touching = max(left, right, key=lambda p: p.episodes)
-        touch = Touch.nearest(self.arc(touching.x, touching.period), self.map)
-        return graze(self, frame.chart, guess, touch)
+            yield SpecialKind("grazing", is_like_right, finish=without_touch)
 
     def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
         """A fold of the energy with the resonance whose tongue it begins or ends."""
