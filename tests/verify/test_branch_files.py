@@ -404,8 +404,8 @@ def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatc
     def kill(*_):
         raise KeyboardInterrupt
 
-    # Jumps are looked for after the last point, before the branch is written as a whole.
-    monkeypatch.setattr("vipetsc.modes.branches.orbits.jumps", kill)
+    # Orbits are sampled after the last point, before the branch is written as a whole.
+    monkeypatch.setattr("vipetsc.modes.branches.orbits.sampled", kill)
     with pytest.raises(KeyboardInterrupt):
         follow(parts, saves_all=True, **nnm)
     monkeypatch.undo()

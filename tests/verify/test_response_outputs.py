@@ -12,13 +12,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import vipetsc
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import assert_same_bits, datasets, run_of
 from tests.rigs import OUTPUT, TWO_MASSES, followed, rate_of
 from tests.steady_states import motion_at, nfrc_case
+from tests.verify.test_smooth_springs import DUFFING
+from vipetsc.case import Case
 from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.io.export import write_curves
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import OUTPUTS
@@ -196,3 +199,22 @@ def test_a_point_outside_is_refused():
     output = {"points": [{"name": "tip", "cell": 3}]}
     with pytest.raises(CaseError, match="the lattice has the cells 1 to 2"):
         NfrcCase.from_table(TWO_MASSES | {"output": output})
+
+
+def test_harmonics_are_those_of_a_run_a_quarter_of_a_period_earlier(tmp_path):
+    """With (-i)^k, as the file's attribute says, a curve's harmonics are those of a run, whose drive is a sine."""
+    table = DUFFING | {"nfrc": DUFFING["nfrc"] | {"range": [0.5, 0.52], "points": 1}}
+    (curve,) = follow_all(NfrcCase.from_table(table), tmp_path, MPI.COMM_SELF)
+    with open_netcdf(tmp_path / f"branch-{curve.name}.h5", "branch", ("phase",)) as file:
+        assert "(-i)^k" in file.attrs["phase"]
+        z = file["spring_harmonics"].values[0, 0] + 1j * file["spring_harmonics_imaginary"].values[0, 0]
+        omega = float(file["frequency"].values[0])
+
+    drive = DUFFING["drive"] | {"frequency": omega}
+    periods = 2 * np.pi / omega
+    time = {"end": 60 * periods, "sample_interval": periods / 64}
+    run = run_of(Case.from_table({k: v for k, v in DUFFING.items() if k != "nfrc"} | {"drive": drive, "time": time}))
+    u = run["displacement"].values[-64:, 0, 0]
+    phase = omega * run["time"].values[-64:]
+    first = 2 * np.mean(u * np.exp(-1j * phase))
+    assert first == pytest.approx(-1j * z[1], rel=1e-2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.growth import Listener
-from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.problem import FlowError
 from vipetsc.parallel import StopRequest
 
@@ -84,29 +82,19 @@ def test_a_branch_that_goes_on_has_the_orbits_that_it_lacked(tmp_path):
 
 @pytest.fixture
 def marked(monkeypatch):
-    """Each step has a special point that is not located, and the step from point 1 to point 2 is a jump."""
+    """Each step has a special point that is not located."""
 
     def locate(problem, left, right, missed, **options):
         missed.append(f"a special point after {left.describe()}")
         return []
 
-    def jumps(self, problem, points):
-        for left, right in pairwise(points):
-            if {left.index, right.index} == {1, 2}:
-                yield f"jump between {left.describe()} and {right.describe()}"
-
     monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
-    monkeypatch.setattr(ShootingMethod, "jumps", jumps)
 
 
 def test_findings_of_a_stopped_branch_have_the_order_of_one_that_was_not(tmp_path, marked):
-    """Jumps found before a stop stand behind what is found after it, as without the stop."""
     whole = follow(tmp_path / "whole")
-    assert "jump" in whole.findings[-1]
-
     stopped_at(tmp_path / "parts", 4)
     follow(tmp_path / "parts")
-
     assert file_of(tmp_path / "parts").findings == whole.findings
 
 

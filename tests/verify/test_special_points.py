@@ -15,6 +15,7 @@ from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.continuation.special import locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
+from vipetsc.modes.problem import NoMotionError
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import repetitions
@@ -117,7 +118,7 @@ def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, m
     def fails_off_the_middle(self, arclength):
         # Segments longer than 0.9 of the step fail off their middle; halves of the step do not.
         if self.length > 0.9 * b.step and arclength != 0.5 * self.length:
-            raise ArithmeticError("no luck")
+            raise NoMotionError("no luck")
         return at(self, arclength)
 
     monkeypatch.setattr(Segment, "at", fails_off_the_middle)
@@ -135,7 +136,7 @@ def test_a_root_that_is_never_found_is_reported(short_branch, monkeypatch):
     missed = []
 
     def fails(self, arclength):
-        raise ArithmeticError("never")
+        raise NoMotionError("never")
 
     monkeypatch.setattr(Segment, "at", fails)
     assert not locate(short_branch.problem, a, b, missed=missed)

@@ -110,12 +110,11 @@ class Frame(Protocol[S]):
 class PeriodicProblem(Protocol[S]):
     """Equations whose solutions form branches.
 
-    ``has_half_traces`` says whether points have the half-traces of their multipliers, ``guards`` which changes from
-    point to point are guarded (``continuation.guards``), and ``tolerance`` is that of Newton's method.
+    ``guards`` says which changes from point to point are guarded (``continuation.guards``), and ``tolerance`` is that
+    of Newton's method.
     """
 
     tolerance: float
-    has_half_traces: bool
     guards: frozenset[str]
 
     def frame(self, point: S, chart: str = "auto") -> Frame[S]:

@@ -118,10 +118,8 @@ class ConservativeMotions:
     as the relative ``nnm.truncation`` needs.
     """
 
-    # ``PeriodicProblem`` asks for these two. Floquet multipliers, of which points of other problems have half-traces,
-    # are not computed here. What is guarded from point to point, besides the changes that all problems have in common,
-    # is the truncation: at the highest order the harmonics left out may become too large.
-    has_half_traces = False
+    # What is guarded from point to point, besides the changes that all problems have in common, is the truncation: at
+    # the highest order the harmonics left out may become too large.
     guards = frozenset({"truncation"})
 
     def __init__(self, compliance: Compliance, forces: SiteForces, control: NnmTable) -> None:

@@ -41,7 +41,7 @@ class Branch(Generic[S]):
     ``ending`` says in a sentence how the branch has ended, or that it has failed ("failed: ...") or was stopped
     ("stopped ..."). ``complete`` says that there is nothing left to follow: the branch has left its range or met
     itself, on both sides of its start if both are asked for. A branch that failed, was stopped or has used up its
-    points is not complete. ``findings`` are further sentences: jumps, retracing, return to the linear mode, special
+    points is not complete. ``findings`` are further sentences: retracing, return to the linear mode, special
     points that are not located. They are the attribute ``warnings`` of the file.
     """
 

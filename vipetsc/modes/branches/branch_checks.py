@@ -1,35 +1,16 @@
-"""Checks of a branch: jumps, retracing and the return to the linear mode; comparison of its orbits by several flows."""
-
-import itertools
-from collections.abc import Iterator
-from contextlib import suppress
+"""Checks of a branch: retracing and the return to the linear mode; comparison of its orbits by several flows."""
 
 import numpy as np
 
-from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.case.nnm_table import Guards
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.guards import contact_changes, half_trace_change
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, FlowError
-from vipetsc.modes.shooting.charts import Relative
 from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.shooting import Shooting
 
 # Points between two checks whether a branch has passed on to another one; each check integrates fifteen arcs.
 REPETITIONS_EVERY = 50
-# A step is followed again if a half-trace or the direction changes by more than this many default bounds. Where the
-# paper's out-of-phase branches are followed without these guards (100 steps), 3 and 4 steps exceed the bounds and one
-# each exceeds twice the bounds; none of them has jumped.
-SUSPICIOUS = 2
-# A step is followed again in this many steps at least, and MOST_POINTS at most. The guarded branch has met the right
-# point if it passes it at a distance of MET times the step. Of eight steps in the tests six are no jumps: they pass it
-# at 0.0012 of the step at most, after 6 to 60 points. Two jumps miss it by twice the step. With half and twice FINER
-# the same is found.
-MET = 0.02
-MOST_POINTS = 400
-FINER = 4
 # A branch without contact whose frequency is within this of a linear mode's has returned to it.
 LINEAR = 1e-9
 # A branch retraces itself at a point whose distance from an earlier step is below this fraction of its own step, with
@@ -45,76 +26,6 @@ FEWEST = 10
 # orbit by OFF: from the orbit itself it would not move if the residual of that flow were below the tolerance there.
 COMPARED_EVERY = 4
 OFF = 1e-6
-
-
-def suspects(problem: Shooting, points: list[Point]) -> Iterator[tuple[int, str]]:
-    """Steps of a branch that may have jumped: (place of the left point, which change is large, and how large).
-
-    More contacts change than the default guard allows, or a half-trace or the direction changes by more than
-    ``SUSPICIOUS`` times its default bound.
-    """
-    guards = Guards()
-    for i, (a, b) in enumerate(itertools.pairwise(points)):
-        change = half_trace_change(a, b)
-        turn = problem.turn(a, b)
-        if contact_changes(problem, a, b, guards.contacts) > guards.contacts:
-            yield i, f"contacts {a.episodes} -> {b.episodes}"
-        elif change > SUSPICIOUS * guards.half_trace:
-            yield i, f"asinh of a half-trace changes by {change:.2g}"
-        elif turn > SUSPICIOUS * guards.turn_relative:
-            yield i, f"the branch turns by {turn:.2g} rad"
-
-
-def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> bool:
-    """Whether the branch from ``left`` misses the point ``right`` when it is followed with guards.
-
-    It is followed from the left point until it passes the right one, is farther from the left point than three times
-    the step, or cannot go on.
-    """
-    chart = Relative(problem.system, left.x, left.period)
-    origin = chart.encode(left.x, left.period)
-    goal = chart.encode(right.x, right.period)
-    reach = float(np.linalg.norm(goal - origin))
-    anywhere = [0.0, np.inf]
-    guarded = control.model_copy(
-        update={
-            "first_step": min(control.first_step, reach / FINER),
-            "largest_step": reach / FINER,
-            "points": MOST_POINTS,
-            "chart": "relative",
-            "guards": Guards(),
-            "energy": anywhere,
-            "frequency": anywhere,
-        }
-    )
-
-    # A guarded branch that cannot go on has not met the right point: the step is a jump, too.
-    last = origin
-    with suppress(ContinuationError, FlowError):
-        for point in Continuation(problem, left, guarded):
-            here = chart.encode(point.x, point.period)
-            position, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
-            # The branch passes the right point on this step. A smooth arc that turns by no more than the guard allows
-            # deviates from its chord by less than its length times that angle.
-            if 0 < position < 1 and missed <= guarded.guards.turn * length:
-                return missed > MET * reach
-            if np.linalg.norm(here - origin) > 3 * reach:
-                break
-            last = here
-    return True
-
-
-def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
-    """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
-    for i, why in suspects(problem, points):
-        a = points[i]
-        b = points[i + 1]
-        if is_jump(problem, a, b, control):
-            yield (
-                f"jump between points {a.index} and {b.index} (E = {a.energy:.6g} -> {b.energy:.6g} J, "
-                f"f = {a.frequency:.6g} -> {b.frequency:.6g} Hz): {why}; both satisfy the equations "
-                f"(residuals {a.residual:.0e}, {b.residual:.0e})"
-            )
 
 
 def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -93,12 +93,6 @@ class Growth:
             self.write(branch)
             last = branch.regular()[-1]
             raise StoppedError(f"stopped on request after point {last.index}; continue with --resume") from None
-        finally:
-            # Jumps are pairs of neighbouring points so different that the continuation may have changed to another
-            # branch. They are recorded also if the branch fails or is stopped. When it is resumed they are found again,
-            # and stay behind the other findings, as in a branch that was not interrupted.
-            jumps = list(self.method.jumps(problem, branch.regular()))
-            branch.findings = [finding for finding in branch.findings if finding not in jumps] + jumps
         branch.ending = why_ended or continuation.ending
         branch.complete = why_ended is not None or continuation.finished
 

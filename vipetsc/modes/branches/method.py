@@ -105,10 +105,6 @@ class Method(ABC, Generic[S]):
         """A check of every new point: a sentence ends the branch, None lets it go on."""
         return lambda point: None
 
-    def jumps(self, problem: PeriodicProblem[S], points: list[S]) -> Iterator[str]:
-        """Sentences about jumps: neighbouring points of which one may lie on another arc or another branch."""
-        return iter(())
-
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:
         """Add the variables of a whole branch's file that are not of its points."""
 

@@ -13,7 +13,7 @@ from vipetsc.case import NnmCase
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
+from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, sampled
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
@@ -180,11 +180,6 @@ class ShootingMethod(NnmMethod):
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""
         assert isinstance(problem, Shooting)
         return BranchMonitor(problem, self.options.guards).check
-
-    def jumps(self, problem: PeriodicProblem[Point], points: list[Point]) -> Iterator[str]:
-        """Sentences about jumps between points."""
-        assert isinstance(problem, Shooting)
-        return jumps(points, problem, self.options)
 
     def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the orbits of a branch, and the comparison with other flows."""

@@ -13,6 +13,11 @@ from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_fol
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS, Stored
 
+PHASE = (
+    "the drive is A cos(Om t), and harmonics are those of exp(i k Om t); a run's drive is A sin(Om t), with which the "
+    "harmonic k is to be multiplied by (-i)^k"
+)
+
 
 def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
     """The outputs that the states of a curve have."""
@@ -74,8 +79,8 @@ class ResponseLayout:
         return data
 
     def attributes(self, branch: Branch[Response]) -> dict[str, Any]:
-        """Attributes of a curve's file that follow from its states: none."""
-        return {}
+        """What the phases of harmonics refer to, which is not what they refer to in runs."""
+        return {"phase": PHASE}
 
     def table(self, branch: Branch[Response]) -> Table:
         """The table of a curve for CSV, without harmonics."""

@@ -4,6 +4,9 @@ from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 
+# Two special points of a kind are one within this fraction of a segment: each is found to 1e-10 of it.
+SAME = 1e-9
+
 
 def locate(
     problem: PeriodicProblem[S],
@@ -33,11 +36,18 @@ def locate(
         if kind.name == "branch-point" and any(p.kind == "fold-energy" for p in points):
             continue
         try:
-            points += segment.roots(kind, before)
+            found = segment.roots(kind, before)
+            # Contacts that begin at one point, by a symmetry, make one special point.
+            points += [p for p in found if not _is_among(p, kind.name, points, segment.length)]
         except NoMotionError as error:
             if missed is not None:
                 missed.append(f"a {kind.name} after {left.describe()} is not located: {error}")
     return sorted(points, key=lambda p: p.step)
+
+
+def _is_among(point: S, kind: str, others: list[S], length: float) -> bool:
+    """Whether one of the ``others`` is the same point of that kind, on a segment of that ``length``."""
+    return any(other.kind == kind and abs(other.step - point.step) <= SAME * length for other in others)
 
 
 def at_energy(

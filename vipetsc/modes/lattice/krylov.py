@@ -165,7 +165,6 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
     """Periodic orbits of the lattice ``chain`` and its ``system``, on all ranks of ``comm`` together."""
 
     newton: KrylovNewton
-    has_half_traces = False
     guards = frozenset({"turn_relative"})
 
     def __init__(

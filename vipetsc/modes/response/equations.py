@@ -132,7 +132,6 @@ class SteadyEquations(ABC):
     """
 
     # Hill's determinant tells the stability, and ``TurningSteps`` judges the turn and the correction of a step alone.
-    has_half_traces = False
     guards: frozenset[str] = frozenset()
 
     def __init__(

@@ -134,7 +134,7 @@ def _branches(motions: ConservativeMotions, states: SteadyStates) -> Iterator[li
         # A mode in which no contact and no nonlinear spring moves stays linear at any size.
         if not low / NEAR < omega < high * NEAR or size == 0:
             continue
-        bounds = [min(low, omega) * (1 - SLACK) / (2 * np.pi), max(high, omega) * (1 + SLACK) / (2 * np.pi)]
+        bounds = [min(low, omega) * (1 - SLACK), max(high, omega) * (1 + SLACK)]
         options = motions.control.model_copy(update={"frequency": bounds})
         points: list[Point] = []
         # A branch that cannot go on has been followed as far as it goes.

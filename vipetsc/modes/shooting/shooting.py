@@ -67,7 +67,6 @@ class Shooting(ShootingEquations[Arc]):
     ``rounding``, or after ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
     """
 
-    has_half_traces = True
     guards = frozenset({"half_trace", "turn_relative"})
 
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
@@ -183,20 +182,23 @@ class Shooting(ShootingEquations[Arc]):
                 test = HalfTraceAbove(i, level)
                 yield SpecialKind(name, test, floor=LEAST_CROSSING, accept=test.is_real)
 
-        def is_like_right(point: Point) -> float:
-            """1 if a point has as many contact episodes as the right one, else -1: a step at the touch."""
-            if point.episodes == right.episodes:
-                return 1.0
-            return -1.0
-
-        if left.episodes != right.episodes:
-            yield SpecialKind("grazing", is_like_right, finish=without_touch)
+        # Several contacts may begin within one step, one after the other or, by a symmetry, at one point.
+        fewest, most = sorted((left.episodes, right.episodes))
+        for count in range(fewest + 1, most + 1):
+            yield touch_of(count)
 
     def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
         """A fold of the energy with the resonance whose tongue it begins or ends."""
         return replace(fold, resonance=resonance(self, fold))
 
 
-def without_touch(grazing: Point, left: Point, right: Point) -> Point:
-    """A grazing orbit with the number of episodes of the neighbour that has fewer: a mere touch is no episode."""
-    return replace(grazing, episodes=min(left.episodes, right.episodes))
+def touch_of(count: int) -> SpecialKind[Point]:
+    """Points at which the number of contact episodes becomes ``count``, or falls below it.
+
+    A mere touch is no episode: such a point has one fewer.
+    """
+
+    def above(point: Point) -> float:
+        return 1.0 if point.episodes >= count else -1.0
+
+    return SpecialKind("grazing", above, finish=lambda point, left, right: replace(point, episodes=count - 1))

@@ -156,7 +156,6 @@ class ShootingEquations(ABC, Generic[A]):
     ValueError if the map needs an odd system and the system is not.
     """
 
-    has_half_traces: bool
     guards: frozenset[str]
     limits: ArcLimits
     newton: BorderedNewton[Any]
