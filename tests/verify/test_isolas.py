@@ -14,7 +14,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.special import ellipk
 
 import vipetsc
 from tests.rigs import period_map, rate_of
@@ -25,12 +24,9 @@ from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure
-from vipetsc.modes.response import free_motions, isolated
-from vipetsc.modes.response.free_motions import resonance, states_near_free_motions
-from vipetsc.modes.response.isolated import over_amplitude, places_of
+from vipetsc.modes.response import isolated
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.response.swept import motions
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -180,14 +176,13 @@ DUFFING: dict[str, Any] = CUBIC_OSCILLATOR | {
 
 
 def duffing(**nfrc: Any) -> NfrcCase:
-    """The case of the cubic oscillator's curve, with isolated ones looked for by sweeps; ``nfrc`` updates [nfrc]."""
+    """The case of the cubic oscillator's curve, with isolated ones sought at four places; ``nfrc`` updates [nfrc]."""
     options = {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.3], "harmonics": 9}
-    sweeps = {"isolas": 4, "isola_search": ["sweeps"], "isola_periods": 30}
-    return NfrcCase.from_table(DUFFING | {"nfrc": options | sweeps | nfrc})
+    return NfrcCase.from_table(DUFFING | {"nfrc": options | {"isolas": 4} | nfrc})
 
 
-def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(tmp_path):
-    """A sweep down finds the small motion at 1.5 rad/s, where the curve from below has the large one."""
+def test_other_amplitudes_find_the_states_that_the_curve_from_below_does_not_meet(tmp_path):
+    """They find the small motion at 1.6 rad/s, where the curve from below has the large one."""
     main, isola, back = follow_all(duffing(), tmp_path, MPI.COMM_SELF)
     assert (isola.name, back.name) == (f"{main.name}-isola-1", f"{main.name}-isola-1-back")
     first = isola.points[0]
@@ -200,40 +195,10 @@ def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(t
 
     # The first harmonic a of the cubic oscillator satisfies |1 - Om^2 + 3/4 a^2 + i c Om| a = F, up to a small
     # correction by the third harmonic.
-    outputs = first.measured.outputs
-    a = np.hypot(outputs["spring_harmonics"][0, 1], outputs["spring_harmonics_imaginary"][0, 1])
-    stiffness = 1 - 1.5**2 + 0.75 * a**2
-    assert a == pytest.approx(0.3 / abs(stiffness + 0.15j), rel=1e-3)
-
-
-def test_each_free_motion_leads_to_the_states_above_and_below_its_frequency():
-    """The free motion a^2 = 4/3 (Om^2 - 1) at 1.5 rad/s leads to the three steady states of the cubic oscillator."""
-    states = SteadyStates(duffing(), 1.0, 0.3)
-    p = 1.5 / states.parameter.scale
-    (candidates,) = states_near_free_motions(states, np.array([p]))
-    sizes = sorted(np.abs(states.balance.unpack(xi[:-1] * states.clearance)[0, 1]) for xi in candidates)
-    # The first harmonic alone satisfies (a (1 - Om^2 + 3/4 a^2))^2 + (c Om a)^2 = F^2, a cubic equation in a^2.
-    polynomial = [0.5625, 1.5 * (1 - 1.5**2), (1 - 1.5**2) ** 2 + 0.15**2, -(0.3**2)]
-    expected = np.sqrt(np.sort(np.roots(polynomial).real))
-    np.testing.assert_allclose(sizes, expected, rtol=0.02)
-
-
-def test_a_free_motion_has_the_frequency_that_is_asked_for():
-    """The free motion at 1.5 rad/s has that frequency and the amplitude A of x'' + x + x^3 = 0 with that period.
-
-    The period is 4 K(m)/sqrt(1 + A^2) with m = A^2/(2 (1 + A^2)).
-    """
-    states = SteadyStates(duffing(), 1.0, 0.3)
-    free = free_motions._conservative(states)
-    (points,) = free_motions._branches(free, states)
-    (motion,) = free_motions._at(free, points, 1.5)
-    assert 2 * np.pi / motion.period == pytest.approx(1.5, rel=1e-12)
-
-    # The elongation of the first spring is the mass's displacement, which is the amplitude at phase 0.
-    elongation = free.balance(motion.order).unpack(motion.x)[0]
-    squared = abs(elongation.real.sum()) ** 2
-    period = 4 * ellipk(squared / (2 * (1 + squared))) / np.sqrt(1 + squared)
-    assert 2 * np.pi / period == pytest.approx(1.5, rel=1e-4)
+    ends = [curve.points[-1].measured.outputs for curve in (isola, back)]
+    a = min(np.hypot(end["spring_harmonics"][0, 1], end["spring_harmonics_imaginary"][0, 1]) for end in ends)
+    stiffness = 1 - 1.6**2 + 0.75 * a**2
+    assert a == pytest.approx(0.3 / abs(stiffness + 0.16j), rel=1e-3)
 
 
 def test_other_amplitudes_lead_from_a_state_to_the_other_two():
@@ -243,78 +208,16 @@ def test_other_amplitudes_lead_from_a_state_to_the_other_two():
     """
     states = SteadyStates(duffing(), 1.0, 0.3)
     p = 1.5 / states.parameter.scale
-    (three,) = states_near_free_motions(states, np.array([p]))
-    begin, *others = sorted(three, key=np.linalg.norm)
+    # The first harmonic alone satisfies (a (1 - Om^2 + 3/4 a^2))^2 + (c Om a)^2 = F^2, a cubic equation in a^2.
+    polynomial = [0.5625, 1.5 * (1 - 1.5**2), (1 - 1.5**2) ** 2 + 0.15**2, -(0.3**2)]
+    three = []
+    for a in np.sqrt(np.sort(np.roots(polynomial).real)):
+        # The two springs, to the left and to the right wall, have opposite elongations.
+        first = 0.3 / (1 - 1.5**2 + 0.75 * a**2 + 0.15j)
+        guess = np.outer([first, -first], np.arange(10) == 1)
+        three.append(states.at(np.append(states.balance.pack(guess) / states.clearance, p), p))
+    begin, *others = three
     states_found = list(isolated._states_over_amplitude(states, begin))
     for other in others:
         assert isolated._is_among(other, states_found)
     assert not isolated._is_among(begin, states_found)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_at_resonance_the_force_makes_up_for_the_loss(sign):
-    """At resonance the force amplitude is F = c Om a with the amplitude a of the free motion.
-
-    The force is a quarter of a period ahead of the displacement.
-    """
-    states = SteadyStates(duffing(), 1.0, 0.3)
-    line = over_amplitude(states, 1.5 / states.parameter.scale)
-    a = np.sqrt(4 / 3 * (1.5**2 - 1))
-    free = np.zeros((2, 10))
-    # The two springs, to the left and to the right wall, have opposite elongations.
-    free[:, 1] = [sign * a, -sign * a]
-    xi = resonance(line, free)
-    _, amplitude = line.drive(xi[-1])
-    first = line.balance.unpack(xi[:-1] * line.clearance)[0, 1]
-    assert amplitude == pytest.approx(0.1 * 1.5 * abs(first), rel=0.02)
-    assert abs(first) == pytest.approx(a, rel=0.02)
-    # The elongation of the first spring is the mass's displacement, which follows the force.
-    assert np.degrees(np.angle(first)) == pytest.approx(-90, abs=2)
-
-
-def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
-    """A search by breathers finds the same isolated curve, with the same folds."""
-    _, (main, isola) = curves
-    put_main(curves, tmp_path)
-    other = follow_all(absorber(isola_search=["breathers"]), tmp_path, MPI.COMM_SELF, resume=True)
-    assert [(curve.name, curve.ending) for curve in other] == [(curve.name, curve.ending) for curve in (main, isola)]
-    folds = [
-        [point.measured.frequency for point in curve.points if point.kind == "fold"] for curve in (isola, other[1])
-    ]
-    np.testing.assert_allclose(np.sort(folds[0]), np.sort(folds[1]), rtol=1e-7)
-
-
-@pytest.mark.parametrize("periods", [10, 40])
-def test_slow_sweeps_pass_near_steady_states(periods):
-    """The motion in a sweep of ``periods`` between two places differs from a steady state by less than 1.5/``periods``.
-
-    The difference is what the steady state changes while the motion settles.
-    """
-    case = duffing(isola_periods=periods, range=[0.5, 0.9])
-    states = SteadyStates(case, 1.0, 0.3)
-    places = places_of(states, 4)
-    for direction in (1, -1):
-        for p, harmonics in zip(places[::direction], motions(states, 4, direction), strict=True):
-            guess = np.append(states.balance.pack(harmonics) / states.clearance, p)
-            difference = np.linalg.norm(states.at(guess, p) - guess) / np.linalg.norm(guess)
-            assert difference < 1.5 / periods
-
-
-@pytest.mark.parametrize(
-    ("nfrc", "text"),
-    [
-        ({"infinite": True}, "are motions of a lattice that ends"),
-        ({"over": "contacts.stiffness", "range": [1.0, 2.0]}, "are looked for over the frequency"),
-    ],
-)
-def test_sweeps_need_ends_and_a_frequency(nfrc, text):
-    springs = [{"start": 1, "end": 1, "stiffness": 0.5, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 0.1}]
-    table = DUFFING | {
-        "lattice": {"cells": 4, "cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}},
-        "contacts": {"law": "bilinear", "stiffness": 1.0, "restitution": 1.0, "sites": [2], "clearance": 0.5},
-    }
-    options = {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.3], "infinite": False}
-    sweeps = {"isolas": 2, "isola_search": ["sweeps"]}
-    assert NfrcCase.from_table(table | {"nfrc": options | sweeps})
-    with pytest.raises(CaseError, match=text):
-        NfrcCase.from_table(table | {"nfrc": options | sweeps | nfrc})

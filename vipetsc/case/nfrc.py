@@ -19,7 +19,7 @@ from vipetsc.case.nfrc_ends import are_contacts_springs, check_ground, check_ope
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.varied_key import OVER_FREQUENCY, PARAMETERS, TRIED, is_key, key_problems, table_at
+from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
@@ -103,7 +103,6 @@ class NfrcCase(Case):
         problems = [
             *_check_waves(nfrc, cell),
             *check_ground(nfrc, sections["lattice"], chain, gaps_of_sites(contacts, list(chain.clearances))),
-            *_check_searches(nfrc, chain),
         ]
         return sections | {"nfrc": nfrc}, problems
 
@@ -366,21 +365,6 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
-
-
-def _check_searches(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with searches for isolated curves by motions of the whole lattice."""
-    if not nfrc.isolas or nfrc.isola_search == ["amplitudes"]:
-        return
-    remedy = ""
-    if nfrc.source == "wave" or nfrc.infinite or nfrc.open_ends:
-        remedy = "sweeps and breathers are motions of a lattice that ends; drive a mass, with nfrc.infinite = false"
-    elif nfrc.over != "frequency":
-        remedy = OVER_FREQUENCY
-    elif chain.cells * chain.cell.dofs > MOST_DOFS:
-        remedy = f"sweeps and breathers are computed for up to {MOST_DOFS} masses; omit them"
-    if remedy:
-        yield Problem("nfrc.isola_search", nfrc.isola_search, remedy)
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

@@ -10,7 +10,6 @@ from vipetsc.case.section import described
 from vipetsc.case.varied_key import is_key
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
-IsolaSearch = Literal["amplitudes", "sweeps", "breathers"]
 
 
 class NfrcTable(Section):
@@ -70,17 +69,8 @@ class NfrcTable(Section):
     isolas: int = described(
         "number of places within the range at which isolated curves (isolas) are looked for; 0: none", 0, ge=0, le=1000
     )
-    isola_search: Annotated[list[IsolaSearch], AfterValidator(once)] = described(
-        "how isolated curves are looked for: over other amplitudes, or by sweeps of the frequency up and"
-        " down in time, or near breathers, free motions without loss",
-        ["amplitudes"],
-        min_length=1,
-    )
     isola_reach: float = described(
         "factor up to which amplitudes are larger or smaller that are followed to isolated curves", 10.0, gt=1, le=1e3
-    )
-    isola_periods: int = described(
-        "periods of the drive from one place to the next of a sweep in time", 100, ge=1, le=1_000_000
     )
     special_points: Literal["stability", "all"] = described(
         "special points other than folds: where states become stable or unstable, or all where the number"

@@ -11,8 +11,6 @@ SECTIONS = ("lattice", "contacts", "disorder")  # whose keys can vary along a cu
 # that takes only whole numbers may be valid at both ends, and is refused at the third position, which gives none.
 TRIED = (0.0, 0.381966, 1.0)
 
-OVER_FREQUENCY = "sweeps and breathers are looked for over the frequency; omit them, or take curves over it"
-
 
 def is_key(over: Any) -> bool:
     """Whether ``nfrc.over`` is the path of a key."""
@@ -46,6 +44,4 @@ def key_problems(table: Table) -> list[Problem]:
         problems.append(Problem("nfrc.fixed", [], "give the amplitudes of the curves; their frequency is the drive's"))
     if key == "contacts.restitution" and "restitutions" in nfrc:
         problems.append(Problem("nfrc.restitutions", nfrc["restitutions"], f"{key} varies along the curve; omit it"))
-    if nfrc.get("isola_search", ["amplitudes"]) != ["amplitudes"]:
-        problems.append(Problem("nfrc.isola_search", nfrc["isola_search"], OVER_FREQUENCY))
     return problems

@@ -149,14 +149,7 @@ def _isola_rows(case: NfrcCase) -> Rows:
     if not options.isolas:
         return []
     places = counted(options.isolas, "place")
-    searches = []
-    if "amplitudes" in options.isola_search:
-        searches.append(f"by amplitudes up to {options.isola_reach:g} times larger or smaller")
-    if "sweeps" in options.isola_search:
-        searches.append(f"by sweeps of {options.isola_periods} periods from one place to the next")
-    if "breathers" in options.isola_search:
-        searches.append("near free motions without loss")
-    return [("isolas", f"looked for at {places}, {' and '.join(searches)}")]
+    return [("isolas", f"looked for at {places}, by amplitudes up to {options.isola_reach:g} times larger or smaller")]
 
 
 def _family_rows(case: NfrcCase) -> Rows:

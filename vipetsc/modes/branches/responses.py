@@ -19,14 +19,12 @@ from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
-from vipetsc.modes.response.free_motions import states_near_free_motions
 from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
-from vipetsc.modes.response.swept import swept_states
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
 
@@ -111,19 +109,10 @@ class ResponseMethod(Method[Response]):
         def curves_so_far() -> list[list[Response]]:
             return [branch.points, *(other.points for other in followed)]
 
-        search = self.case.nfrc.isola_search
         places = places_of(states, self.case.nfrc.isolas)
-        of_places: list[list[np.ndarray]] = [[] for _ in places]
-        for name, near in (("sweeps", swept_states), ("breathers", states_near_free_motions)):
-            if name in search:
-                assert isinstance(states, SteadyStates)  # checked in the case: the frequency varies
-                for candidates, more in zip(of_places, near(states, places), strict=True):
-                    candidates += more
-
         number = 0
-        for p, candidates in zip(places.tolist(), of_places, strict=True):
-            if "amplitudes" in search:
-                candidates += over_amplitudes(states, curves_so_far(), p)
+        for p in places.tolist():
+            candidates = over_amplitudes(states, curves_so_far(), p)
             for xi in unknown_states(states, curves_so_far, candidates):
                 number += 1
                 start = Response(xi=xi, next_step=states.options.first_step)

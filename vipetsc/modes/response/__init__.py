@@ -5,7 +5,7 @@ case what the lattice is reduced to. ``equations`` has the residual of a steady 
 a step; ``steady`` fills them in for one lattice, ``over_key`` for a lattice that changes along the curve, which
 ``keyed_case`` builds. ``steps`` says how long steps are, where a curve begins and where it ends. ``state`` is a state
 with its measures, ``outputs`` what a case asks for beyond them, ``stability_changes`` the special points at which
-perturbations begin to grow. ``isolated``, ``free_motions`` and ``swept`` look for states on isolated curves.
+perturbations begin to grow. ``isolated`` looks for states on isolated curves.
 ``modes.branches`` follows the curves of a case and writes them.
 """
 

@@ -86,8 +86,10 @@ class TurningSteps:
         bound = high
         if p < low:
             bound = low
-        # The last state is moved back to the end itself: curves over the same range end at the same parameter.
-        xi = states.at(point.xi, bound)
+        # The last state is moved back to the end itself: curves over the same range end at the same parameter. The line
+        # through both states is nearer to it than the last one, and along a fold Newton's method needs that.
+        place = (bound - before.xi[-1]) / (p - before.xi[-1])
+        xi = states.at(before.xi + place * (point.xi - before.xi), bound)
         tangent = states.frame(point).tangent_at(xi)
         last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
         return last, f"reached the end of nfrc.range, {bound * scale:g}"
