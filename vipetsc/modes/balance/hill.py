@@ -248,7 +248,7 @@ class Hill:
             parts = g.reshape(len(new), len(orders), *g.shape[1:])
             # Copies, since a view would keep the compliances of all new exponents.
             self._compliances |= {key: part.copy() for key, part in zip(new, parts, strict=True)}
-        found = [self._compliances[key] for key in keys]
+        values = [self._compliances[key] for key in keys]
 
         # Those used last are kept. Exponents of the coarse grid come again with every motion, those of refined
         # intervals and of the secant method mostly do not.
@@ -256,7 +256,7 @@ class Hill:
             self._compliances[key] = self._compliances.pop(key)
         for key in list(self._compliances)[:-MOST_KEPT]:
             del self._compliances[key]
-        return found
+        return values
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om; of the latest motion the line of ``least`` is kept."""

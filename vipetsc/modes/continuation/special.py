@@ -36,9 +36,9 @@ def locate(
         if kind.name == "branch-point" and any(p.kind == "fold-energy" for p in points):
             continue
         try:
-            found = segment.roots(kind, before)
+            roots = segment.roots(kind, before)
             # Contacts that begin at one point, by a symmetry, make one special point.
-            points += [p for p in found if not _is_among(p, kind.name, points, segment.length)]
+            points += [p for p in roots if not _is_among(p, kind.name, points, segment.length)]
         except NoMotionError as error:
             if missed is not None:
                 missed.append(f"a {kind.name} after {left.describe()} is not located: {error}")
