@@ -2,6 +2,7 @@
 
 import logging
 import os
+import pickle
 import signal
 import sys
 import time
@@ -81,7 +82,9 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     # A rank alone keeps the value as it is: a copy of a case, as messages make, would be resolved again.
     if comm.size == 1:
         return _value_or_raise(_attempt(function))
-    attempt = _attempt(function) if comm.rank == 0 else None
+    attempt = None
+    if comm.rank == 0:
+        attempt = _sendable(_attempt(function))
     wait_for_all(comm)  # before the broadcast, in which ranks would wait at full speed
     return _value_or_raise(comm.bcast(attempt))
 
@@ -90,7 +93,7 @@ def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
     attempt = _attempt(function)
     wait_for_all(comm)
-    errors = [error for error in comm.allgather(attempt.error) if error is not None]
+    errors = [error for error in comm.allgather(_sendable(attempt).error) if error is not None]
     if not errors:
         return _value_or_raise(attempt)
     # A second name: the attempt, whose traceback holds the open files of ``function``, has to outlive the error that is
@@ -107,7 +110,7 @@ def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
     attempts = {number: _attempt(jobs[number]) for number in range(comm.rank, len(jobs), comm.size)}
     if comm.size > 1:
         wait_for_all(comm)
-        for from_rank in comm.allgather(attempts):
+        for from_rank in comm.allgather({number: _sendable(attempt) for number, attempt in attempts.items()}):
             attempts |= from_rank
     return [_value_or_raise(attempts[number]) for number in range(len(jobs))]
 
@@ -132,10 +135,30 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
     """Call ``function``, and keep what it raises."""
     try:
         return _Attempt(value=function(), error=None)
+    except SystemExit as error:
+        # A user's module may leave by ``sys.exit``, on one rank perhaps: the others must not wait for it.
+        return _Attempt(value=None, error=RuntimeError(f"sys.exit({error.code!r}) was called"))
     except Exception as error:
         if _comes_of_an_end(error):
             raise EndedError from None
         return _Attempt(value=None, error=error)
+
+
+def _sendable(attempt: _Attempt) -> _Attempt:
+    """An ``attempt`` whose error other ranks can raise: where it cannot be copied, a RuntimeError with its text.
+
+    An exception whose constructor takes other arguments than it passes on cannot be made again from these.
+    """
+    error = attempt.error
+    if error is None:
+        return attempt
+    try:
+        copied = type(pickle.loads(pickle.dumps(error))) is type(error)
+    except Exception:
+        copied = False
+    if copied:
+        return attempt
+    return _Attempt(value=None, error=RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 def _comes_of_an_end(error: BaseException) -> bool:

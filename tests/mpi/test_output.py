@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from types import SimpleNamespace
 
 from mpi4py import MPI
@@ -14,9 +15,10 @@ import pytest
 from tests.conftest import assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, small_case
 from vipetsc.case import CaseError
 from vipetsc.dynamics import recorded_sizes, simulate
+from vipetsc.dynamics.observers import RunawayError
 from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
-from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, sort_over_ranks
+from vipetsc.parallel import StoppedError, StopRequest, divided, on_every_rank, on_root, sort_over_ranks
 
 COMM = MPI.COMM_WORLD
 
@@ -141,6 +143,28 @@ def test_what_one_rank_raises_all_raise():
 
     with pytest.raises(KeyError, match="only here"):
         on_every_rank(COMM, fails)
+
+
+def _runs_away() -> None:
+    raise RunawayError("it diverges", 3)
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("agree", [on_root, on_every_rank, lambda comm, work: divided(comm, [work] * comm.size)])
+@pytest.mark.parametrize(("work", "text"), [(_runs_away, "it diverges"), (lambda: sys.exit(3), "exit")])
+def test_what_cannot_be_sent_is_raised_on_all_with_its_text(agree, work, text):
+    """An error with a constructor of its own, which no message can make again, and a call of sys.exit on one rank."""
+    failing = 0
+    if agree is on_every_rank:
+        failing = COMM.size - 1
+
+    def fails() -> None:
+        if COMM.rank == failing:
+            work()
+
+    with pytest.raises(RuntimeError, match=text):
+        agree(COMM, fails)
+    assert COMM.allreduce(1) == COMM.size
 
 
 @pytest.mark.parallel([2, 3])

@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, on_two, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.failing_place import _fastest_cell
+from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.observers import Observer
 from vipetsc.dynamics.propagator import engine
 from vipetsc.dynamics.propagator.engine import Forces
@@ -160,8 +160,8 @@ def test_of_cells_that_move_equally_fast_the_first_is_named(ends, site):
     comm = MPI.COMM_WORLD
     layout = SimpleNamespace(comm=comm, dofs=1, owned=3, start=3 * comm.rank)
     engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
-    model = SimpleNamespace(chain=SimpleNamespace(sites=(5, 19), cells=20, ends=ends))
-    place = _fastest_cell(SimpleNamespace(layout=layout, engine=engine, model=model))
+    model = SimpleNamespace(chain=SimpleNamespace(sites=(5, 19), cells=20, ends=ends, cell=SimpleNamespace(springs=())))
+    place = failing_place(SimpleNamespace(layout=layout, engine=engine, model=model))
     assert place == f"cell 2, nearest {site}"
 
 

@@ -13,11 +13,12 @@ import pytest
 
 from tests.assembly import assembled_stiffness
 from tests.conftest import small_case
-from vipetsc.case import Case, Model
+from vipetsc.case import Case, CaseError, Model
 from vipetsc.contact.law import CLOSED
-from vipetsc.dynamics import run
+from vipetsc.dynamics import energies, run
 from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.memory import check_numbers
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.io.store import RunMemory
@@ -220,3 +221,45 @@ def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypat
     with pytest.raises(ValueError, match="cannot be resumed"):
         run.simulate(small_case(), RunMemory(), resume=True)
     assert len(installed) == expected
+
+
+def test_remainders_are_carried_so_that_those_of_many_cells_do_not_overflow():
+    """The sum of remainders of nearly half a unit stays below a unit: those of 2^24 cells would add up to 2^63."""
+    energy = 5.5 - 2.0**-40
+    sums = np.zeros((ENERGY_SUMS, 2), np.int64)
+    for _ in range(3):
+        add_energy(sums, energy, 1.0)
+    whole, fine = sums[1].tolist()
+    assert 0 <= fine < 2**40
+    assert whole + fine / 2**40 == pytest.approx(3 * energy, rel=1e-15)
+
+
+@pytest.mark.parametrize("ranks", [3, 2**14])
+def test_the_sum_over_ranks_does_not_depend_on_their_order_nor_number(ranks):
+    """The largest remainders of 2^14 ranks, whose sum has more than the 53 bits of a float, add up exactly."""
+    sums = np.zeros((ranks, ENERGY_SUMS, 2), np.int64)
+    rng = np.random.default_rng(2)
+    sums[:, :, 0] = rng.integers(0, 2**45, (ranks, ENERGY_SUMS))
+    sums[:, :, 1] = 2**40 - 1 - rng.integers(0, 7, (ranks, ENERGY_SUMS))
+    expected = [sum((whole << 40) + fine for whole, fine in of_rank) for of_rank in sums.swapaxes(0, 1).tolist()]
+
+    found = []
+    for order in (slice(None), slice(None, None, -1)):
+        total = np.zeros((4 * ENERGY_SUMS, 1))
+        for of_rank in sums[order]:
+            total += energies.parts(of_rank[None])
+        found.append(energies.joined(total)[:, 0])
+    # All of them on one rank, which carries whole units out of the remainders as it adds.
+    alone = np.array([[divmod(number, 2**40) for number in expected]], np.int64)
+    found.append(energies.joined(energies.parts(alone))[:, 0])
+
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+    np.testing.assert_allclose(found[0], [number / 2**40 for number in expected], rtol=3e-16)
+
+
+@pytest.mark.parametrize("scalar", [np.complex128, np.float32])
+def test_a_petsc_of_other_numbers_is_refused_before_it_runs(scalar):
+    """Compiled code reads the states of PETSc as real doubles."""
+    with pytest.raises(CaseError, match="double precision"):
+        check_numbers(small_case().model(), scalar)

@@ -1,7 +1,11 @@
 """Runs that need more memory than is available are refused before anything is allocated or written."""
 
 import resource
+import tracemalloc
+from types import SimpleNamespace
 from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
@@ -10,7 +14,11 @@ from tests.conftest import small_case
 from vipetsc.case import Case, CaseError
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics import memory, simulate
+from vipetsc.dynamics.cost import estimate
+from vipetsc.dynamics.lattice_record import create_record
+from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import memory_available, memory_needed
+from vipetsc.io.store import RunFolder
 
 HUGE = {"lattice": {"cells": 50_000_000}, "contacts": {"sites": [6], "clearance": 1e-4}}
 
@@ -104,3 +112,34 @@ def test_the_limit_of_the_process_counts(monkeypatch):
     monkeypatch.setattr(memory.resource, "getrlimit", lambda _: (limit, limit))
     # This process may have grown since then.
     assert abs(memory_available() - 2**20) < 2**24
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_a_billion_equal_linear_cells_cost_an_estimate_and_a_rank_next_to_nothing(ends):
+    """No cell is looked at one by one, neither by the estimate of the whole run nor in a rank's part of it."""
+    case = small_case(lattice={"cells": 1_000_000_000, "ends": ends}, contacts={"sites": [300]}, output={"fields": []})
+    model = case.model()
+    tracemalloc.start()
+    estimate(case, 1000)
+    create_record(model, Layout(model, SimpleNamespace(rank=0, size=1000)))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1e7
+
+
+def test_checkpoints_add_little_to_what_a_long_lattice_records(folder):
+    """Where a chunk is one sample, a state as large as a sample follows every fourth one, not each."""
+    sizes: list[int] = []
+
+    class Folder(RunFolder):
+        def save_state(self, state):
+            sizes.append(sum(array.nbytes for array in state.values()))
+            super().save_state(state)
+
+    case = small_case(lattice={"cells": 60}, contacts={"sites": []}, time={"end": 4e-3, "sample_interval": 1e-4})
+    output = Folder(folder / "run", MPI.COMM_SELF)
+    output.chunk_length = 1
+    result = simulate(case, output)
+    assert result.complete
+    recorded = 2 * 8 * 60 * 4 * result.statistics["samples"]
+    assert 0.1 * recorded < sum(sizes) < 0.5 * recorded

@@ -41,7 +41,7 @@ def begun(kind: type[Observer]) -> Observer:
     """An observer of the ``kind`` at the beginning of a run of an undamped lattice."""
     observer = kind()
     undamped = SimpleNamespace(chain=SimpleNamespace(is_damped=False))
-    observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6), model=undamped))
+    observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6, negligible=1e-6), model=undamped))
     return observer
 
 

@@ -122,6 +122,7 @@ def test_a_spring_that_tears_off_stalls_the_run():
     result = simulate(torn, RunMemory(MPI.COMM_SELF))
     assert not result.complete
     assert "the nonlinear springs of cells 2 at 0.0" in result.sentence
+    assert "its spring 4 no longer pulls back beyond" in result.sentence
 
 
 def test_elongations_are_degrees_of_freedom_behind_the_sites():

@@ -129,14 +129,10 @@ def check_scalars(scalar: Any = None) -> Check:
     """Check that PETSc computes with real doubles; ``scalar`` is the type of its numbers, by default as installed."""
     from petsc4py import PETSc
 
-    value = np.dtype(scalar or PETSc.ScalarType)
-    if value == np.float64:
-        return Check("petsc scalars", str(value))
-    remedy = (
-        "real scalars in double precision are needed: Debian's petsc-dev, conda-forge's petsc=*=real*, or"
-        " PETSc configured --with-scalar-type=real --with-precision=double"
-    )
-    return Check("petsc scalars", str(value), remedy)
+    from vipetsc.dynamics.petsc_library import refused_scalars
+
+    value = scalar or PETSc.ScalarType
+    return Check("petsc scalars", str(np.dtype(value)), refused_scalars(value))
 
 
 def loaded_libraries(name: re.Pattern[str]) -> list[str]:

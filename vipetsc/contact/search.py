@@ -168,16 +168,17 @@ def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 
     ``b`` (n,), n <= 6, are its Bernstein coefficients. A start within ``tolerance`` of zero is the root that was landed
-    on last: it is a crossing, s = 0, only if the polynomial rises from there.
+    on last: it is a crossing, s = 0, only if the polynomial rises from there. Other crossings are then those of the
+    start's value, which is zero within the tolerance.
     """
     if abs(b[0]) > tolerance:
         return first_upcrossing(b)
-    # With b_0 = 0 the polynomial is s q(s): q has the other roots, and its value at 0 has the sign of the slope there.
-    # By s B_i,n-1(s) = (i + 1)/n B_i+1,n(s) its coefficients are b_i+1 n/(i + 1).
+    # The polynomial is b_0 + s q(s): q has the other roots, and its value at 0 has the sign of the slope there. By
+    # s B_i,n-1(s) = (i + 1)/n B_i+1,n(s) its coefficients are (b_i+1 - b_0) n/(i + 1).
     n = b.size - 1
     quotient = np.empty(n)
     for i in range(n):
-        quotient[i] = b[i + 1] * n / (i + 1)
+        quotient[i] = (b[i + 1] - b[0]) * n / (i + 1)
     return first_upcrossing(quotient)
 
 

@@ -2,8 +2,9 @@
 
 Sums of floating-point numbers depend on their order in the last bits, and so on the number of ranks. Each cell's energy
 is therefore a whole number of a unit and a remainder in multiples of unit/2^40; both are summed as integers, whose sums
-are exact in any order. The unit is 2^-36 of the run's scale of energy, so that rounding a cell's energy to unit/2^40
-loses less than 2^-76 of that scale.
+are exact in any order. The unit is 2^-20 of the run's scale of energy, so that rounding a cell's energy to unit/2^40
+loses less than 2^-60 of that scale, and a sum may grow to 2^32 times the scale: that of an undamped resonance does not
+stay near the scale, which is the energy of the forced wave.
 """
 
 from dataclasses import dataclass, replace
@@ -21,12 +22,19 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, damping_powers, displacement, is_varied
 
-_FINE = 2.0**40  # multiples of the finer remainder in one unit
+_FINE_BITS = 40
+_FINE = 2.0**_FINE_BITS  # multiples of the finer remainder in one unit
+_UNIT_BITS = 20  # of the scale of energy in a unit
 # Whole multiples from which on a sum counts as a runaway energy, and at which a cell's energy is cut off.
-LARGEST = 2.0**50
-# Whole multiples at which a sum is cut off. A chunk of cells adds 2^59 at most, so that a sum of 64 bits never
-# overflows, however many cells run away at once. (Remainders are 2^39 at most, and would need 2^24 cells of a rank.)
+LARGEST = 2.0**52
+# Whole multiples at which a sum is cut off. A chunk of cells adds 2^61 at most, so that a sum of 64 bits never
+# overflows, however many cells run away at once.
 SATURATED = 2**61
+# Ranks add their sums in parts of so many bits, as floats: exact for 2^22 ranks, since floats are so below 2^53.
+_PART_BITS = 30
+# Energies in J below this fraction of the scale are too small for the balance to be judged: in the first samples of a
+# burst of 30 cycles the error may be as large as the work, with either engine. From there on it is below 1e-10 of it.
+_NEGLIGIBLE = 1e-8
 _KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(5)
 ENERGY_SUMS = 5
 
@@ -54,16 +62,21 @@ def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None
             whole, fine = _multiples(energies[i], unit)
             whole_sum += whole
             fine_sum += fine
+        # Remainders are 2^39 at most: those of a chunk cannot overflow, those of all cells of a rank could.
+        fine_sum += sums[kind, 1]
+        whole_sum += fine_sum >> _FINE_BITS
         sums[kind, 0] = min(sums[kind, 0] + whole_sum, SATURATED)
-        sums[kind, 1] += fine_sum
+        sums[kind, 1] = fine_sum - ((fine_sum >> _FINE_BITS) << _FINE_BITS)
 
 
 @kernel
 def _add_one(sums: np.ndarray, kind: int, energy: float, unit: float) -> None:
     """Add one ``energy`` as ``_add`` does."""
     whole, fine = _multiples(energy, unit)
+    fine += sums[kind, 1]
+    whole += fine >> _FINE_BITS
     sums[kind, 0] = min(sums[kind, 0] + whole, SATURATED)
-    sums[kind, 1] += fine
+    sums[kind, 1] = fine - ((fine >> _FINE_BITS) << _FINE_BITS)
 
 
 @kernel
@@ -209,11 +222,37 @@ class Energies:
         return self.work - self.dissipated - self.dissipated_by_damping - self.total
 
 
+def parts(sums: np.ndarray) -> np.ndarray:
+    """The ``sums`` (sample, energy, 2) of a rank as floats (part and energy, sample), to be added to those of others.
+
+    An energy has four parts, of ``_PART_BITS`` bits at most: the upper and lower ones of the whole multiple and of the
+    remainder.
+    """
+    pieces = []
+    for number, bits in zip(sums.T, (_PART_BITS, _FINE_BITS // 2), strict=True):
+        upper = number >> bits
+        pieces += [upper, number - (upper << bits)]
+    return np.vstack(pieces).astype(float)
+
+
+def joined(total: np.ndarray) -> np.ndarray:
+    """Energies (energy, sample) in units of sums of ``parts``; the same for any division of the cells among ranks."""
+    upper, lower, fine_upper, fine_lower = np.split(total.astype(np.int64), 4)
+    fine = (fine_upper << (_FINE_BITS // 2)) + fine_lower
+    lower += fine >> _FINE_BITS
+    fine -= (fine >> _FINE_BITS) << _FINE_BITS
+    upper += lower >> _PART_BITS
+    lower -= (lower >> _PART_BITS) << _PART_BITS
+    # Each of the three is exact: no more than these two additions round.
+    return upper * 2.0**_PART_BITS + (lower + fine / _FINE)
+
+
 class EnergyMeter:
     """Measures the energies of a distributed state.
 
     Energies are summed as integers, whose sums do not depend on their order: multiples of ``unit`` in J, a power of two
-    far below the run's energy scale, and a finer remainder. From ``largest`` in J on the sums saturate.
+    far below the run's energy scale, and a finer remainder. From ``largest`` in J on the sums saturate. With less than
+    ``negligible`` in J in the lattice the balance cannot be judged.
     """
 
     def __init__(self, model: Model, layout: Layout) -> None:
@@ -228,9 +267,9 @@ class EnergyMeter:
             duration = min(max(drive.waveform.duration for drive in model.drives), model.end)
             cells = duration * model.speed
         scale = sum(model.chain.cell.masses) * speed**2 * max(cells, 1.0)
-        # With 36 bits below the scale, an energy of 2^14 times the scale is 2^50 units, LARGEST.
-        self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
+        self.unit = float(2.0 ** (np.floor(np.log2(scale)) - _UNIT_BITS))
         self.largest = self.unit * LARGEST
+        self.negligible = _NEGLIGIBLE * scale
 
     def sums(self, y: np.ndarray) -> np.ndarray:
         """The sums (5, 2) of ``measure`` over the rank's part ``y`` of a state, whose ghosts are up to date."""
@@ -243,15 +282,12 @@ class EnergyMeter:
 
         All ranks must call it.
         """
-        whole, fine = sums.T  # (energy, sample) each
-        # MPI adds these with the works of the drives, as floats, which are exact below 2^53. Carrying whole units out
-        # of the remainders leaves all numbers below that.
-        carried = fine >> 40
-        total = np.vstack([whole + carried, fine - (carried << 40), work.T])
-        self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
+        own = parts(sums)
+        numbers = np.vstack([own, work.T])
+        self.comm.Allreduce(MPI.IN_PLACE, numbers, MPI.SUM)
 
-        whole, fine, works = np.split(total, [ENERGY_SUMS, 2 * ENERGY_SUMS])
-        kinetic, spring, contact, dissipated, damping = whole * self.unit + fine * (self.unit / _FINE)
+        total, works = np.split(numbers, [len(own)])
+        kinetic, spring, contact, dissipated, damping = self.unit * joined(total)
         energies = Energies(
             kinetic=kinetic,
             spring=spring,

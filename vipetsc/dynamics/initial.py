@@ -32,12 +32,13 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
         y = local.array
         site_dofs = meter.lattice.site_dofs
         sums = meter.sums(y)
-        relative = [relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))]
+        relative = np.array([relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))])
 
     # A site between two ranks comes from both, with the same bits.
     motion = np.zeros((len(setup.model.chain.sites), 2))
-    for numbers, rows in layout.comm.allgather((layout.contacts, relative)):
-        motion[list(numbers)] = np.reshape(rows, (-1, 2))
+    own = np.array(layout.contacts, np.int64), relative.reshape(-1, 2)
+    for numbers, rows in layout.comm.allgather(own):
+        motion[numbers] = rows
     no_work = np.zeros((1, 1))
     energy = float(meter.total(sums[None], no_work).total[0])
     setup.engine.begin(layout.motion(state.array_r), motion, energy)

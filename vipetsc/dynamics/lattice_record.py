@@ -150,6 +150,8 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
 
 def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Both ends of each of a cell's springs that is nonlinear in some cell, of dtype ``NONLINEAR``, and the laws."""
+    if chain.is_linear:
+        return np.zeros(0, NONLINEAR), np.zeros(0, SPRING_LAW)
     # One law of each spring where cells have equal ones; else one for each cell, from that before the first one on.
     table = np.stack(chain.spring_terms(layout.start - 1, layout.stop), axis=-1)
     if np.array_equal(table, np.broadcast_to(table[:1], table.shape)):

@@ -3,6 +3,7 @@
 import os
 import resource
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -12,6 +13,7 @@ import numpy as np
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
+from vipetsc.dynamics.petsc_library import refused_scalars
 from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.recorded_sizes import chunk_samples, possible_output, recorded_cells, written_together
 from vipetsc.io.store import GATHER_LIMIT
@@ -106,8 +108,14 @@ def memory_available() -> int:
     return min(free, max(limit - taken, 0))
 
 
-def check_indices(model: Model) -> None:
-    """Raise CaseError if the state has more components than this PETSc's indices count."""
+def check_numbers(model: Model, scalar: Any = PETSc.ScalarType) -> None:
+    """Raise CaseError if this PETSc does not compute with real doubles, or its indices do not count the state.
+
+    ``scalar`` is the type of its numbers.
+    """
+    refused = refused_scalars(scalar)
+    if refused:
+        raise CaseError([Problem("petsc", None, refused)])
     chain = model.chain
     most = int(np.iinfo(PETSc.IntType).max)
     size = chain.cells * (2 * chain.cell.dofs + chain.is_damped) + len(chain.sites) + 1
@@ -120,10 +128,9 @@ def check_indices(model: Model) -> None:
 def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
     """Raise CaseError on all ranks if one has less memory left than the run needs; all must call it.
 
-    The same error is raised if PETSc's indices cannot count the components of the state, or if every rank shall write
-    and h5py cannot.
+    The same error is raised if PETSc's numbers or indices do not suffice, or if every rank shall write and h5py cannot.
     """
-    check_indices(model)
+    check_numbers(model)
     output = possible_output(output, comm.size)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
     if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:

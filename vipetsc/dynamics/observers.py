@@ -22,10 +22,6 @@ from vipetsc.progress import Progress
 
 # A run whose energy balance misses by this fraction of the largest work so far is no longer a solution.
 RUNAWAY = 0.1
-# The balance is judged only while the lattice has more energy than this fraction of ``EnergyMeter.largest``, about 1e-8
-# of the run's scale of energy. With less the error may be as large as the work: in the first samples of a burst of 30
-# cycles it is, with either engine, and from this energy on below 1e-10 of the work.
-NEGLIGIBLE = 1e-12
 # Error of the energy balance over the largest work above which a run warns: so many relative tolerances, 1e-8 at the
 # default tolerance of 1e-10; never less than the second number, nor more than the third. The built-in run has an error
 # of 8e-11 with ``ts`` and of 1e-13 with the propagator. The third number acts at tolerances above 1e-6: a small lattice
@@ -109,8 +105,8 @@ class Observer:
 class Guard(Observer):
     """Raises RunawayError, on all ranks, for a state that is not finite, or whose energy balance does not close.
 
-    The balance may miss by the fraction ``RUNAWAY`` of the largest work so far. An energy from ``EnergyMeter.largest``
-    on counts as not finite.
+    The balance may miss by the fraction ``RUNAWAY`` of the largest work so far, unless the lattice has hardly any
+    energy (``EnergyMeter.negligible``). An energy from ``EnergyMeter.largest`` on counts as not finite.
     """
 
     name = "guard"
@@ -119,10 +115,10 @@ class Guard(Observer):
 
     def observe(self, block: Block) -> None:
         energies = block.energies
-        largest = self.setup.meter.largest
+        meter = self.setup.meter
         most_work = np.maximum.accumulate(np.append(self.most_work, np.abs(energies.work)))[1:]
-        finite = np.isfinite(energies.work) & (energies.total < largest)
-        runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > NEGLIGIBLE * largest)
+        finite = np.isfinite(energies.work) & (energies.total < meter.largest)
+        runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > meter.negligible)
 
         # The samples before the first refused one are good.
         refused = np.flatnonzero(~finite | runs_away)

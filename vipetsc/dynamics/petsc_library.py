@@ -1,8 +1,22 @@
 """The PETSc library of this process, for calls that petsc4py does not offer."""
 
 import ctypes
+from typing import Any
 
 from petsc4py import PETSc
+
+import numpy as np
+
+
+def refused_scalars(scalar: Any = PETSc.ScalarType) -> str | None:
+    """Why a PETSc whose numbers are of the type ``scalar`` cannot be used, or None: kernels read real doubles."""
+    value = np.dtype(scalar)
+    if value == np.float64:
+        return None
+    return (
+        f"PETSc computes with {value}; real scalars in double precision are needed: Debian's petsc-dev, conda-forge's"
+        " petsc=*=real*, or PETSc configured --with-scalar-type=real --with-precision=double"
+    )
 
 
 def petsc_library() -> ctypes.CDLL:

@@ -19,10 +19,18 @@ from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.points import PointMotion
-from vipetsc.dynamics.recorded_sizes import chunk_samples, possible_output, recorded_cells, written_together
+from vipetsc.dynamics.recorded_sizes import (
+    CHUNK_SAMPLES,
+    chunk_samples,
+    possible_output,
+    recorded_cells,
+    written_together,
+)
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording, ranges
 
+# Samples of all cells, each as large as a state, after which a checkpoint follows: it adds a quarter to the bytes.
+SAMPLES_A_STATE = 4
 # Of each of the energies in a file, by its name in ``Energies``.
 ENERGIES = {name.removeprefix("energy/"): name for name in (*SAMPLED, DAMPED) if name.startswith("energy/")}
 
@@ -34,6 +42,7 @@ class Recorder(Observer):
     saved = ("episodes", "deepest")
     episodes = 0
     deepest = 0.0  # indentation in m
+    unsaved_samples = 0  # in chunks since the last checkpoint
     end = np.inf  # time in s of a failure: engines finish their block, whose later part is no solution
 
     def begin(self, setup: Setup) -> None:
@@ -64,6 +73,7 @@ class Recorder(Observer):
             of_sites=self._of_sites,
         )
 
+        self._sample_numbers = len(output.fields) * layout.dofs * len(recorded) // output.stride
         numbers = len(output.fields) * layout.dofs * local.size + len(self._of_sites) * len(layout.sites)
         if together:
             self._columns = np.array([[first, stop]])
@@ -179,6 +189,13 @@ class Recorder(Observer):
         """Whether the chunk is full."""
         return self._held == self._length
 
+    @property
+    def is_state_due(self) -> bool:
+        """Whether a checkpoint should follow the last chunk: a state is as large as some samples of a long lattice."""
+        layout = self.setup.layout
+        every = SAMPLES_A_STATE * -(-int(layout.offsets[-1]) // max(self._sample_numbers, 1))
+        return not self.setup.output.folder or self.unsaved_samples >= min(every, CHUNK_SAMPLES)
+
     def flush(self, last: bool = False) -> None:
         """Write the samples collected so far and this rank's closed episodes as a chunk.
 
@@ -202,6 +219,7 @@ class Recorder(Observer):
             chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
         output.append(chunk or None)
 
+        self.unsaved_samples += self._held
         self.episodes += comm.allreduce(len(episodes))
         self.deepest = comm.allreduce(max([self.deepest, *episodes["indentation"].tolist()]), MPI.MAX)
         self._begin_chunk()

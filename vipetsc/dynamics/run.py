@@ -326,15 +326,16 @@ class Run:
             first=samples.number, times=times, energies=energies, samples=samples, state=self.setup.engine.state
         )
 
-    def checkpoint(self) -> None:
-        """Write the checkpoint from which a run is resumed."""
+    def checkpoint(self, stopped: bool = False) -> None:
+        """Write the samples so far and, if it is due or the run has ``stopped``, the state that a run resumes from."""
         # Chunks before the state: a kill between them leaves a chunk that the last complete state does not count.
         with log.RECORDER:
             for observer in self.observers:
                 observer.flush()
         sys.audit("vipetsc.checkpoint")
-        if not self.setup.output.saves_states:
+        if not self.setup.output.saves_states or not (stopped or self.recorder.is_state_due):
             return
+        self.recorder.unsaved_samples = 0
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
         for observer in self.observers:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
@@ -346,7 +347,7 @@ class Run:
         output = self.setup.output
         comm = self.setup.output.comm
         if ending == STOPPED:
-            self.checkpoint()
+            self.checkpoint(stopped=True)
             sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         statistics["effective_restitution"] = self.setup.model.effective_restitution

@@ -11,6 +11,7 @@ from vipetsc.case import Model
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import create_contacts, hold
 from vipetsc.dynamics.layout import Layout
+from vipetsc.lattice.chain import Pair
 
 END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
 """An end of a site: components of its displacement and velocity, -1 on ground; its owned cell, else -1; its mass."""
@@ -24,19 +25,24 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     Sites are free, or of the mode ``PERMANENT`` where they touch or are pressed at rest. A number below 0 stands for a
     site without stops.
     """
-    numbers = np.maximum(np.asarray(numbers, np.int64), -1)
+    numbers = np.asarray(numbers, np.int64)
     chain = model.chain
+    exists = numbers >= 0
+    asked = numbers[exists].tolist()
 
-    # A row after the last site is that of number -1: no stops, the cell's own pair.
-    gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances]).reshape(-1, 2)
-    gaps = np.vstack([gaps, [[np.inf] * 2]])[numbers]
-    masses = np.array([*chain.reduced_masses(), chain.cell.reduced_mass])[numbers]
-    joins_next_cell = np.array([*(pair.next_cell for pair in chain.contact_pairs), False])[numbers]
-    # A number below 0 takes any law that is used: without stops no law acts.
-    numbers_of_laws = [max(i, 0) for i in numbers]
-    if not model.laws:
-        numbers_of_laws = [0] * len(numbers_of_laws)
-    laws = [model.used_laws[i] for i in numbers_of_laws]
+    # A number below 0 has no stops, and the cell's own pair.
+    gaps = np.full((len(numbers), 2), np.inf)
+    masses = np.full(len(numbers), chain.cell.reduced_mass)
+    joins_next_cell = np.zeros(len(numbers), bool)
+    if asked:
+        of_sites = model.gaps or chain.clearances
+        gaps[exists] = np.reshape([of_sites[i] for i in asked], (len(asked), -1))
+        masses[exists] = chain.reduced_masses(asked)
+        joins_next_cell[exists] = [bool(chain.pairs) and chain.pairs[i].next_cell for i in asked]
+    # It takes any law that is used: without stops no law acts.
+    laws = [model.used_laws[0]] * len(numbers)
+    if model.laws:
+        laws = [model.laws[i] for i in np.maximum(numbers, 0).tolist()]
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)
@@ -67,9 +73,11 @@ def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> n
         return first + mass, first + d + mass, -1, mass
 
     site_dofs = np.zeros(len(layout.contacts), SITE_DOFS)
-    pairs = chain.contact_pairs
+    own_pair = Pair(chain.cell.host, chain.cell.resonator)
     for row, i in zip(site_dofs, layout.contacts, strict=True):
-        pair = pairs[i]
+        pair = own_pair
+        if chain.pairs:
+            pair = chain.pairs[i]
         cell = chain.sites[i]
         # The last cell of a ring is the one before the first: so the rank that owns the first cells counts it.
         if cell == chain.cells - 1 and layout.start == 0 and n < chain.cells:

@@ -142,8 +142,11 @@ class RunFolder:
             # Two checkpoints are kept: until all ranks have written this one, the one before it is the last that is
             # complete.
             if self.comm.rank == 0:
-                for old in self._parts.glob(f"state-{number - 2:06d}-*"):
-                    old.unlink()
+                earlier = [path for path in self._parts.glob("state-*") if int(path.stem.split("-")[1]) < number]
+                last = max((path.stem.split("-")[1] for path in earlier), default="")
+                for old in earlier:
+                    if old.stem.split("-")[1] != last:
+                        old.unlink()
 
         on_every_rank(self.comm, replace_oldest)
 

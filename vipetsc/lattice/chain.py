@@ -1,5 +1,6 @@
 """A finite lattice: its cells, its ends, its contact sites, its linear response."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Literal, NamedTuple
@@ -134,13 +135,18 @@ class Chain:
         """Whether contacts join cells."""
         return any(pair.next_cell for pair in self.pairs)
 
-    def reduced_masses(self) -> list[float]:
-        """Mass in kg of each site's relative motion."""
+    def reduced_masses(self, numbers: Sequence[int] | None = None) -> list[float]:
+        """Mass in kg of the relative motion of the sites with these ``numbers``, from 0, or of all."""
+        if numbers is None:
+            numbers = range(len(self.sites))
         # One row for all cells where they are equal, so that a long lattice costs no more than its sites.
         inverse = 1 / self._varied.get("masses", np.array([self.cell.masses]))
         rows = len(inverse)
-        sites = np.array(self.sites, np.int64)
-        host, resonator, next_cell = np.array(self.contact_pairs, np.int64).reshape(-1, 3).T
+        sites = np.array([self.sites[i] for i in numbers], np.int64)
+        pairs = [Pair(self.cell.host, self.cell.resonator)] * len(numbers)
+        if self.pairs:
+            pairs = [self.pairs[i] for i in numbers]
+        host, resonator, next_cell = np.array(pairs, np.int64).reshape(-1, 3).T
         inverse_host = np.where(host >= 0, inverse[sites % rows, host], 0.0)  # ground does not move
         inverse_resonator = inverse[(sites + next_cell) % rows, resonator]
         return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()

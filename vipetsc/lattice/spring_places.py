@@ -25,6 +25,9 @@ class SpringPlace(NamedTuple):
 
 def nonlinear_numbers(chain: Chain, also: Collection[int] = ()) -> np.ndarray:
     """Cells and numbers (spring, 2), as in ``SpringPlace``, of the springs that ``nonlinear_places`` returns."""
+    # A lattice may have a billion cells: none is looked at where all springs are linear.
+    if chain.is_linear and not also:
+        return np.zeros((0, 2), np.int64)
     terms = chain.spring_terms(-1, chain.cells)
     is_wanted = (terms.quadratic != 0) | (terms.cubic != 0)
     is_wanted[:, list(also)] = True

@@ -115,11 +115,11 @@ def measure_unless_measured(work: Work, linear: "MemberHistory | None") -> None:
 def run_rows(case: Case, ranks: int) -> Rows:
     """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
-    from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
+    from vipetsc.dynamics.memory import check_numbers, memory_available, memory_needed
     from vipetsc.dynamics.recorded_sizes import recorded_cells, written_together
 
     model = case.model()
-    check_indices(model)
+    check_numbers(model)
     chain = model.chain
     cost = estimate(case, ranks)
 
@@ -224,7 +224,8 @@ def run_table(result: "Result", faster: str = "") -> str:
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
     if rebounds:
         restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)"
-    limits = [f"{name} {numbers[name]}" for name in ("grazes", "floored", "clipped", "pulled") if numbers[name]]
+    rare = "grazes", "floored", "clipped", "pulled", "missed", "forced"
+    limits = [f"{name} {numbers[name]}" for name in rare if numbers.get(name)]
     engine = ""
     if note := numbers.get("engine_note"):
         engine = f"{numbers['engine']}: {note}"

@@ -189,12 +189,14 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     for _ in range(MOST_ATTEMPTS):
         fraction = first_kink(cluster, trial, substep.length)
         if fraction > 1.0 or fraction * substep.length < SHORTEST:
-            break
+            return substep
         substep = Substep(substep.kind, fraction * substep.length)
         if not _try_substep(cluster, trial, substep):
             state.rejected += 1
             state.length = CUT * substep.length
             return Substep(substep.kind, -1.0)
+    if first_kink(cluster, trial, substep.length) <= 1.0:
+        state.missed += 1
     return substep
 
 
@@ -229,6 +231,7 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) 
                 return landing.length, False
             landing = shorten(landing, earlier.position)
         elif outcome != RETRY:
+            cluster.state[0].missed += outcome != LANDED
             return landing.length, outcome == LANDED
 
 
@@ -275,6 +278,7 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
         state.rejected += 1
         state.length = factor * taken
         return False
+    state.forced += ratio > 1.0
     # A substep that was cut short, by the end of the step say, is no reason for a shorter one after it. After a landing
     # a site has another mode, for which this error says nothing.
     if not landed and trial.closed.size + trial.springs.size > 0:

@@ -20,14 +20,14 @@ from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.taylor import ROUNDING
 from vipetsc.dynamics.spring_law import SPRING_LAW
 
-COUNTS = ("substeps", "rejected", "landings", "switches")
+COUNTS = ("substeps", "rejected", "landings", "switches", "missed", "forced")
 SUBSTEP_STATE = np.dtype(
     [(name, float) for name in ("begin", "position", "length")] + [(name, np.int64) for name in COUNTS]
 )
 """Where a cluster stands, a record in an array, so that compiled code can change it: the time in s at which the step
 begins; the position in the step and the length of the next substep, both in units of H; counts of substeps tried,
-without their repetitions that end on a kink or a change, of those rejected, of landings begun and of switches of a
-mode."""
+without their repetitions that end on a kink or a change, of those rejected, of landings begun, of switches of a mode,
+of substeps that end beside a change or with a kink inside, and of those taken although their error is too large."""
 
 SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
 """A nonlinear spring: what its force has beyond the linear part; the size in m of elongations."""

@@ -37,9 +37,11 @@ from vipetsc.parallel import StopRequest, smallest
 STRETCH = 1.08
 # Steps of a length that the user has fixed are stretched by no more than the rounding of times.
 FIXED_STRETCH = 1.0 + 1e-6
-# Steps and rejected trials for each site, before the next given time, beyond which a run counts as stalled: a thousand
-# times what any sample has taken.
+# Steps and rejected trials for each site, from one step to the next that lands on nothing, beyond which a run counts as
+# stalled: a thousand times what any run has taken.
 MOST_TRIALS = 10_000
+# Longest step that is taken without a search for changes, as a fraction of the first step without contacts.
+BLIND = 1e-6
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
 # Steps in radians of the first drive's frequency: the first one, and the length with which the controller begins, for
@@ -78,13 +80,16 @@ class Integrator(Engine):
         self.layout = layout
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
-        self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
+        self.counts = dict.fromkeys(("steps", "rejected", "landings", "missed", "switches"), 0)
         self._logged = np.isin(layout.contacts, layout.sites)  # other ranks log the others
         self._own_rows = np.flatnonzero(self._logged)
         self._stop = stop or StopRequest()
         self._any_open = False
         # Whether the next step begins at an onset, after which a force is not smooth in time.
         self._after_onset = False
+        # Whether the next step is taken without a search, and the steps and trials since the last that landed nowhere.
+        self._is_blind = False
+        self._trials = 0
         self._is_rough = any(law.onset_exponent != 1 for law in model.used_laws)
 
         self.time = 0.0
@@ -162,13 +167,12 @@ class Integrator(Engine):
             self.observe(self.tracker.start)
 
         stopped = False
-        trials = 0
         while self.time < target:
-            if trials > self._most_trials:
-                raise StalledError(f"{trials} steps did not reach t = {target:.6g} s")
+            if self._trials > self._most_trials:
+                raise StalledError(f"{self._trials} steps made no progress from t = {self.time:.6g} s on")
+            self._trials += 1
             if not self._step(target):
                 stopped = True
-            trials += 1
         # A run that is resumed from a checkpoint here restarts, too: both then have the same bits.
         self.ts.restartStep()
         return not stopped
@@ -184,6 +188,8 @@ class Integrator(Engine):
         longest = self._longest_step()
         if longest < shortest:
             raise StalledError(f"the step fell to {longest:.3g} s")
+        if self._is_blind:
+            longest = min(longest, max(BLIND * self.free_step, 2 * shortest))
         # Equal steps to the target: none of them is short because the others were long.
         count = math.ceil(remaining / longest)
         h = remaining / count
@@ -195,8 +201,10 @@ class Integrator(Engine):
         if count > 1:
             end = self.time + h
         self.observe(self.tracker.end, end)
-        with log.SEARCH:
-            change = self._first_change(h)
+        change = ModeChange(2.0, 0, 0)
+        if not self._is_blind:
+            with log.SEARCH:
+                change = self._first_change(h)
 
         # One reduction for both: the earliest change, and whether a stop was requested anywhere.
         position, stop = smallest(self.comm, change.position, -float(self._stop.requested))
@@ -207,6 +215,10 @@ class Integrator(Engine):
             self.tracker.accept_step(h)
             self.time = end
             self._after_onset = False
+            # Blind steps may come in turn with landings that lead nowhere: they are no progress.
+            if not self._is_blind:
+                self._trials = 0
+            self._is_blind = False
         return stop == 0.0
 
     def _longest_step(self) -> float:
@@ -276,6 +288,8 @@ class Integrator(Engine):
             self._switch()
         elif outcome == RESTS:
             self._rest(owner, change)
+        else:
+            self.counts["missed"] += 1
 
     def _judge(self, attempt: Landing, change: ModeChange) -> tuple[Landing, int]:
         """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it.
@@ -300,18 +314,25 @@ class Integrator(Engine):
         return shorten(attempt, position), RETRY
 
     def _switch_at_start(self, owner: int, change: ModeChange) -> None:
-        """Switch at a ``change`` of the rank ``owner`` that lies at the start of a step, or let its site rest."""
+        """Switch at a ``change`` of the rank ``owner`` that lies at the start of a step, or let its site rest.
+
+        Where nothing would switch and the site cannot rest, the next step would find the same change: it is taken
+        without a search.
+        """
         tracker = self.tracker
         site = change.site
         rests = False
+        is_blind = False
         if self.comm.rank == owner:
             start = tracker.start[site]
-            _, rate, _, _ = switching(tracker.contacts, site, change.function, start)
-            # Nothing would switch, and the next step would find the same change.
-            rests = rate <= 0.0 and bool(stays_landed(tracker.contacts[site], start, start, 0.0, np.empty(6)))
-        if self.comm.bcast(rests, owner):
+            value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, start)
+            if rate <= 0.0:
+                rests = bool(stays_landed(tracker.contacts[site], start, start, 0.0, np.empty(6)))
+                is_blind = not rests and value <= tolerance
+        rests, self._is_blind = self.comm.bcast((rests, is_blind), owner)
+        if rests:
             self._rest(owner, change)
-        else:
+        elif not self._is_blind:
             self._switch()
 
     def _rest(self, owner: int, change: ModeChange) -> None:
@@ -374,7 +395,7 @@ class Integrator(Engine):
         return self.layout.checkpoint(self.state.array_r) | {
             "sites": self.tracker.checkpoint()[self._logged],
             "time": np.array(self.time),
-            "steps": np.array([self.step, self.free_step, float(self._any_open), float(self._after_onset)]),
+            "steps": np.array([self.step, self.free_step, self._any_open, self._after_onset, self._is_blind], float),
             "counts": np.array([list(self.counts.values())]),
         }
 
@@ -384,9 +405,10 @@ class Integrator(Engine):
         self.layout.restore(checkpoints, self.state.array)
         self.tracker.restore(tables["sites"])
         self.time = float(common["time"])
-        self.step, self.free_step, any_open, after_onset = common["steps"].tolist()
+        self.step, self.free_step, any_open, after_onset, is_blind = common["steps"].tolist()
         self._any_open = bool(any_open)
         self._after_onset = bool(after_onset)
+        self._is_blind = bool(is_blind)
         self.counts = dict(zip(self.counts, common["counts"][0].tolist(), strict=True))
         # A rank counts the switches of its own sites: those so far are rank 0's from now on.
         self.counts["switches"] = 0

@@ -1,0 +1,144 @@
+"""Runs in which nothing is wrong, although energies, steps or landings are far from the usual ones."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import simulated, small_case
+from tests.unit.propagator_parts import mass_on_stop
+from vipetsc.case import Case
+from vipetsc.contact.search import MISSED
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.advance import _control_length
+from vipetsc.dynamics.ts.integrator import Integrator
+
+ENGINES = pytest.mark.parametrize("engine", ["ts", "propagator"])
+
+
+def flat_band(engine: str, periods: int, damping: float = 0.0, coupling: float = 10.0) -> Case:
+    """Three cells of a host and a resonator, hardly coupled, driven at the resonance of the middle one."""
+    k = 1e4
+    omega = float(np.sqrt(2 * k / 0.01))
+    springs = [
+        {"start": 1, "end": 1, "stiffness": coupling, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": k, "damping": damping},
+    ]
+    cell = {"masses": [0.01, 0.01], "springs": springs, "contact": [1, 2]}
+    period = 2 * np.pi / omega
+    drive = {"waveform": "harmonic", "amplitude": 1e-3, "cell": 2, "mass": 1, "frequency": omega, "ramp": 2 * period}
+    return Case.from_table(
+        {
+            "name": "flat",
+            "lattice": {"cells": 3, "ends": "fixed", "cell": cell},
+            "contacts": {"sites": 0},
+            "drive": drive,
+            "time": {"end": periods * period, "engine": engine},
+            "output": {"figures": False},
+        }
+    )
+
+
+@ENGINES
+@pytest.mark.parametrize("coupling", [1.0, 10.0])
+def test_an_undamped_resonance_grows_as_long_as_it_is_driven(engine, coupling):
+    """The amplitude grows with the time, the energy with its square, far beyond that of the forced wave."""
+    run, result = simulated(flat_band(engine, 400, coupling=coupling))
+    energy = run["energy/kinetic"].values + run["energy/spring"].values
+    half = len(energy) // 2
+    # Not exactly: the host's springs to its neighbours detune it by their part of the stiffness.
+    assert energy[-1] / energy[half] == pytest.approx(4.0, rel=0.35)
+    assert result.statistics["ledger_error"] < 1e-8
+
+
+@ENGINES
+def test_what_dashpots_dissipate_may_exceed_the_energy_by_far(engine):
+    """At a steady amplitude the loss grows by the same amount in each period, over 600 of them."""
+    run, result = simulated(flat_band(engine, 600, damping=0.05))
+    lost = run["energy/dissipated_by_damping"].values
+    per_sixth = np.diff(lost[:: len(lost) // 6])
+    assert per_sixth[3:] == pytest.approx(per_sixth[-1], rel=0.01)
+    assert result.statistics["ledger_error"] < 1e-8
+
+
+def test_many_steps_between_two_samples_are_no_stall():
+    """A method of low order at a fine tolerance takes more than 10,000 steps to the next sample."""
+    case = small_case(
+        contacts={"sites": []},
+        drive={"amplitude": 1.0},
+        time={"end": 1.2e-3, "method": "2a", "rtol": 1e-12, "engine": "ts", "sample_interval": 6e-4},
+    )
+    _, result = simulated(case)
+    assert result.statistics["steps"] > 10_000
+
+
+@pytest.mark.parametrize("clearance", [0.141421356237, 0.14142135623, 0.1414213562373, 0.14142135623731])
+def test_a_mode_that_begins_at_a_turning_point_on_the_stop_goes_on(clearance):
+    """The pair of two masses begins at rest within 1e-10 of the stop, with |w| = 2^1/2/10 of its second mode."""
+    springs = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 1.0}]
+    case = Case.from_table(
+        {
+            "lattice": {"cells": 1, "cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}},
+            "contacts": {"law": "bilinear", "stiffness": 100.0, "sites": [1], "clearance": clearance},
+            "initial": {"kind": "mode", "number": 2, "amplitude": 0.1},
+            "time": {"end": 20.0, "samples": 101, "engine": "ts"},
+        }
+    )
+    run, result = simulated(case)
+    # The stop is reached with hardly any velocity, if at all: the mode goes on, u_1 = 0.1 cos(omega t) up to a factor.
+    u = run.displacement.values[:, 0]
+    k = np.array([[3.0, -1.0], [-1.0, 1.0]])
+    omega = np.sqrt(np.linalg.eigvalsh(k)[1])
+    expected = u[0] * np.cos(omega * run.time.values)[:, None]
+    np.testing.assert_allclose(u, expected, atol=1e-5)
+    assert result.statistics["ledger_error"] < 1e-9
+
+
+@pytest.mark.parametrize("beyond", [0.0, 5e-11, 9e-11, -5e-11, 5e-10])
+def test_a_pair_at_rest_within_the_tolerance_of_its_stop_goes_on(beyond):
+    """A site that stands at its clearance and does not approach is no change: the engine goes on to the next sample."""
+    case = small_case(lattice={"cells": 60}, contacts={"sites": [30], "clearance": 1e-3, "restitution": 1.0})
+    model = case.model()
+    layout = Layout(model, MPI.COMM_SELF)
+    engine = Integrator(model, layout)
+    cells = np.zeros((60, 2 * layout.dofs))
+    w = 1e-3 * (1 + beyond)
+    cells[29, model.chain.cell.resonator] = w
+    engine.begin(cells, np.array([[w, 0.0]]), 0.0)
+    assert engine.advance(model.sample_interval)
+    assert engine.counts["steps"] < 200
+    engine.destroy()
+
+
+class Misses(Integrator):
+    """An engine whose first landing ends beside the change."""
+
+    def _judge(self, attempt, change):
+        if self.counts["missed"]:
+            return super()._judge(attempt, change)
+        return attempt, MISSED
+
+
+def test_landings_that_miss_are_counted():
+    model = small_case().model()
+    counts = []
+    for kind in (Integrator, Misses):
+        engine = kind(model, Layout(model, MPI.COMM_SELF))
+        engine.advance(0.02)
+        counts.append(engine.statistics()["missed"])
+        assert engine.counts["landings"] > 0
+        engine.destroy()
+    assert counts == [0, 1]
+
+
+@pytest.mark.parametrize(("length", "forced"), [(1e-10, 1), (1e-3, 0)])
+def test_substeps_that_are_taken_in_spite_of_their_error_are_counted(length, forced):
+    """Of a force that is not smooth the shortest substep is taken and counted; a longer one is rejected."""
+    cluster = mass_on_stop()
+    cluster.trial.force[:] = np.random.default_rng(1).normal(size=cluster.trial.force.shape) * 1e12
+    taken = _control_length(cluster, cluster.trial, length, False)
+    assert bool(taken) == bool(forced)
+    assert cluster.state["forced"].tolist() == [forced]
+    assert cluster.state["rejected"].tolist() == [1 - forced]
