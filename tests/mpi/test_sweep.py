@@ -15,17 +15,14 @@ import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
-from vipetsc.case import CaseError, Problem, Sweep
+from vipetsc.case import Sweep
 from vipetsc.cli.verb import Work
-from vipetsc.cli.verbs import run_verb
 from vipetsc.cli.verbs.sweep_verb import simulate_members
-from vipetsc.dynamics import recorded_sizes
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
-from vipetsc.studies import linear_history
+from vipetsc.studies import linear_run
 from vipetsc.studies import sweep as studies_sweep
 from vipetsc.studies.ensemble import FAILED
-from vipetsc.studies.linear_history import LinearHistory
 from vipetsc.studies.pool import TaskPool
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sweep import SweepResult, run_sweep
@@ -160,28 +157,10 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
 
 
 @pytest.mark.parallel([2])
-def test_members_begin_from_the_same_checkpoints_on_any_number_of_ranks(folder, monkeypatch):
-    """The samples of a checkpoint of a linear run do not depend on how many its ranks store at once."""
-    case = sweep("sweep.ranks=2").member(0).case
-    # As in a lattice of many cells, of which 64 samples would be too many bytes for one chunk.
-    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 20)
-
-    checkpoints = []
-    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
-        history = LinearHistory.of(case, comm, StopRequest())
-        checkpoints.append([int(parts[0]["samples"]) for parts in history.checkpoints])
-
-    assert checkpoints[0] == checkpoints[1] == [*range(64, case.model().samples, 64)]
-
-
-@pytest.mark.parallel([2])
-@pytest.mark.parametrize(
-    ("module", "name"), [(linear_history, "envelope_squares"), (LinearHistory, "with_velocity_alone")]
-)
-def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monkeypatch, module, name):
+def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monkeypatch):
     """Where memory is short on the first rank alone, all members have the reason, and no rank waits for another.
 
-    The first rank alone has the motion of the linear run, of which it takes the envelope, and keeps the velocity.
+    The first rank alone has the motion of the linear run, of which it takes the envelope.
     """
     comm = MPI.COMM_WORLD
 
@@ -190,7 +169,7 @@ def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monk
 
     with monkeypatch.context() as patch:
         if comm.rank == 0:
-            patch.setattr(module, name, fail)
+            patch.setattr(linear_run, "envelope_squares", fail)
         result = run_sweep(sweep("sweep.ranks=2"), folder / "out", comm)
 
     assert result.count(FAILED) == 6
@@ -293,31 +272,6 @@ def test_blocks_of_jobs_hold_every_job_once():
     if comm.size == 1:
         # One rank does the jobs in their order.
         assert done == list(range(1007))
-
-
-class BegunError(Exception):
-    """The work of a verb came so far that all ranks work together."""
-
-
-@pytest.mark.parallel([2])
-def test_one_rank_reads_the_sweep_of_a_member(monkeypatch, tmp_path):
-    """A rank that does not see the file of the sweep takes it from rank 0, and goes on with the others."""
-    plan = sweep()
-
-    def read(options: Namespace) -> Sweep:
-        if MPI.COMM_WORLD.rank:
-            raise CaseError([Problem("case.toml", None, "not on this machine")])
-        return plan
-
-    def begin(of_rank: Sweep, *arguments: object) -> None:
-        assert of_rank.ids() == plan.ids()
-        raise BegunError
-
-    monkeypatch.setattr(run_verb, "_sweep_of", read)
-    monkeypatch.setattr(linear_history, "MemberHistory", begin)
-    work = Work(Namespace(member="0"), tmp_path, MPI.COMM_WORLD, StopRequest())
-    with pytest.raises(BegunError):
-        run_verb.simulate_and_measure(plan.case(0), work)
 
 
 @pytest.mark.parallel([2])

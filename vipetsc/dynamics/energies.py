@@ -282,11 +282,11 @@ class EnergyMeter:
 
         All ranks must call it.
         """
-        own = parts(sums)
-        numbers = np.vstack([own, work.T])
+        of_rank = parts(sums)
+        numbers = np.vstack([of_rank, work.T])
         self.comm.Allreduce(MPI.IN_PLACE, numbers, MPI.SUM)
 
-        total, works = np.split(numbers, [len(own)])
+        total, works = np.split(numbers, [len(of_rank)])
         kinetic, spring, contact, dissipated, damping = self.unit * joined(total)
         energies = Energies(
             kinetic=kinetic,

@@ -79,14 +79,3 @@ class Engine(ABC):
     @abstractmethod
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-
-
-class OpeningEngine(Engine):
-    """An engine that can begin with the samples of a run without sites, of which the state after them is kept."""
-
-    @abstractmethod
-    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
-
-        A part has the arrays that ``checkpoint`` returned on its rank; all ranks must call it.
-        """

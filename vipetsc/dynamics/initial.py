@@ -36,8 +36,8 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
 
     # A site between two ranks comes from both, with the same bits.
     motion = np.zeros((len(setup.model.chain.sites), 2))
-    own = np.array(layout.contacts, np.int64), relative.reshape(-1, 2)
-    for numbers, rows in layout.comm.allgather(own):
+    of_rank = np.array(layout.contacts, np.int64), relative.reshape(-1, 2)
+    for numbers, rows in layout.comm.allgather(of_rank):
         motion[numbers] = rows
     no_work = np.zeros((1, 1))
     energy = float(meter.total(sums[None], no_work).total[0])

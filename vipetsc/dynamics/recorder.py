@@ -14,10 +14,8 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.case.points import PointTable
-from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.observers import Observer, Setup
-from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.recorded_sizes import (
     CHUNK_SAMPLES,
@@ -157,32 +155,6 @@ class Recorder(Observer):
         self._number = block.first - self._held
         self._held = here.stop
         self._rows = rows
-
-    def record(self, opening: Opening) -> None:
-        """Store the samples of an ``opening`` as a chunk of rank 0; all ranks must call it."""
-        chunk = None
-        if self.setup.layout.comm.rank == 0:
-            chunk = self._opened(opening)
-        self.setup.output.append(chunk)
-        self._begin_chunk()
-
-    def _opened(self, opening: Opening) -> dict[str, np.ndarray]:
-        """The chunk of an ``opening``, as ``_gather`` gives it on rank 0."""
-        recording = self.setup.output.recording
-        cells = recorded_cells(self.setup.case.output, self.setup.model.chain.cells)
-        rows = -(-opening.samples // self._stride)
-        fields = self.setup.output.room((len(recording.fields), rows, self.setup.layout.dofs, len(cells)))
-        for field, name in zip(fields, recording.fields, strict=True):
-            opening.put_field(name, slice(cells.start, cells.stop, cells.step), self._stride, out=field)
-
-        time = np.arange(opening.samples) * self.setup.model.sample_interval
-        sites = len(self.setup.model.chain.sites)
-        chunk = {name: opening.values(name) for name in recording.sampled if name not in ("time", "field_time")}
-        chunk |= {"time": time, "field_time": time[:: self._stride]}
-        chunk |= {name: np.zeros((opening.samples, sites)) for name in self._of_sites}
-        chunk |= {"sites": np.array([[0, sites]]), "columns": np.array([[0, len(cells)]])}
-        chunk |= {"impacts": np.zeros(0, EPISODE)}
-        return chunk | dict(zip(recording.fields, fields, strict=True))
 
     @property
     def due(self) -> bool:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,14 +15,13 @@ import numpy as np
 from vipetsc.case import Case, Model
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine import Engine, FillResult, OpeningEngine
+from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.initial import initial_fields, set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
-from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
@@ -72,7 +71,6 @@ def simulate(
     stop: StopRequest | None = None,
     progress: bool = False,
     observers: Sequence[type[Observer]] = (),
-    opening: Callable[[], Opening | None] | None = None,
 ) -> Result:
     """Simulate ``case`` on all ranks of ``comm``, in memory or into ``folder`` (``run.h5`` and ``summary.json``).
 
@@ -93,9 +91,6 @@ def simulate(
         Report progress on rank 0: a bar on a terminal or in a notebook, elsewhere lines on stderr.
     observers
         Further observers, which see all good samples.
-    opening
-        Gives the samples that a new run begins with, if any, instead of simulating them; all ranks call it. Engines
-        without exact steps, and runs with further observers, do not use it.
 
     Raises
     ------
@@ -133,11 +128,8 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
-    # A further observer wants to see every sample, also those that an opening would bring.
-    if observers or not issubclass(ENGINES[choice.name], OpeningEngine):
-        opening = None
 
-    simulation = Simulation(case=case, model=model, engine=choice, stop=stop, watching=watching, opening=opening)
+    simulation = Simulation(case=case, model=model, engine=choice, stop=stop, watching=watching)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
         if folder is None:
@@ -159,7 +151,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: case, model and engine, observers, opening of a new run.
+    """A simulation: case, model and engine, observers.
 
     A new run begins in the ``state``, displacements and velocities (cell, dof) of the rank's cells, if one is given,
     else as the model says.
@@ -170,16 +162,12 @@ class Simulation:
     engine: EngineChoice
     stop: StopRequest | None
     watching: Sequence[type[Observer]]
-    opening: Callable[[], Opening | None] | None = None
     state: tuple[np.ndarray, np.ndarray] | None = None
 
     def make(self, output: RunOutput) -> Result:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
         output.begin(self.case.to_toml())
         checkpoints = output.last_state()
-        opening = None
-        if self.opening and checkpoints is None:
-            opening = self.opening()
 
         begin = Begin(wall=time.perf_counter(), cpu=time.process_time(), compiled=compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
@@ -199,8 +187,6 @@ class Simulation:
             run = Run(setup, self.watching)
             if checkpoints is not None:
                 run.restore(checkpoints)
-            elif opening is not None:
-                run.open(opening)
             elif self.state is not None:
                 set_in_motion(run.setup, self.state)
             elif self.model.initial is not None:
@@ -252,15 +238,6 @@ class Run:
         """Go on after a checkpoint, given the parts of all ranks that wrote it; their number may differ."""
         # The engine first: observers may ask it for its time.
         self.setup.engine.restore(checkpoints)
-        self._go_on(checkpoints[0])
-
-    def open(self, opening: Opening) -> None:
-        """Begin with the samples of an ``opening``; all ranks must call it."""
-        engine = self.setup.engine
-        assert isinstance(engine, OpeningEngine)  # ``simulate`` has an opening for no other
-        checkpoints = opening.checkpoint()
-        self.recorder.record(opening)
-        engine.open(checkpoints)
         self._go_on(checkpoints[0])
 
     def _go_on(self, state: Mapping[str, np.ndarray]) -> None:

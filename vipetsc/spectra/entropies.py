@@ -68,22 +68,17 @@ class Entropy:
     error: float
 
 
-def entropy(
-    velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1, first: LocalEntropy | None = None
-) -> Entropy:
+def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
     ``start`` is the sample at which the linear wave's peak is at the first site. Every ``every``-th sample is
     transformed (a snapshot), and every ``stride``-th cell averaged over; the largest weight of Eq. (d) is sought in the
-    other samples too. ``first`` are the entropies of the first snapshots if these are known already. Raises ValueError
-    if ``start`` is not a sample, or one is not finite.
+    other samples too. Raises ValueError if ``start`` is not a sample, or one is not finite.
     """
     nt = len(velocity)
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
     snapshots = velocity[::every]
-    if first is not None:
-        snapshots = snapshots[len(first.local) :]
     # The threshold of Eq. (d) should not depend on which samples are snapshots.
     others = velocity[_strongest_others(velocity, start, every)]
 
@@ -91,9 +86,6 @@ def entropy(
     largest = weight[len(snapshots) :].max(initial=0.0)
     local = local[: len(snapshots)]
     weight = weight[: len(snapshots)]
-    if first is not None:
-        local = np.concatenate([first.local, local])
-        weight = np.concatenate([first.weight, weight])
 
     arrival = min(-(-start // every), len(local) - 1)
     return averages(local, weight, arrival, stride, largest)

@@ -29,7 +29,6 @@ from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.dispersion_measures import dispersions_by_side
 from vipetsc.studies.modal_measures import MODAL, modal_energies
-from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
@@ -96,18 +95,15 @@ def analyse(
     options: AnalysisTable | None = None,
     comm: MPI.Comm = MPI.COMM_SELF,
     case: Case | None = None,
-    opening: OpeningEntropies | None = None,
 ) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, when the peak of the linear wave is at the first site (``spectra.arrivals``); by default it is
     estimated from the group velocity. Entropies are averaged from it on, energies of bands from the front of the run's
-    own wave on. ``options`` are the case's where none
-    are given. ``case`` is the run's, where the caller has it, and ``opening`` the entropies of the snapshots with which
-    a member of a sweep begins. Measures that the run does not allow (no sites, a single cell) are left out and named in
-    the attribute ``left_out``; those that the stored samples and cells do not resolve are also named in the list
-    ``warnings``.
+    own wave on. ``options`` are the case's where none are given. ``case`` is the run's, where the caller has it.
+    Measures that the run does not allow (no sites, a single cell) are left out and named in the attribute ``left_out``;
+    those that the stored samples and cells do not resolve are also named in the list ``warnings``.
 
     The ranks of ``comm`` take different measures of the same run; all must call it, and all get all measures.
     """
@@ -130,7 +126,7 @@ def analyse(
         return _dataset(LAYOUT | numbers.layout, numbers.values, about, numbers.attributes)
 
     record = on_every_rank(comm, lambda: VelocityRecord(run, case, options))
-    wavelets = partial(_wavelets, arrival=arrival, opening=opening)
+    wavelets = partial(_wavelets, arrival=arrival)
     values = _measure(run, record, set(measures) - record.unresolved(), wavelets, comm) | numbers.values
     layout = LAYOUT | numbers.layout
     record.warnings += numbers.warnings
@@ -293,9 +289,7 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     return values
 
 
-def _wavelets(
-    record: VelocityRecord, measures: Collection[str], arrival: float | None, opening: OpeningEntropies | None
-) -> dict[str, Any]:
+def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
     """Wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
     nt, cells = record.velocity.shape[:2]
     if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
@@ -308,13 +302,11 @@ def _wavelets(
     if "partition" in measures:
         values |= _partition(record, stride * record.options.snapshot_stride, maps)
     if "entropy" in measures:
-        values |= _entropies(record, stride, arrival, opening, maps)
+        values |= _entropies(record, stride, arrival, maps)
     return values
 
 
-def _entropies(
-    record: VelocityRecord, stride: int, arrival: float | None, opening: OpeningEntropies | None, maps: bool
-) -> dict[str, Any]:
+def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps: bool) -> dict[str, Any]:
     """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
     options = record.options
     time = record.time[:: stride * options.snapshot_stride]
@@ -327,15 +319,8 @@ def _entropies(
 
     host = record.model.chain.cell.host
     velocity = np.ascontiguousarray(record.velocity[::stride, :, host])
-    first = None
-    if opening:
-        first = opening.first(host, stride * options.snapshot_stride, options.cell_stride)
     entropy = spectra.entropy(
-        velocity,
-        start=start * options.snapshot_stride,
-        stride=options.cell_stride,
-        every=options.snapshot_stride,
-        first=first,
+        velocity, start=start * options.snapshot_stride, stride=options.cell_stride, every=options.snapshot_stride
     )
     # The result from every second snapshot and cell estimates the error of the result from all.
     local = entropy.local[start:][::2, ::2]

@@ -13,20 +13,24 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+from mpi4py import MPI
+
 import numpy as np
 import xarray as xr
 
 from vipetsc import spectra
 from vipetsc.case import Case, case_id
 from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
+from vipetsc.dynamics import simulate
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record
+from vipetsc.io.store import RunMemory
 from vipetsc.lattice.chain import Pair, cells_between
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.opening_entropies import OpeningEntropies
-from vipetsc.studies.recorded_runs import RecordPaths
+from vipetsc.studies.recorded_runs import RecordPaths, completed
 
 # A member is scaled where its linear wave stays below this fraction of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than what is left, for any burst of a few cycles.
@@ -58,18 +62,10 @@ class LinearRun(NamedTuple):
     measures: dict[int, Record]
 
     @classmethod
-    def of(
-        cls,
-        run: xr.Dataset,
-        statistics: dict[str, Any],
-        sites: Collection[int],
-        names: Collection[str],
-        entropies: OpeningEntropies | None = None,
-    ) -> Self:
+    def of(cls, run: xr.Dataset, statistics: dict[str, Any], sites: Collection[int], names: Collection[str]) -> Self:
         """Take the wave of a ``run`` with both fields of all cells, and the measures ``names`` of it.
 
-        They are measured for each of the first ``sites`` (cells; 0 for none), with the ``entropies`` of all its
-        snapshots where the caller keeps them.
+        They are measured for each of the first ``sites`` (cells; 0 for none).
         """
         samples = run.sizes["time"]
         blocks = [*range(BLOCK, samples, BLOCK), samples]
@@ -81,7 +77,7 @@ class LinearRun(NamedTuple):
             measures={},
         )
         for site in sites:
-            analysis = analyse(with_site(run, site), names, wave.arrival_at(site), opening=entropies)
+            analysis = analyse(with_site(run, site), names, wave.arrival_at(site))
             wave.measures[site] = measured(analysis)
         return wave
 
@@ -121,6 +117,28 @@ class LinearRun(NamedTuple):
             statistics=record["statistics"],
             measures={int(site): row for site, row in record["measures"].items()},  # JSON has no numbers as keys
         )
+
+
+def simulate_linear(case: Case, comm: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Simulate the linear run of ``case`` on all ranks of ``comm``; returns its dataset and its statistics.
+
+    The dataset is empty on all ranks but the first. Raises StoppedError, or RuntimeError if the run fails.
+    """
+    memory = RunMemory(comm)
+    result = completed(simulate(linear_case(case), memory, comm, stop=stop))
+    run = xr.Dataset()
+    if memory.dataset is not None:
+        run = memory.dataset
+    return run, result.statistics
+
+
+def linear_arrival(case: Case, comm: MPI.Comm, stop: StopRequest) -> float | None:
+    """The time in s at which the linear wave of ``case`` arrives at its first site; None without sites.
+
+    All ranks of ``comm`` must call it: they simulate the linear run together.
+    """
+    run, statistics = simulate_linear(case, comm, stop)
+    return on_root(comm, lambda: LinearRun.of(run, statistics, sites=(), names=()).arrival_at(first_site_cell(case)))
 
 
 def envelope_squares(run: xr.Dataset, stops: Sequence[int]) -> np.ndarray:

@@ -16,7 +16,6 @@ import xarray as xr
 import vipetsc
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.result import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
@@ -207,12 +206,12 @@ class RecordedRuns:
         """
         on_root(self.team, lambda: self._append(key, record, kind))
 
-    def simulate(self, case: Case, output: RunOutput, opening: Callable[[], Opening | None] | None = None) -> Result:
-        """Run ``case`` on all ranks of the team into ``output``, with an ``opening`` as in ``dynamics.simulate``.
+    def simulate(self, case: Case, output: RunOutput) -> Result:
+        """Run ``case`` on all ranks of the team into ``output``.
 
         Raises StoppedError if the run was stopped, RuntimeError if it failed.
         """
-        return completed(simulate(case, output, self.team, stop=self.stop, opening=opening))
+        return completed(simulate(case, output, self.team, stop=self.stop))
 
     def run_in_memory(self, case: Case) -> tuple[xr.Dataset, Result]:
         """Dataset of a run of ``case`` by the team, empty on all ranks but its first, and how it ended.

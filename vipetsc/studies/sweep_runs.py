@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, Sweep
-from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.recorded_sizes import recorded_cells
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import origin
@@ -19,10 +18,9 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import Record
 from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
-from vipetsc.parallel import StopRequest, on_every_rank, on_root
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
-from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly, history_bytes
 from vipetsc.studies.linear_run import (
     LINEAR,
     MARGIN,
@@ -33,6 +31,7 @@ from vipetsc.studies.linear_run import (
     first_site_cell,
     linear_name,
     measured,
+    simulate_linear,
 )
 from vipetsc.studies.pool import reason_of
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
@@ -66,7 +65,6 @@ class SweepRuns:
         self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, ranks=plan.options.ranks, failures=(Exception,))
         self.linear: dict[str, LinearRun] = {}
         self.failed: dict[tuple[str, int], str] = {}
-        self._histories = LinearHistories()
         # Members use one block of memory for their fields, one after the other: none is needed once it is measured.
         self._fields = FieldMemory()
 
@@ -99,48 +97,10 @@ class SweepRuns:
         Returns its record. Raises StoppedError, or RuntimeError if the run fails.
         """
         name = linear_name(case)
-        history = self._make_history(case)
-
-        def measure() -> Record:
-            entropies = history.opening_entropies(samples=history.run.sizes["time"], factor=1.0)
-            linear = LinearRun.of(
-                history.run, history.statistics, sites=sites, names=self.measures, entropies=entropies
-            )
-            return linear.record(name)
-
-        record = on_root(self.recorded.team, measure)
-        self._keep(name, history, case)
-        return record
-
-    def _make_history(self, case: Case) -> LinearHistory:
-        """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if the run fails."""
-        return LinearHistory.of(case, self.recorded.team, self.recorded.stop)
-
-    def _keep(self, name: str, history: LinearHistory, case: Case) -> None:
-        """Keep the ``history`` of the linear run ``name`` of ``case`` for the members that begin from it.
-
-        All ranks of the team must call it: if one has too little memory, all raise MemoryError and keep nothing.
-        """
-        if not begins_linearly(self.plan, case):
-            return
-        size = history_bytes(case)
-        if not self.plan.options.fields:
-            history = on_every_rank(self.recorded.team, history.with_velocity_alone)
-            size = history_bytes(case, fields=1)
-        self._histories.keep(name, history, size)
-
-    def _opening(self, case: Case, name: str) -> Opening | None:
-        """The samples with which ``case`` begins, from the linear run ``name``, which is simulated if it is not kept.
-
-        Raises as ``_make_history``.
-        """
-        if not begins_linearly(self.plan, case):
-            return None
-        if self._histories.get(name) is None:
-            self._keep(name, self._make_history(case), case)
-        history = self._histories.get(name)
-        assert history
-        return history.opening(case)
+        run, statistics = simulate_linear(case, self.recorded.team, self.recorded.stop)
+        return on_root(
+            self.recorded.team, lambda: LinearRun.of(run, statistics, sites=sites, names=self.measures).record(name)
+        )
 
     def make_members(self, numbers: Iterable[int], progress: bool) -> int:
         """Simulate or scale the members with these ``numbers``; returns how many succeeded. Collective."""
@@ -172,7 +132,7 @@ class SweepRuns:
         if scales and bool((linear.reached(case) < MARGIN).all()):
             record = _scaled(case, linear, name, site)
         else:
-            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), name)
+            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site))
         return record | {"rtol": case.time.rtol}
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
@@ -201,12 +161,12 @@ class SweepRuns:
         self._take_linear(name, sites, record)
         return self.linear[name]
 
-    def _simulate(self, case: Case, folder: Path, arrival: float | None, name: str) -> Record:
+    def _simulate(self, case: Case, folder: Path, arrival: float | None) -> Record:
         """Simulate and measure a member of which all samples and cells are recorded; returns its record.
 
         If the sweep keeps fields, its run is written to ``folder``, cut down to what the case keeps. ``arrival`` is the
-        time in s at which the linear wave arrives at the first site, ``name`` the name of the linear run. Raises
-        StoppedError, or RuntimeError if the run fails.
+        time in s at which the linear wave arrives at the first site. Raises StoppedError, or RuntimeError if the run
+        fails.
         """
         fields = self.plan.options.fields
         all_kept = keeps_all(case) and "displacement" in case.output.fields
@@ -231,20 +191,14 @@ class SweepRuns:
             simulated = _with_everything(case, [*FIELDS])
             if all_kept:
                 simulated = case
-        # Also for a run that is resumed behind its opening: its measures use it, and have the bits of a run in one go.
-        opening = self._opening(case, name)
-        result = self.recorded.simulate(simulated, output, lambda: opening)
+        result = self.recorded.simulate(simulated, output)
 
         def measure() -> Record:
-            entropies = None
-            history = self._histories.get(name)
-            if opening and history:
-                entropies = history.opening_entropies(opening.samples, opening.factor)
             run = memory.dataset
             if run is None:
                 run = open_run(folder / "run.h5")
             with run:
-                analysis = analyse(run, self.measures, arrival, case=simulated, opening=entropies)
+                analysis = analyse(run, self.measures, arrival, case=simulated)
                 if fields and not all_kept:
                     write_netcdf(folder / "run.h5", thinned(run, case).assign_attrs(case=case.to_toml()))
             if fields:

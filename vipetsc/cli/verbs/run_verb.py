@@ -24,7 +24,6 @@ from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
-    from vipetsc.studies.linear_history import MemberHistory
 
 MEMBER = argument(
     "--member",
@@ -57,17 +56,8 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
-    from vipetsc.studies.linear_history import MemberHistory
 
-    # As in its sweep, a member begins from its linear run, and so has the same bits.
-    linear = None
-    opening = None
-    if work.options.member:
-        # Read by one rank: one that could not read the file would leave the others, which wait for it.
-        plan = on_root(work.comm, lambda: _sweep_of(work.options))
-        linear = MemberHistory(plan, case, work.comm, work.stop)
-        opening = linear.opening
-    result = simulate(case, work.folder, work.comm, opening=opening, **work.keywords)
+    result = simulate(case, work.folder, work.comm, **work.keywords)
     work.warn(result.warnings)
     faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
     work.report(run_table(result, faster))
@@ -81,7 +71,7 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     has_fields = bool(case.output.fields) and has_two_samples
     has_points = bool(case.output.points) and has_two_samples
     if has_fields or has_points:
-        measure_unless_measured(work, linear)
+        measure_unless_measured(case, work)
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
         measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
         work.warn(unsettled)
@@ -90,17 +80,15 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     return Outcome(complete=result.complete, drawable=has_fields)
 
 
-def measure_unless_measured(work: Work, linear: "MemberHistory | None") -> None:
-    """Measure the run in the folder of ``work`` if its measures are missing or older than the run; collective.
-
-    ``linear`` is the linear run of a member of a sweep, None for a run that is no member.
-    """
+def measure_unless_measured(case: Case, work: Work) -> None:
+    """Measure the run of ``case`` in the folder of ``work`` if its measures are missing or older; collective."""
     from vipetsc.studies.analysis_options import is_measured
+    from vipetsc.studies.linear_run import linear_arrival
     from vipetsc.studies.reanalysis import measure_run
 
     if on_root(work.comm, lambda: is_measured(work.folder)):
         return
-    if linear is None:
+    if not work.options.member:
         measure_run(work.folder, comm=work.comm)
         return
 
@@ -109,7 +97,7 @@ def measure_unless_measured(work: Work, linear: "MemberHistory | None") -> None:
     sweep = Path(work.options.case)
     if sweep.is_file():
         sweep = sweep.parent
-    measure_run(work.folder, sweep, comm=work.comm, find_arrival=linear.arrival)
+    measure_run(work.folder, sweep, comm=work.comm, find_arrival=lambda: linear_arrival(case, work.comm, work.stop))
 
 
 def run_rows(case: Case, ranks: int) -> Rows:

@@ -17,7 +17,7 @@ from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.drives import Drives
-from vipetsc.dynamics.engine import FillResult, OpeningEngine
+from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
@@ -149,7 +149,7 @@ def take_steps(
     return error, tracks.log
 
 
-class Propagator(OpeningEngine):
+class Propagator(Engine):
     """Advances a lattice from sample to sample; see ``Engine``."""
 
     name = "propagator"
@@ -297,15 +297,7 @@ class Propagator(OpeningEngine):
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         self._forces.restore(checkpoints)
-        self._begin_after(int(checkpoints[0]["steps"]), checkpoints)
-
-    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        self._forces.open(checkpoints)
-        # Steps of this engine up to the last sample: the other run's may have another length.
-        self._begin_after((int(checkpoints[0]["samples"]) - 1) * self._record.parts, checkpoints)
-
-    def _begin_after(self, steps: int, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go to the state of ``checkpoints``, as if after so many ``steps``."""
+        steps = int(checkpoints[0]["steps"])
         self._saved = None
         self._layout.restore(checkpoints, self._components[steps % 2])
         self._record.progress["steps"] = steps

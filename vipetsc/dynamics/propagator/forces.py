@@ -272,17 +272,6 @@ class Forces:
         self.clusters.state[:] = forces["cluster"][self.dofs.first[:-1]]
         self.tracker.restore(tables["sites"])
 
-    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on from the ``checkpoints`` of a run that has the drives alone; the sites stay at rest.
-
-        Each has the table ``forces`` (dof,) of ``checkpoint``.
-        """
-        forces = join(checkpoints, {"forces": "number"})["forces"]
-        driven = np.flatnonzero(self._numbers < 0)
-        rows = forces[np.searchsorted(forces["number"], self._numbers[driven])]
-        self.clusters.energy[driven] = rows["energy"]
-        self.clusters.state[np.searchsorted(self.dofs.first, driven, side="right") - 1] = rows["cluster"]
-
 
 def _site_numbers(groups: Groups, model: Model) -> np.ndarray:
     """The numbers (dof,) of the sites in ``groups``, -1 for springs and drives."""
