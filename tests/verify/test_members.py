@@ -14,6 +14,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.read import open_ensemble
 from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
+from vipetsc.studies import sweep_runs
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED
 from vipetsc.studies.linear_run import MEMBERS, linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
@@ -222,10 +223,10 @@ def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
 def test_all_members_say_alike_why_their_linear_run_failed(tmp_path, monkeypatch):
     """All members have the reason for which their linear run failed, with the error's type: memory was too small."""
 
-    def fail(self, case):
+    def fail(*arguments):
         raise MemoryError("Unable to allocate 1.00 TiB")
 
-    monkeypatch.setattr(SweepRuns, "_make_history", fail)
+    monkeypatch.setattr(sweep_runs, "simulate_linear", fail)
     table = TABLE | {"sweep": {"drive": {"amplitude": [1e-3, 2e-3, 3e-3]}}}
     run_sweep(Sweep.from_table(table), tmp_path / "out")
 
