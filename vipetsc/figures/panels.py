@@ -192,11 +192,7 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     stops = model.gaps or [(gap, gap) for gap in chain.clearances]
     depth = []
     for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, stops, strict=True):
-        # Cells from 0. The resonator may be in the next cell, which of a ring's last cell is the first one. A lattice
-        # with ends has no such contact in its last cell.
-        w = u[:, (cell + pair.next_cell) % chain.cells, pair.resonator]
-        if pair.host >= 0:  # a contact with the ground has no host
-            w = w - u[:, cell, pair.host]
+        w = pair.relative(u, cell)
         depth.append(np.maximum(np.maximum(w - plus, -w - minus), 0.0))
     return np.array(depth)
 

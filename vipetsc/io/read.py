@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice.chain import cells_between
+from vipetsc.lattice.chain import nearest_site
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -101,13 +101,9 @@ def field_interval(run: xr.Dataset) -> float:
 
 def first_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
-    cells = run["sites/cell"].values
-    if not len(cells):
-        return None
     case = tomllib.loads(run.attrs["case"])
     lattice = case["lattice"]
-    distance = cells_between(cells, case["drive"]["cell"], lattice["cells"], lattice["ends"])
-    return int(np.argmin(distance))
+    return nearest_site(run["sites/cell"].values, case["drive"]["cell"], lattice["cells"], lattice["ends"])
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:

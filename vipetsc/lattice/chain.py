@@ -28,6 +28,17 @@ class Pair(NamedTuple):
     resonator: int
     next_cell: bool = False
 
+    def relative(self, field: np.ndarray, cell: int) -> np.ndarray:
+        """Return the motion (...) of the resonator relative to its host in a ``cell`` (0-based).
+
+        ``field`` (..., cell, dof) is the displacement or the velocity of all cells. The resonator may be in the next
+        cell, which of a ring's last cell is the first one; the ground does not move.
+        """
+        w = field[..., (cell + self.next_cell) % field.shape[-2], self.resonator]
+        if self.host < 0:
+            return np.asarray(w)
+        return np.asarray(w - field[..., cell, self.host])
+
 
 class Entries(NamedTuple):
     """Entries of a matrix over all masses, in their order: ``rows``, ``columns``, ``values`` (entry,).
@@ -325,6 +336,17 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
     # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow as they run along it.
     order = "MMD_AT_PLUS_A" if ends == "periodic" else "COLAMD"
     return float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
+
+
+def nearest_site(sites: ArrayLike, cell: int, cells: int, ends: Ends) -> int | None:
+    """Return the number, from 0, of that of the ``sites`` (site,) which is nearest to a ``cell``; None without sites.
+
+    The first of two at the same distance counts. The site nearest to the drive is the one that its wave meets first.
+    """
+    distance = cells_between(sites, cell, cells, ends)
+    if not distance.size:
+        return None
+    return int(np.argmin(distance))
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:

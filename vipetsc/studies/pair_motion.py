@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
-from vipetsc.lattice import UnitCell
 from vipetsc.lattice.chain import Pair
 
 
@@ -23,42 +22,17 @@ class PairMotion(NamedTuple):
     velocity: np.ndarray
 
     @classmethod
-    def of(cls, run: xr.Dataset, cell: UnitCell, columns: Sequence[int] | slice = slice(None)) -> Self:
-        """The motion of the pair of ``cell`` in those ``columns`` of the recorded cells of a ``run``.
-
-        The run has all samples of both fields.
-        """
-        displacement = run["displacement"].values[:, columns]
-        velocity = run["velocity"].values[:, columns]
-        return cls(
-            time=run["time"].values,
-            displacement=displacement[..., cell.resonator] - displacement[..., cell.host],
-            velocity=velocity[..., cell.resonator] - velocity[..., cell.host],
-        )
-
-    @classmethod
     def between(cls, run: xr.Dataset, columns: Sequence[int], pairs: Sequence[Pair]) -> Self:
         """The motion of ``pairs``, each with its host in one of the ``columns`` of the recorded cells of a ``run``.
 
         A pair that joins cells has its resonator in the next column, behind the last one in the first.
         """
-        motions = []
-        for name in ("displacement", "velocity"):
-            field = run[name].values
-            relative = []
-            for column, pair in zip(columns, pairs, strict=True):
-                w = field[:, (column + pair.next_cell) % field.shape[1], pair.resonator]
-                # The ground does not move.
-                if pair.host >= 0:
-                    w = w - field[:, column, pair.host]
-                relative.append(w)
-            motions.append(np.stack(relative, axis=1))
-        displacement, velocity = motions
-        return cls(time=run["time"].values, displacement=displacement, velocity=velocity)
 
-    def largest(self) -> list[float]:
-        """Largest |w| (pair) in m at or between the samples."""
-        return self.reached([(1.0, 1.0)] * self.displacement.shape[1])
+        def relative(name: str) -> np.ndarray:
+            field = run[name].values
+            return np.stack([pair.relative(field, column) for column, pair in zip(columns, pairs, strict=True)], axis=1)
+
+        return cls(time=run["time"].values, displacement=relative("displacement"), velocity=relative("velocity"))
 
     def reached(self, gaps: Sequence[tuple[float, float]]) -> list[float]:
         """Largest w (pair) on either side, at or between the samples, over the clearance there.

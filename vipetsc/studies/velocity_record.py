@@ -12,7 +12,7 @@ from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.read import field_interval, field_time
 from vipetsc.lattice import wave_bands
-from vipetsc.lattice.chain import cells_between
+from vipetsc.lattice.chain import nearest_site
 
 
 class VelocityRecord:
@@ -42,10 +42,8 @@ class VelocityRecord:
         self.interval = field_interval(run)
         self.cells = run["cell"].values
         sites = run["sites/cell"].values
-        self.site = None
-        if sites.size:
-            distance = cells_between(sites, case.drive.cell, case.lattice.cells, case.lattice.ends)
-            self.site = int(sites[np.argmin(distance)])
+        first = nearest_site(sites, case.drive.cell, case.lattice.cells, case.lattice.ends)
+        self.site = None if first is None else int(sites[first])
 
         # Rounded up: a map has at most so many pixels on either side.
         self.sizes = (-(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels))
