@@ -82,7 +82,7 @@ def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [("nnm.modes=[7]", "2 modes"), ("nnm.flow=rk4", "nnm.flow"), ("nmn.flow=1", "did you mean nnm")],
+    [("nnm.modes=[7]", "2 modes"), ("nnm.map=third", "nnm.map"), ("nmn.map=1", "did you mean nnm")],
 )
 def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
     """A wrong key or value is refused with a hint and exit code 2, and no folder is created."""

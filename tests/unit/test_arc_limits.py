@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets
+from tests.reference_flows import FiniteDifferences, Tsrk
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
 from vipetsc.modes.branches.branch import Branch
@@ -22,7 +23,6 @@ from vipetsc.modes.shooting.arc_limits import MOST_LONGER, ArcLimits
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.reference import FiniteDifferences, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System

@@ -300,7 +300,6 @@ def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
         ("1000.0", "nnm.start_frequency"),
         ("", "nnm.start_frequency"),
         ("4000.0]\nstart_sites = [2", "nnm.start_sites"),
-        ("4000.0]\ncompare = ['tsrk'", "nnm.compare"),
         ("4000.0]\nharmonics = [3", "nnm.harmonics"),
     ],
 )
@@ -333,7 +332,7 @@ def test_branches_shot_with_dense_matrices_have_no_start_frequency(system):
     ("nnm", "message"),
     [
         ({"shooting": "dense"}, "needs nnm.shooting"),
-        ({"compare": ["newmark"]}, "needs dense matrices"),
+        ({"switch": ["branch-point"]}, "needs dense matrices"),
         ({"system": "reduced", "start_frequency": [], "multipliers": 3}, 'is for "chain"'),
         ({"shooting": "newton"}, "nnm.shooting"),
     ],

@@ -18,7 +18,6 @@ from vipetsc.modes.problem import unit
 from vipetsc.modes.shooting.charts import Relative
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.reference import Newmark
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
 
@@ -145,21 +144,3 @@ def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
         assert monitor._returned(SimpleNamespace(episodes=0, frequency=5.1)) is None
         found = monitor._returned(SimpleNamespace(episodes=0, frequency=5.0 + 1e-12, energy=2.0, index=7))
     assert found == "returned to linear mode 3 at E = 2 J (point 7)"
-
-
-@pytest.mark.slow
-def test_a_branch_that_stands_still_says_so():
-    """A branch by Newmark's rule stands still at grazing, and the monitor reports it.
-
-    Newmark's rule evaluates contacts at the ends of steps only.
-    """
-    monitor = BranchMonitor(Shooting(Dop853Flow(reduced_model()), MAPS["quarter"]), Guards(standstill=20))
-    problem = Shooting(Newmark(reduced_model()), MAPS["quarter"])
-    start = linear_start(problem, OUT_OF_PHASE, 0.0293434)
-    continuation = Continuation(problem, start, NnmTable(points=100, chart="auto"))
-
-    finding = next(text for text in map(monitor.check, continuation) if text)
-
-    assert finding.startswith("does not advance: 20 points up to ")
-    # The energy at which the mode touches its stop.
-    assert "E = 0.0293434562 J" in finding

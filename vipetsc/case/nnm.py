@@ -70,7 +70,7 @@ class NnmCase(CaseFile):
     output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "nnm"
-    kept_by_resume: ClassVar[str] = "the system, map and flow with which its branches were started"
+    kept_by_resume: ClassVar[str] = "the system and the map with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
         "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself"
     }
@@ -174,11 +174,11 @@ class NnmCase(CaseFile):
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 
     def physics(self) -> tuple[Any, ...]:
-        """Keys that a resumed branch must keep: the system, the shooting map and the flow."""
+        """Keys that a resumed branch must keep: the system and the shooting map."""
         nnm = self.nnm
         # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
-        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
+        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, begun
 
     @property
     def krylov(self) -> bool:

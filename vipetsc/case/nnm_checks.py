@@ -219,7 +219,7 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
     foreign: tuple[str, ...]
     if nnm.system == "condensed" or nnm.method == "condensed":
         method = "shot"
-        foreign = ("compare", "switch")
+        foreign = ("switch",)
     elif nnm.system == "chain" and nnm.start_frequency:
         # Localised motions of a chain begin at this frequency and at the start sites: both keys apply.
         return
@@ -287,7 +287,7 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
         yield Problem(f"nnm.{key}", getattr(nnm, key), f'{NOT_VARIED}; omit it, or system = "condensed"')
         return
     if krylov:
-        for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):
+        for key in ("switch", "orbits_at"):
             if getattr(nnm, key) != NnmTable.model_fields[key].default:
                 yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
     if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):

@@ -143,13 +143,6 @@ class NnmTable(Section):
     map: Literal["auto", "quarter", "half", "whole"] = described(
         "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
     )
-    flow: Literal["compiled", "tsrk", "newmark"] = described(
-        "integrator: compiled Dormand-Prince 8(5,3), PETSc's 8vr, or Newmark's method with 2000 steps per period",
-        "compiled",
-    )
-    jacobian: Literal["variational", "differences"] = described(
-        "derivative of the map, from variational equations or finite differences", "variational"
-    )
     chart: Literal["auto", "relative", "logarithmic", "grazing"] = described(
         "unknowns: displacements over the clearance, their logarithms, or square roots of the distance to"
         " contact; auto: grazing near contact",
@@ -176,9 +169,6 @@ class NnmTable(Section):
     orbits_at: list[Positive] = described(
         "energies at which orbits are stored, wherever the branch passes them", [], unit="J"
     )
-    compare: list[Literal["compiled", "tsrk", "newmark"]] = described(
-        "further flows that correct every fourth point, for comparison", []
-    )
     switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = described(
         "kinds of special points at which crossing branches are followed", []
     )
@@ -188,8 +178,7 @@ class NnmTable(Section):
 
     def is_krylov(self, dofs: int, is_linear: bool = True) -> bool:
         """Whether orbits of a lattice of so many masses, with linear springs or others, are shot without matrices."""
-        # Other flows, branch switching and difference quotients work on the whole matrix of derivatives.
-        needs_dense = self.compare or self.switch or self.flow != "compiled" or self.jacobian != "variational"
+        # Branch switching works on the whole matrix of derivatives.
         needs_krylov = bool(self.start_frequency or self.multipliers)
-        is_chosen = is_linear and (needs_krylov or (dofs > FEW_MASSES and not needs_dense))
+        is_chosen = is_linear and (needs_krylov or (dofs > FEW_MASSES and not self.switch))
         return self.method == "shooting" and self.shooting != "dense" and (is_chosen or self.shooting == "krylov")

@@ -11,8 +11,7 @@ On a k:1 internal *resonance* one mode moves k times while the other moves once.
 leaves its trend and comes back, with an energy fold at the tip. The files have k at energy folds.
 
 *Regions* of the energy (``modes.branches.regions``): I no contact, II grazing, III vibro-impact, IV the smooth limit,
-where the clearance is negligible; 0 where there are only smooth springs. *Flows* are time integrators: the files may
-compare points of a branch with orbits that other flows than its own have found.
+where the clearance is negligible; 0 where there are only smooth springs.
 """
 
 import tomllib
@@ -46,7 +45,6 @@ HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 # the tongues are labelled by their resonance instead, at their highest fold.
 MOST_MARKS = 12
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
-LEAST_DIFFERENCE = 1e-17  # drawn in place of 0, for which a logarithmic axis has no place; it is below all rounding
 
 SLOPE = r"|d$f$/d$E$| (Hz/J)"
 
@@ -68,7 +66,7 @@ CURVE_POINTS = 4000
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
-    """Draw frequency, slope, differences of flows, damping and phase portraits of the branches in ``paths``.
+    """Draw frequency, slope, damping and phase portraits of the branches in ``paths``.
 
     Each branch has a column. A panel is there if one of the branches has what it shows. Raises OSError or ValueError
     for a file that holds no branch.
@@ -76,13 +74,9 @@ def backbone(paths: Sequence[Path]) -> Figure:
     branches = [_read(path) for path in paths]
 
     # All columns have the panels that one of them needs, so that their axes are side by side.
-    has_flows = any(_holds(branch, "flows/") for branch in branches)
     has_orbits = any(_holds(branch, "orbits/number") for branch in branches)
     draw_panels = [frequency_energy, slope]
     heights = [FREQUENCY_HEIGHT, OTHER_HEIGHT]
-    if has_flows:
-        draw_panels.append(flow_differences)
-        heights.append(OTHER_HEIGHT)
     if any("damping_ratio" in branch for branch in branches):
         draw_panels.append(draw_losses)
         heights.append(OTHER_HEIGHT)
@@ -236,29 +230,6 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
     if label:
         axes.legend(loc="lower left", fontsize=5.5)
     axes.set_ylabel(SLOPE)
-
-
-def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw how far orbits of other flows are from the branch at one amplitude, relative to it, over energy.
-
-    Marks of the frequency are full, those of the energy are open.
-    """
-    paths = [str(name) for name in branch.variables if str(name).startswith("flows/")]
-    flows = list(dict.fromkeys(path.split("/")[1] for path in paths))
-    if not flows:
-        annotate_empty(axes, "no other flow was compared")
-        return
-
-    # One colour for each of the three flows that there are.
-    for name, colour in zip(flows, (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
-        energy = branch[f"flows/{name}/energy"]
-        for key, face in (("frequency", colour), ("energy", "white")):
-            # Flows that agree to the last bit differ by 0, which would be missing from the panel.
-            difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), LEAST_DIFFERENCE)
-            look = {"ms": 2.2, "mec": colour, "mfc": face, "mew": 0.5}
-            axes.loglog(energy, difference, "o", label=f"{name}: {key}", **look)
-    axes.set(ylabel="relative difference", ylim=(None, 10.0))  # room for the legend
-    axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
 def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:

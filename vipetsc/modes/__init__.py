@@ -39,7 +39,6 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.reference import Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System

@@ -1,11 +1,10 @@
-"""Checks of a branch: retracing and the return to the linear mode; comparison of its orbits by several flows."""
+"""Checks of a branch: retracing and the return to the linear mode; its orbits in files."""
 
 import numpy as np
 
 from vipetsc.case.nnm_table import Guards
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.shooting import Shooting
 
@@ -22,10 +21,6 @@ SAME_DIRECTION = 0.999
 # latest steps that are looked at then lie 1.2 of the point's own steps away, or more.
 LATEST = 6
 FEWEST = 10
-# One of COMPARED_EVERY points is compared with another flow. Its Newton's method begins with unknowns that are off the
-# orbit by OFF: from the orbit itself it would not move if the residual of that flow were below the tolerance there.
-COMPARED_EVERY = 4
-OFF = 1e-6
 
 
 def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,40 +138,4 @@ def sampled(problem: Shooting, points: list[Point]) -> Variables:
         "orbits/number": variable("orbit", [p.index for p in points], "1", "number of the regular point"),
         "orbits/displacement": variable(axes, displacement, "m", "displacement"),
         "orbits/velocity": variable(axes, velocity, "m/s", "velocity"),
-    }
-
-
-def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
-    """Energy and frequency by ``flow`` at one of ``COMPARED_EVERY`` points, as variables of the branch's file.
-
-    The orbits are corrected by the other flow while the first contact's w (or the largest displacement) is kept: with
-    the energy or the frequency kept the comparison would be ill-posed where the branch is vertical or flat. The
-    differences are the flow's values over those of the branch, less 1; NaN where Newton's method fails.
-    """
-    problem = Shooting(flow, reference.map, max(reference.tolerance, 1e-12))
-    contacts = problem.system.contacts
-    chosen = points[::COMPARED_EVERY]
-    energy = np.full(len(chosen), np.nan)
-    frequency = np.full(len(chosen), np.nan)
-    for i, point in enumerate(chosen):
-        frame = problem.relative_frame(point.x, point.period)
-        held = int(np.abs(point.x).argmax())
-        if contacts:
-            held = contacts[0].resonator
-        row = np.zeros(len(frame.xi))
-        row[held] = 1.0
-        attempt = frame.solve(frame.xi + OFF * (1 - row), row, row @ frame.xi)
-        if attempt.converged:
-            x, period = frame.chart.decode(attempt.xi)
-            energy[i] = problem.energy(x) / point.energy - 1
-            frequency[i] = point.period / period - 1
-
-    axis = f"compared_{flow.name}"
-    group = f"flows/{flow.name}"
-    text = "relative {} difference of " + f"{flow.name} at the same amplitude"
-    return {
-        axis: variable(axis, [p.index for p in chosen], "1", f"number of the point compared with {flow.name}"),
-        f"{group}/energy": variable(axis, [p.energy for p in chosen], "J", "energy of the branch"),
-        f"{group}/energy_difference": variable(axis, energy, "1", text.format("energy")),
-        f"{group}/frequency_difference": variable(axis, frequency, "1", text.format("frequency")),
     }

@@ -13,7 +13,7 @@ from vipetsc.case import NnmCase
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, sampled
+from vipetsc.modes.branches.branch_checks import BranchMonitor, sampled
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
@@ -24,17 +24,13 @@ from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.maps import MAPS, ShootingMap
-from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.shooting_equations import ShootingEquations
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
 
-# The flows by their names in case files.
-FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
 # What divides the energy at which a mode first touches a contact, and the largest force of springs that are not linear
 # over the linear force: a branch begins below both. Its start is then linear, or almost: the numbers decide where a
 # branch begins, not its course. A mode that feels neither is linear at every energy, and begins at the last number in
@@ -135,7 +131,7 @@ def start_energy(options: NnmTable, system: System, mode: int) -> float:
 
 
 class ShootingMethod(NnmMethod):
-    """Branches of orbits by ``Shooting``, with the checks that half-traces and other flows allow."""
+    """Branches of orbits by ``Shooting``, with the checks that half-traces allow."""
 
     kind = ORBITS
 
@@ -147,10 +143,8 @@ class ShootingMethod(NnmMethod):
         self.locates_grazing = options.locate_grazing
         self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
 
-        flow = FLOWS[options.flow](self.system)
-        if options.jacobian == "differences":
-            flow = FiniteDifferences(flow)
-        self.shooting = Shooting(flow, map_of(options, self.system), options.tolerance, options.max_newton)
+        shooting_map = map_of(options, self.system)
+        self.shooting = Shooting(Dop853Flow(self.system), shooting_map, options.tolerance, options.max_newton)
 
     def new_branch(self, name: str) -> Branch[Point]:
         """A branch without points."""
@@ -182,11 +176,9 @@ class ShootingMethod(NnmMethod):
         return BranchMonitor(problem, self.options.guards).check
 
     def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
-        """Add the orbits of a branch, and the comparison with other flows."""
+        """Add the orbits of a branch."""
         orbits = [*self._typical(branch), *self.asked(problem, branch)]
         branch.extra = sampled(self.shooting, orbits)
-        for name in self.options.compare:
-            branch.extra |= compare(self.shooting, branch.regular(), FLOWS[name](self.system))
 
     def _typical(self, branch: Branch[Point]) -> list[Point]:
         """The regular points in the middle of every region."""

@@ -11,9 +11,8 @@ The n equations for n + 1 unknowns leave a curve of solutions, the branch. The w
 comparison, but its equations are worse conditioned (``maps``).
 
 **Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated together with the orbit (``flow``;
-``dop853``: Dormand and Prince's pair, Hairer et al. 1993; ``reference``: PETSc's methods, Newmark's rule). At a
-contact change h(u) = |w| - D = 0 the slope f' jumps, and S passes it with the saltation matrix (Leine and Nijmeijer
-2004, ch. 7)
+``dop853``: Dormand and Prince's pair, Hairer et al. 1993). At a contact change h(u) = |w| - D = 0 the slope f' jumps,
+and S passes it with the saltation matrix (Leine and Nijmeijer 2004, ch. 7)
 
     S+ = (I + (g+ - g-) grad h^T / (grad h^T g-)) S-,
 
@@ -38,6 +37,5 @@ from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.shooting.maps import MAPS, ShootingMap
 from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
-from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
