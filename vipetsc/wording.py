@@ -1,6 +1,7 @@
 """Numbers with nouns and names with units, as tables, messages and pictures write them."""
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 
 MOST_SHOWN = 8  # entries of a list, which with the number of all of them fit on a line
 
@@ -21,6 +22,12 @@ def counted(number: int | str, noun: str) -> str:
     if noun.endswith("s"):
         noun += "e"
     return f"{text} {noun}s"
+
+
+def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
+    """Return the one of the ``valid`` names that a misspelt ``name`` is nearest to; empty if none is near."""
+    near = difflib.get_close_matches(name, list(valid), n=1, cutoff=cutoff)
+    return near[0] if near else ""
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -8,10 +8,11 @@ import pytest
 from pydantic import ValidationError
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError, LawCase
+from vipetsc.case import Case, CaseError, LawCase, NnmCase
 from vipetsc.case.case_file import sections_in
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics.propagator.step_choice import refusal
@@ -260,3 +261,21 @@ def test_a_step_that_is_far_too_long_is_refused_without_an_overflow(grounding, c
     )
     assert "is too long for" in refusal(case.model())
     assert dict(run_rows(case, 1))["engine"].startswith("ts")
+
+
+@pytest.mark.parametrize(
+    ("kind", "table", "key"),
+    [
+        (NfrcCase, {"nfrc": {"range": [2.0, 1.0]}}, "nfrc.range"),
+        (NnmCase, {"nnm": {"energy": [1.0, 1.0]}}, "nnm.energy"),
+        (NnmCase, {"nnm": {"frequency": [2.0, 1.0]}}, "nnm.frequency"),
+        (OptimiseCase, {"optimise": {"variables": {"clearance": [1e-2, 1e-4]}}}, "optimise.variables.clearance"),
+        (OptimiseCase, {"optimise": {"variables": {"masses": {"1": [2.0, 1.0]}}}}, "optimise.variables.masses.1"),
+        (OptimiseCase, {"optimise": {"variables": {"restitution": [0.9, 0.1]}}}, "optimise.variables.restitution"),
+    ],
+)
+def test_the_low_end_of_a_range_is_below_the_high_one(kind, table, key):
+    """One sentence for all ranges, at the path of the range."""
+    with pytest.raises(CaseError) as caught:
+        kind.from_table(table)
+    assert {problem.key: problem.remedy for problem in caught.value.problems}[key].startswith("must be [low, high]")

@@ -5,7 +5,6 @@ and, where there is one, the nearest valid key. ``CaseFile`` reads every case fr
 case is a subclass that declares the sections it reads.
 """
 
-import difflib
 import math
 import re
 import sys
@@ -32,6 +31,7 @@ from vipetsc.case.shapes import MARK
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
+from vipetsc.wording import nearest
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -319,10 +319,10 @@ def parsed(text: str, source: str) -> Table:
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     """The problem of a key that is not one of ``valid``, with the nearest one that is."""
     parents, dot, key = path.rpartition(".")
-    near = difflib.get_close_matches(key, list(valid), n=1, cutoff=0.5)
+    near = nearest(key, valid)
     remedy = f"valid keys: {', '.join(sorted(valid))}"
     if near:
-        remedy = f"did you mean {parents}{dot}{near[0]}?"
+        remedy = f"did you mean {parents}{dot}{near}?"
     return Problem(path, value, f"unknown key; {remedy}")
 
 
@@ -392,9 +392,9 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         message += f" of tables; write [[{path}]]"
     choices = details.get("expected")
     if isinstance(value, str) and choices:
-        near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
+        near = nearest(value, re.findall(r"'([^']+)'", choices), cutoff=0.4)
         if near:
-            message += f"; did you mean {near[0]!r}?"
+            message += f"; did you mean {near!r}?"
     return Problem(path, value, message)
 
 

@@ -198,10 +198,6 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         at = f"identify.unknowns[{index}]"
         quantity = unknown.quantity
         values = values_of(base, quantity)
-        low, high = unknown.bounds
-        if not low < high:
-            yield Problem(f"{at}.bounds", unknown.bounds, "must be [low, high] with low below high")
-            continue
         yield from _bounds_problems(unknown, at)
 
         # The quantity is one that the case has.
@@ -244,6 +240,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             starts = [*unknown.start]
             if len(starts) != len(groups):
                 yield Problem(f"{at}.start", unknown.start, f"give one number for each of the {len(groups)} values")
+        low, high = unknown.bounds
         if any(start is not None and not low <= start <= high for start in starts):
             yield Problem(f"{at}.start", unknown.start, f"must lie within the bounds {low:g} and {high:g}")
 
@@ -276,8 +273,6 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         # The columns of the record itself.
         if (record.time is None) == (record.rate is None):
             yield Problem(f"{at}.time", record.time, "give the column of times or the rate in Hz, one of both")
-        if isinstance(record.offset, list) and not record.offset[0] < record.offset[1]:
-            yield Problem(f"{at}.offset", record.offset, "must be a number, or bounds [low, high] with low below high")
 
         # The case of the record, which may have other drives.
         case = base

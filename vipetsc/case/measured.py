@@ -7,13 +7,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import h5py
 import numpy as np
-from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
-from vipetsc.case.schema import Finite, Positive
+from vipetsc.case.schema import Finite, Positive, Range
 from vipetsc.case.section import described
 from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.io.names import resolved_path
@@ -69,7 +68,7 @@ class RecordTable(Section):
     time: Place | None = described("column of the times: name or number from 1; of HDF5 a dataset", None)
     time_factor: Positive = described("factor that makes the times seconds", 1.0)
     rate: Positive | None = described("sample rate, in place of time", None, unit="Hz")
-    offset: Annotated[Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)], BY_SHAPE] = described(
+    offset: Annotated[Finite | Range, BY_SHAPE] = described(
         "time of the record at which the drive begins, or bounds [low, high] of an unknown one", 0.0, unit="s"
     )
     begin: Finite | None = described("first time of the record that is used", None, unit="s")

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.schema import Finite, Positive, once
+from vipetsc.case.schema import Positive, Range, once
 from vipetsc.case.section import described
 from vipetsc.case.varied_key import is_key
 
@@ -45,12 +45,10 @@ class NfrcTable(Section):
         "parameter that varies along a curve: amplitude, frequency, or the path of a key (`contacts.clearance`)",
         "amplitude",
     )
-    range: list[Finite] = described(
+    range: Range = described(
         "[low, high] of this parameter: amplitude (of a wave over the first clearance, of a force in N, of"
         " a wall in m), rad/s, or the key's unit",
         [0.5, 2.0],
-        min_length=2,
-        max_length=2,
     )
     fixed: Annotated[list[Positive], AfterValidator(once)] = described(
         "values of the parameter that does not vary, one curve each. Over the amplitude: frequencies in"

@@ -23,9 +23,6 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     """Problems with a user-defined system, and with the bounds of a branch and its steps."""
     if (nnm.system == "own") != (nnm.custom is not None):
         yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
-    for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
-        if not low < high:
-            yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
     # On the way down the energy may tend to 0, which no number of steps in its logarithm reaches.
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.schema import Finite, Positive, once
+from vipetsc.case.schema import Finite, NotNegative, Positive, once, rising
 from vipetsc.case.section import described
 from vipetsc.case.shapes import BY_SHAPE
 
@@ -20,6 +20,8 @@ MOST_OF_LATTICE = 40_000
 # points, and cost the cube: six points in contact take 8, 25 and 237 s of CPU at 52, 100 and 200 masses, without
 # matrices 2 to 3.
 FEW_MASSES = 100
+
+Bounds = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(rising)]
 
 
 class LinearSpringTable(Section):
@@ -151,12 +153,8 @@ class NnmTable(Section):
     start_energy: Annotated[Positive | Literal["auto"], BY_SHAPE] = described(
         "energy of the first point; auto: small enough for a linear mode", "auto", unit="J"
     )
-    energy: list[Annotated[float, Field(ge=0)]] = described(
-        "range of energies; a branch ends outside it", [0.0, 1e9], unit="J", min_length=2, max_length=2
-    )
-    frequency: list[Annotated[float, Field(ge=0)]] = described(
-        "range of frequencies; a branch ends outside it", [0.0, 1e9], unit="rad/s", min_length=2, max_length=2
-    )
+    energy: Bounds = described("range of energies; a branch ends outside it", [0.0, 1e9], unit="J")
+    frequency: Bounds = described("range of frequencies; a branch ends outside it", [0.0, 1e9], unit="rad/s")
     direction: Literal["up", "down", "both"] = described("initial direction of the energy", "up")
     points: int = described("largest number of points of a branch", 20000, ge=1)
     first_step: Positive = described("first step along the branch, in units of the chart", 1e-3)

@@ -1,20 +1,20 @@
 """Objectives and constraints of a search for a design, and their checks."""
 
-import difflib
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, WithJsonSchema
+from pydantic import WithJsonSchema
 
 from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.response_measures import RESPONSE, response_measures
-from vipetsc.case.schema import Finite, Positive
+from vipetsc.case.schema import Finite, Positive, PositiveRange
 from vipetsc.case.section import described
 from vipetsc.lattice import pass_bands, wave_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
+from vipetsc.wording import nearest
 
 # Measures that only searches have; all others are numbers of every run, by their names.
 OF_SEARCHES = ("upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted")
@@ -24,7 +24,6 @@ ABOVE_DRIVEN = ("upper_share_at_end", "ibtet")  # of the energy in the bands abo
 FILE_AMPLITUDE = "a state from a file is taken as it is, with the amplitude that it has"
 # Numbers of a run's analysis that do not describe the lattice's motion.
 NO_GOAL = ("ledger_error", "entropy/start", "bands/modal_energy")
-Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
 
 class MeasuredTable(Section):
@@ -42,7 +41,7 @@ class MeasuredTable(Section):
         "upper_share_at_end",
     )
     band: int | None = described("for band_share and measures with a value per band: the pass band", None, ge=1)
-    part: Pair | None = described(
+    part: PositiveRange | None = described(
         "for band_share: a part of that band; for responses a part of nfrc.range, in its unit", None, unit="rad/s"
     )
     amplitudes: list[Positive] = described(
@@ -182,11 +181,9 @@ def measured_problems(
     elif part and band:
         low = bands[band - 1].low
         high = bands[band - 1].high
-        # Where the cell varies, so do the edges of the band: only the order is checked.
-        if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
-            yield Problem(
-                f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
-            )
+        # Where the cell varies, so do the edges of the band.
+        if not varied and (part[1] <= low or part[0] >= high):
+            yield Problem(f"{at}.part", part, f"must meet band {band}, {low:.5g}-{high:.5g} rad/s")
 
 
 def _is_of_bands(objective: MeasuredTable, base: Case) -> bool:
@@ -217,17 +214,17 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
     if objective.band:
         yield Problem(f"{at}.band", objective.band, "responses have no bands; part is a part of nfrc.range")
     low, high = case.nfrc.range
-    if objective.part and not low <= objective.part[0] < objective.part[1] <= high:
-        yield Problem(f"{at}.part", objective.part, f"must be [low, high] within nfrc.range, {low:g} to {high:g}")
+    if objective.part and not (low <= objective.part[0] and objective.part[1] <= high):
+        yield Problem(f"{at}.part", objective.part, f"must be within nfrc.range, {low:g} to {high:g}")
 
 
 def _nearest(name: str, valid: Sequence[str]) -> str:
     """A remedy for a ``name`` that is not valid: the nearest of the ``valid`` names if one is near, and all of them."""
     # 0.6 is difflib's own bound: below it proposals are guesses.
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
+    near = nearest(name, valid, cutoff=0.6)
     hint = ""
     if near:
-        hint = f"did you mean {near[0]!r}? "
+        hint = f"did you mean {near!r}? "
     return f"{hint}There are {', '.join(valid)}"
 
 

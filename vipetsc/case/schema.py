@@ -58,7 +58,17 @@ def _text(value: Any) -> Any:
     return value
 
 
+def rising(bounds: list[Any]) -> list[Any]:
+    """Return the two ``bounds`` if the first is below the second; raises ValueError."""
+    low, high = bounds
+    if not low < high:
+        raise ValueError("must be [low, high] with low below high")
+    return bounds
+
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Range = Annotated[list[Finite], Field(min_length=2, max_length=2), AfterValidator(rising)]
+PositiveRange = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(rising)]
 Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 

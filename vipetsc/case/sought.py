@@ -5,14 +5,13 @@ from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
-from vipetsc.case.schema import Finite
+from vipetsc.case.schema import Range
 from vipetsc.case.section import described
 from vipetsc.case.shapes import BY_SHAPE
 from vipetsc.lattice import UnitCell, pass_bands
@@ -62,7 +61,7 @@ class UnknownTable(Section):
         "grounding",
         "amplitude",
     ] = described("what is sought: of contact sites, of masses or springs of the cell, or the amplitude of the drive")
-    bounds: Annotated[list[Finite], Field(min_length=2, max_length=2)] = described("lower and upper bound, in SI units")
+    bounds: Range = described("lower and upper bound, in SI units")
     of: Annotated[Literal["all", "each"] | list[list[int]], BY_SHAPE] = described(
         "one value for all, one for each, or one for each group of numbers, from 1", "all"
     )

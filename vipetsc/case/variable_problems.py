@@ -11,7 +11,7 @@ from vipetsc.case.case_file import CaseError, Problem, Table, put
 from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.search_space import VariableRow, case_of, row_of, search_space
 from vipetsc.case.section import is_within
-from vipetsc.case.variables import SECTIONS, VariablesTable
+from vipetsc.case.variables import VariablesTable
 
 AT = "optimise.variables"
 # Keys of the case that are clearances; each path stands for the keys within it, too.
@@ -130,19 +130,16 @@ def _bounds_problems(bounds: VariablesTable, base: Case) -> Iterator[Problem]:
         yield Problem(f"{AT}.profile", bounds.profile, "give clearance or profile, not both")
 
     cell = base.lattice.unit_cell()
-    given = bounds.model_dump(exclude_none=True, exclude={*SECTIONS})
-    pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
-    for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
+    for kind, given, count in (
+        ("masses", bounds.masses, len(cell.masses)),
+        ("springs", bounds.springs, len(cell.springs)),
+    ):
         # Numbers are compared as texts: paths have them as they are given, and that of "01" leads to no mass or spring.
         numbers = [str(number) for number in range(1, count + 1)]
-        for name, pair in given[kind].items():
-            pairs[f"{kind}.{name}"] = pair
+        for name, pair in given.items():
             if name not in numbers:
                 yield Problem(f"{AT}.{kind}.{name}", pair, f"the cell's {kind} are numbered from 1 to {count}")
 
-    for key, (low, high) in pairs.items():
-        if key != "sites" and not low < high:
-            yield Problem(f"{AT}.{key}", [low, high], "must be [low, high] with low below high")
     if bounds.sites:
         low, high = bounds.sites
         sites = len(base.model().chain.sites)

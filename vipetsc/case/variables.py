@@ -4,16 +4,17 @@ import copy
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.objective import Pair
+from vipetsc.case.schema import PositiveRange, rising
 from vipetsc.case.section import described
 from vipetsc.case.value_ranges import leaves
 
 SECTIONS = ("lattice", "contacts", "drive", "initial", "time", "output")  # whose keys may vary
 Kind = Literal["log", "linear", "whole", "site", "choice"]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Fractions = Annotated[list[Fraction], Field(min_length=2, max_length=2), AfterValidator(rising)]
 
 
 class VariablesTable(Section):
@@ -23,18 +24,18 @@ class VariablesTable(Section):
     the case, as all of ``contacts.each`` are, is one of each entry.
     """
 
-    clearance: Pair | None = described("bounds of each site's clearance", None, unit="m")
-    profile: Pair | None = described(
+    clearance: PositiveRange | None = described("bounds of each site's clearance", None, unit="m")
+    profile: PositiveRange | None = described(
         "bounds of the clearances of the first and the last site; the others are log-spaced in between", None, unit="m"
     )
     sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = described(
         "first and last cell in which a site may be", None
     )
-    restitution: Annotated[list[Fraction], Field(min_length=2, max_length=2)] | None = described(
-        "bounds of the restitution", None
+    restitution: Fractions | None = described("bounds of the restitution", None)
+    masses: dict[str, PositiveRange] = described("bounds of masses, by their number in the cell", {}, unit="kg")
+    springs: dict[str, PositiveRange] = described(
+        "bounds of stiffnesses, by the spring's number in the cell", {}, unit="N/m"
     )
-    masses: dict[str, Pair] = described("bounds of masses, by their number in the cell", {}, unit="kg")
-    springs: dict[str, Pair] = described("bounds of stiffnesses, by the spring's number in the cell", {}, unit="N/m")
     lattice: dict[str, Any] | None = described(
         "keys of [lattice] that vary: { log, linear or whole = [low, high] }, or a list of values", None
     )
