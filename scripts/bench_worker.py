@@ -23,7 +23,6 @@ petsc4py.init(["bench", "-no_signal_handler"])
 from mpi4py import MPI
 from petsc4py import PETSc
 
-import h5py
 import numba
 import numpy as np
 from bench_ours import EngineRun
@@ -197,14 +196,12 @@ def _spread(cells: int, sites: int) -> Case:
     """A case with evenly spread ``sites``, which no wave reaches in its three samples."""
     # Sites are away from both ends, because the first end is driven.
     places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
-    # "auto" would choose by size: with the same writer rows of all sizes can be compared.
-    writer = "parallel" if h5py.get_config().mpi else "gather"
     table = {
         "name": "build",
         "lattice": {"preset": "four-band", "cells": cells},
         "contacts": {"sites": places, "clearance": 2e-3},
         "time": {"sample_interval": 2e-4, "end": 4e-4, "engine": "propagator"},
-        "output": {"fields": ["velocity"], "writer": writer, "figures": False},
+        "output": {"fields": ["velocity"], "figures": False},
     }
     return Case.from_table(table)
 

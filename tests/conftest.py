@@ -251,13 +251,6 @@ def modified(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-# Ranks write one file together; the h5py of a wheel cannot.
-needs_parallel_hdf5 = pytest.mark.skipif(
-    MPI.COMM_WORLD.size > 1 and not h5py.get_config().mpi,
-    reason="this h5py is not built for MPI (Debian: python3-h5py-mpi)",
-)
-in_parallel = pytest.param("parallel", marks=needs_parallel_hdf5)
-
 # With 0 ranks the program is called without mpirun, in a serial test.
 alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
 

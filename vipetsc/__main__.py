@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Looked for rather than imported: PETSc takes its options from the first import that starts it.
     if missing := [name for name in BUILT_FOR_MPI if find_spec(name) is None]:
         remedy = (
-            "on Debian: apt install python3-petsc4py python3-h5py-mpi, in an environment with --system-site-packages;"
+            "on Debian: apt install python3-petsc4py python3-h5py, in an environment with --system-site-packages;"
             " without root or Debian: scripts/recipes/pip in a clone creates an environment"
         )
         logging.getLogger("vipetsc").critical("vipetsc: %s not installed; %s", " and ".join(missing), remedy)

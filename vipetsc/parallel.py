@@ -177,38 +177,6 @@ def _value_or_raise(attempt: _Attempt) -> Any:
     return attempt.value
 
 
-class SortedRows(NamedTuple):
-    """Part of a table sorted over ranks: this rank's ``rows`` in order, which begin with row ``first`` of ``total``."""
-
-    rows: np.ndarray
-    first: int
-    total: int
-
-
-def sort_over_ranks(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> SortedRows:
-    """Sort the ``rows`` of all ranks by their ``keys`` and divide them anew; all ranks must call it.
-
-    ``rows`` (row,) have the ``keys`` as fields. Parts are about equally large; rows that agree in the first key stay
-    together.
-    """
-
-    def in_order(table: np.ndarray) -> np.ndarray:
-        return table[np.lexsort([table[key] for key in reversed(keys)])]
-
-    total = comm.allreduce(len(rows))
-    rows = in_order(rows)
-    if comm.size > 1 and total:
-        # Quantiles of a sample, 64 values a rank, cut the first key into about equal parts.
-        first_key = rows[keys[0]]
-        sample = np.sort(np.concatenate(comm.allgather(first_key[:: total // (64 * comm.size) + 1])))
-        quantiles = sample[np.arange(1, comm.size) * len(sample) // comm.size]
-        parts = np.split(rows, np.searchsorted(first_key, quantiles))
-        rows = in_order(np.concatenate(comm.alltoall(parts)))
-
-    first = sum(comm.allgather(len(rows))[: comm.rank])
-    return SortedRows(rows=rows, first=first, total=total)
-
-
 class SharedCounter:
     """A count that all ranks of ``comm`` draw from, one-sided: no rank has to wait on another to hand out work."""
 

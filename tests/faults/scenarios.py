@@ -6,7 +6,6 @@ import json
 import shutil
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
@@ -31,10 +30,7 @@ engine = "propagator"
 samples = 101
 rtol = 1e-8
 """
-# Debian's h5py has two builds, and loads the one with MPI only under mpirun.
-has_parallel_hdf5 = h5py.get_config().mpi or find_spec("h5py._debian_h5py_mpi")
-WRITER = "parallel" if has_parallel_hdf5 else "gather"
-TS = RUN.replace("propagator", "ts") + f'[output]\nfigures = false\nwriter = "{WRITER}"\n'
+TS = RUN.replace("propagator", "ts") + "[output]\nfigures = false\n"
 SWEEP = """
 [lattice]
 preset = "diatomic"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from types import SimpleNamespace
 
 from mpi4py import MPI
 
@@ -12,21 +11,19 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, small_case
-from vipetsc.case import CaseError
-from vipetsc.dynamics import recorded_sizes, simulate
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import RunawayError
 from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
-from vipetsc.parallel import StoppedError, StopRequest, divided, on_every_rank, on_root, sort_over_ranks
+from vipetsc.parallel import StoppedError, StopRequest, divided, on_every_rank, on_root
 
 COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parallel(2)
-@pytest.mark.parametrize("writer", ["gather", in_parallel])
-def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writer):
-    """All ranks write the same attributes, such as the duration of a run: HDF5 could not close the file otherwise."""
+def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch):
+    """All ranks have the same attributes, such as the duration of a run."""
     finish = RunFolder.finish
     outcome = []
 
@@ -35,7 +32,7 @@ def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writ
         finish(output, attributes, summary)
 
     monkeypatch.setattr(RunFolder, "finish", watch)
-    result = simulate(small_case(output={"writer": writer}, time={"end": 0.01}), folder / "run")
+    result = simulate(small_case(time={"end": 0.01}), folder / "run")
     outcome.append([result.sentence, result.statistics, result.warnings])
     assert len(set(COMM.allgather(json.dumps(outcome)))) == 1
 
@@ -44,11 +41,10 @@ def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writ
         assert file.attrs["ranks"] == COMM.size
 
 
-@needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_a_run_in_memory_is_gathered_on_rank_0(folder):
-    """The dataset of a run in memory is on rank 0, with the bits of the file that ranks write together."""
-    case = small_case(output={"writer": "parallel"}, time={"end": 0.02})
+    """The dataset of a run in memory is on rank 0, with the bits of the file."""
+    case = small_case(time={"end": 0.02})
     memory = RunMemory(COMM)
     simulate(case, memory)
     simulate(case, folder / "run")
@@ -62,67 +58,19 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
     assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
 
-@needs_parallel_hdf5
-@pytest.mark.parallel([2, 3])
-def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
-    """A file that ranks write together has the bits of a gathered one.
-
-    Each rank has several sites, which are not sorted; there are several chunks, fields of a window, and contacts that
-    are closed at the end.
-    """
-    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 20)
-    sites = {"sites": [13, 5, 6, 18, 12, 2], "clearance": [2e-4, 1e-4, 3e-5, 1e-4, 5e-5, 2e-4]}
-    # The propagator's runs take a fraction of the time of the other engine's.
-    time = {"end": 0.04, "engine": "propagator"}
-    for writer in ("gather", "parallel"):
-        output = {"writer": writer, "window": [2, 20], "every": 2, "stride": 3}
-        simulate(small_case(contacts=sites, output=output, time=time), folder / writer)
-
-    gathered = datasets(folder / "gather" / "run.h5")
-    together = datasets(folder / "parallel" / "run.h5")
-    assert len(gathered["impacts/onset"]) > 20
-    assert (gathered["energy/dissipated_by_site"][-1] > 0).sum() > 2
-    assert_same_bits(gathered, together)
-
-
-@pytest.mark.parallel([2, 3])
-def test_rows_are_sorted_over_ranks_and_none_has_all():
-    """Rows are sorted by onset, then by site, and each rank gets about the same number of them.
-
-    Ranks begin with different numbers of rows, a third rank with none.
-    """
-    random = np.random.default_rng(3)
-    table = np.zeros(900, [("onset", float), ("site", np.int64)])
-    table["onset"] = random.integers(300, size=900) / 7
-    table["site"] = random.permutation(900)
-    begin, end = ((0, 700), (700, 900), (900, 900))[COMM.rank]
-
-    rows, first, total = sort_over_ranks(COMM, table[begin:end], ("onset", "site"))
-
-    expected = np.sort(table, order=("onset", "site"))
-    assert total == len(expected)
-    assert 0 < len(rows) < 1.1 * total / COMM.size + 10
-    np.testing.assert_array_equal(rows, expected[first : first + len(rows)])
-
-
 @pytest.mark.parallel(2)
-@pytest.mark.parametrize("writer", ["gather", in_parallel])
-def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
+def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch):
     """An error of the rank that writes is raised on all ranks; the earlier run and the parts of the new one remain."""
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
     before = (path / "run.h5").read_bytes()
 
-    # Rank 0 writes a gathered file.
-    failing = COMM.size - 1 if writer == "parallel" else 0
-    case = small_case(output={"writer": writer}, time={"end": 0.02})
+    case = small_case(time={"end": 0.02})
 
+    # Rank 0 writes the file.
     def fails(*arguments):
-        if COMM.rank == failing:
-            raise OSError(28, "No space left on device")
-        put_chunks(*arguments)
+        raise OSError(28, "No space left on device")
 
-    put_chunks = chunks.put_chunks
     monkeypatch.setattr(chunks, "put_chunks", fails)
     with pytest.raises(OSError, match=r"run\.h5 could not be written"):
         simulate(case, path, force=True)
@@ -192,19 +140,19 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
     COMM.Barrier()
 
     # Two checkpoints are kept, because a rank may be killed while it writes the last one.
-    kept = sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy"))
-    assert kept == [f"state-000002-{COMM.rank}-2.npy", f"state-000003-{COMM.rank}-2.npy"]
+    kept = sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.h5"))
+    assert kept == [f"state-000002-{COMM.rank}-2.h5", f"state-000003-{COMM.rank}-2.h5"]
     COMM.Barrier()
 
     if COMM.rank == 1:
-        (parts / "state-000003-1-2.npy").unlink()
+        (parts / "state-000003-1-2.h5").unlink()
     COMM.Barrier()
     again = RunFolder(folder, COMM)
 
     assert [state["number"] for state in again.last_state()] == [2, 2]
     assert again.count == 3
     # A resumed run on another number of ranks would not overwrite later chunks.
-    assert not list(parts.glob("part-000003-*"))
+    assert not list(parts.glob("part-000003*"))
 
 
 @pytest.mark.parallel(2)
@@ -218,24 +166,9 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
 
     # The file is cut off within its header.
     if COMM.rank == 1:
-        (state,) = (folder / "run" / "parts").glob("state-*-1-2.npy")
+        (state,) = (folder / "run" / "parts").glob("state-*-1-2.h5")
         state.write_bytes(state.read_bytes()[:20])
     COMM.barrier()
 
     with pytest.raises((OSError, ValueError)):
         RunFolder(folder / "run", COMM).last_state()
-
-
-@pytest.mark.parallel(2)
-def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeypatch):
-    """Without MPI in h5py a parallel writer is refused on all ranks; a writer that is left open gathers."""
-    monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
-    case = small_case(output={"writer": "parallel"}, time={"end": 0.01})
-    with pytest.raises(CaseError, match=r"output\.writer = 'parallel': needs an h5py with MPI support"):
-        simulate(case, folder / "run")
-    COMM.Barrier()
-    assert not (folder / "run").exists()
-
-    # Where the case leaves the choice, a run above the limit is gathered too.
-    monkeypatch.setattr(recorded_sizes, "GATHER_LIMIT", 1000)
-    assert simulate(small_case(time={"end": 0.01}), folder / "run").complete

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, on_two, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, on_two, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.failing_place import failing_place
@@ -92,15 +92,9 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
 
 
 @pytest.mark.parallel([3, 4])
-@pytest.mark.parametrize("writer", ["gather", in_parallel])
-def test_ranks_without_cells_take_part(folder, writer):
+def test_ranks_without_cells_take_part(folder):
     """A lattice of fewer cells than ranks is simulated with the bits of one rank."""
-    case = small_case(
-        lattice={"cells": 2},
-        contacts={"sites": [1, 2], "clearance": 5e-5},
-        time={"end": 0.02},
-        output={"writer": writer},
-    )
+    case = small_case(lattice={"cells": 2}, contacts={"sites": [1, 2], "clearance": 5e-5}, time={"end": 0.02})
     runs_alike(folder, case)
 
 
@@ -109,19 +103,6 @@ def test_ranks_without_cells_have_no_dashpots(folder):
     """A damped lattice of fewer cells than ranks, with dashpots to its walls, has the bits of one rank."""
     lattice = {"cells": 2, "damping": {"mass": 10.0, "stiffness": 1e-6}}
     runs_alike(folder, small_case(lattice=lattice, contacts={"sites": [1, 2], "clearance": 5e-5}, time={"end": 0.02}))
-
-
-@needs_parallel_hdf5
-@pytest.mark.parallel(2)
-def test_parallel_writing_gives_the_gathered_file(folder):
-    """A file that two ranks write together has the bits of a gathered one, with every second cell of a window."""
-    output = {"window": [3, 20], "every": 2, "stride": 3}
-    for writer in ("gather", "parallel"):
-        simulate(small_case(output=output | {"writer": writer}), folder / writer)
-
-    gathered = datasets(folder / "gather" / "run.h5")
-    assert_same_bits(gathered, datasets(folder / "parallel" / "run.h5"))
-    assert gathered["cell"].tolist() == list(range(3, 21, 2))
 
 
 class Spoiler(Observer):
@@ -203,10 +184,7 @@ def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, ob
 @pytest.mark.parametrize(
     ("engine", "looks", "damping"), [("ts", (500, 150), None), ("propagator", (6, 1), {"mass": 10.0})]
 )
-@pytest.mark.parametrize("writer", [*on_two("gather"), in_parallel])
-def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(
-    folder, monkeypatch, engine, looks, damping, writer
-):
+def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, monkeypatch, engine, looks, damping):
     """A run begins on one rank, continues on all and ends on all but one, with the bits of an uninterrupted run.
 
     Some contacts are closed at both checkpoints. The propagator's run has dashpots, whose losses checkpoints keep cell
@@ -218,7 +196,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(
     sections = {
         "lattice": {"damping": damping},
         "contacts": {"sites": [12, 8, 1, 13, 24], "restitution": 0.7},
-        "output": {"writer": writer, "window": [3, 20], "every": 2},
+        "output": {"window": [3, 20], "every": 2},
     }
     case = small_case(time={"end": 0.05, "engine": engine}, **sections)
     fewer = comm.Split(int(comm.rank == 0))

@@ -1,10 +1,10 @@
-"""Motions of points and contact forces have the same bits on any number of ranks, with either writer."""
+"""Motions of points and contact forces have the same bits on any number of ranks."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.conftest import in_parallel, small_case
+from tests.conftest import small_case
 from tests.mpi.test_granular import CHAIN, RING
 from tests.mpi.test_partition import runs_alike
 from vipetsc.case import Case
@@ -16,9 +16,8 @@ POINTS = [{"name": f"c{cell}m{mass}", "cell": cell, "mass": mass} for cell, mass
 
 
 @pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize("writer", ["gather", in_parallel])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_same_bits_of_points_and_forces(folder, engine, writer):
+def test_same_bits_of_points_and_forces(folder, engine):
     """Points and forces have the same bits in a ring with dashpots and with sites that are not sorted by cell.
 
     The window of the fields leaves some of the points out.
@@ -27,7 +26,7 @@ def test_same_bits_of_points_and_forces(folder, engine, writer):
         lattice={"ends": "periodic", "damping": {"mass": 5.0, "stiffness": 1e-6}},
         contacts={"sites": [13, 6, 12]},
         time={"end": 0.03, "engine": engine},
-        output={"points": POINTS, "forces": True, "window": [5, 15], "stride": 2, "writer": writer},
+        output={"points": POINTS, "forces": True, "window": [5, 15], "stride": 2},
     )
     runs_alike(folder, case)
 

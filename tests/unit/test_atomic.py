@@ -16,7 +16,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures.style import save
-from vipetsc.io.atomic import atomic_write, load_arrays, remove_abandoned, save_arrays, write_text
+from vipetsc.io.atomic import StoredArrays, atomic_write, remove_abandoned, save_arrays, write_text
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 
@@ -36,7 +36,7 @@ def full_disk(limit: int) -> Iterator[None]:
 NUMBERS = np.arange(10_000.0)
 WRITERS = {
     "a.txt": lambda path: write_text(path, "long " * 20_000),
-    "a.npy": lambda path: save_arrays(path, {"x": NUMBERS}),
+    "arrays.h5": lambda path: save_arrays(path, {"x": NUMBERS}),
     "a.h5": lambda path: write_netcdf(path, xr.Dataset({"x": variable("x", NUMBERS, "1", "x")})),
     "a.png": lambda path: save(Figure(), path),
 }
@@ -104,7 +104,7 @@ def open_and_close_run(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("state.npy", load_arrays),
+        ("state.h5", StoredArrays),
         ("run.h5", open_and_close_run),
         ("analysis.h5", lambda path: open_netcdf(path, "analysis")),
         ("ensemble.h5", lambda path: open_ensemble(path.parent)),
@@ -119,7 +119,9 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, name, read, content):
         read(path)
 
 
-@pytest.mark.parametrize(("name", "read"), [("a.npy", load_arrays), ("a.h5", lambda path: open_netcdf(path, "run"))])
+@pytest.mark.parametrize(
+    ("name", "read"), [("arrays.h5", StoredArrays), ("a.h5", lambda path: open_netcdf(path, "run"))]
+)
 def test_a_file_cut_in_the_middle_is_named(tmp_path, name, read):
     """A file of which the second half is missing raises OSError with its name."""
     path = tmp_path / name

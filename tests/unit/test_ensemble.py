@@ -394,27 +394,41 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
     assert np.isnan(ensemble["entropy/history"].values[1]).all()
 
 
-def test_an_ensemble_with_an_index_is_complete(tmp_path, monkeypatch):
-    """An ensemble whose records could not be merged has no index, not even that of an earlier call."""
+@pytest.mark.parametrize(
+    "step", ["studies.ensemble.Results.merge_files", "studies.sweep.assemble", "studies.sweep.write_text"]
+)
+def test_a_sweep_that_is_assembled_anew_can_be_read_at_any_time(tmp_path, monkeypatch, step):
+    """A failure before any step leaves an index and an ensemble; the next call has the latest records."""
     sweep = Sweep.from_table(SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0]}}})
     one, two = sweep.ids()
     linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures={5: {}})
     file = RecordFile(tmp_path / "members-0.jsonl")
     file.append(record_of_linear(linear, "wave"))
     file.append(scaled_record(one, site=5, work=1.0, warnings=[]))
-    conclude(Results(sweep, tmp_path))
     index = tmp_path / "index.json"
+    conclude(Results(sweep, tmp_path))
     assert json.loads(index.read_text())["members"]["missing"] == 1
 
-    def fill_the_disk(results: Results) -> None:
+    file.append(scaled_record(two, site=5, work=4.0, warnings=[]))
+    file.close()
+    conclude(Results(sweep, tmp_path))
+    first = json.loads(index.read_text())
+    assert first["members"]["missing"] == 0
+
+    def fill_the_disk(*arguments: object) -> None:
         raise OSError("No space left on device")
 
-    file.append(scaled_record(two, site=5, work=4.0, warnings=[]))
+    # As `analyse` appends records of members that it has measured again: the index of the sweep will be the same.
+    file = RecordFile(tmp_path / "members-0.jsonl")
+    file.append(scaled_record(two, site=5, work=9.0, warnings=[]))
+    file.close()
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(Results, "merge_files", fill_the_disk)
+        patch.setattr(f"vipetsc.{step}", fill_the_disk)
         conclude(Results(sweep, tmp_path), afresh=True)
-    assert (tmp_path / "ensemble.h5").exists()
-    assert not index.exists()
+    assert json.loads(index.read_text()) == first
+    with open_ensemble(tmp_path) as ensemble:
+        assert ensemble.sizes["amplitude"] == 2
 
     conclude(Results(sweep, tmp_path))
-    assert json.loads(index.read_text())["members"]["missing"] == 0
+    with open_ensemble(tmp_path) as ensemble:
+        assert ensemble["work"].values.tolist() == [1.0, 9.0]

@@ -11,8 +11,8 @@ from tests.conftest import assert_same_bits, datasets, run_of, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.dynamics.recorder import Recorder
-from vipetsc.io import atomic, chunks
-from vipetsc.io.atomic import load_arrays, save_arrays
+from vipetsc.io import chunks
+from vipetsc.io.atomic import StoredArrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.store import FieldMemory, RunMemory
@@ -35,7 +35,7 @@ def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sections", [{}, PART, {"contacts": {"sites": []}}, {"output": {"writer": "parallel"}}])
+@pytest.mark.parametrize("sections", [{}, PART, {"contacts": {"sites": []}}])
 def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     case = small_case(**sections, time={"end": 0.04})
     result = simulate(case, folder / "run")
@@ -116,7 +116,7 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
     memory = RunMemory()
     memory.begin("")
-    memory.recording = Recording(given, (), False, 2)
+    memory.recording = Recording(given, (), 2)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         log = np.zeros(len(sites), EPISODE)
         log["site"] = sites
@@ -132,10 +132,8 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]
 
 
-@pytest.mark.parametrize("largest", [atomic.LARGEST_RECORD, 0])
-def test_arrays_come_back_as_they_were(tmp_path, monkeypatch, largest):
-    """Arrays have their types and shapes again, from one record and, if they are too large for it, from a sequence."""
-    monkeypatch.setattr(atomic, "LARGEST_RECORD", largest)
+def test_arrays_come_back_as_they_were(tmp_path):
+    """Arrays have their types and shapes again, all or those that are asked for."""
     arrays = {
         "a": np.arange(6.0).reshape(2, 3)[:, ::2],
         "b": np.array(7),
@@ -143,29 +141,23 @@ def test_arrays_come_back_as_they_were(tmp_path, monkeypatch, largest):
         "d": np.array([1, -1]),
         "energy/e": np.zeros(3, [("time", float), ("site", int)]),
     }
-    save_arrays(tmp_path / "x.npy", arrays)
-    # The first array of a sequence is that of the names.
-    assert (np.load(tmp_path / "x.npy").dtype.names is None) == (largest == 0)
-    back = load_arrays(tmp_path / "x.npy")
+    path = tmp_path / "x.h5"
+    save_arrays(path, arrays)
+    back = StoredArrays(path)
 
-    assert list(back) == list(arrays)
+    assert {*back} == {*arrays}
     for name, values in arrays.items():
         assert back[name].dtype == values.dtype
         np.testing.assert_array_equal(back[name], values)
-    assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
+    assert back.only(["d"]).keys() == {"d"}
+    assert [p.name for p in tmp_path.iterdir()] == ["x.h5"]
 
-    # Mapped arrays let a rank read only its own part of the states of others.
-    mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]
-    assert not mapped.flags.writeable and not mapped.flags.owndata
-    np.testing.assert_array_equal(mapped, arrays["a"])
-    assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
-
-    with pytest.raises(OSError, match=r"x\.npy cannot be read: .*f"):
-        load_arrays(tmp_path / "x.npy", ["f"])
-    content = (tmp_path / "x.npy").read_bytes()
-    (tmp_path / "x.npy").write_bytes(content[:-1])
-    with pytest.raises(OSError, match=r"x\.npy cannot be read"):
-        load_arrays(tmp_path / "x.npy")
+    with pytest.raises(OSError, match=r"x\.h5 cannot be read: .*f"):
+        back.only(["f"])
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(OSError, match=r"x\.h5 cannot be read"):
+        StoredArrays(path)
 
 
 def test_contacts_that_still_last_at_the_end_are_logged(folder):

@@ -315,7 +315,7 @@ class TimeTable(Section):
 
 
 class OutputTable(Section):
-    """Stored part of the fields (cells of the ``window``, every n-th cell, every n-th sample), and who writes it."""
+    """Stored part of the fields (cells of the ``window``, every n-th cell, every n-th sample)."""
 
     fields: Annotated[list[Literal["displacement", "velocity"]], AfterValidator(once)] = described(
         "fields that are stored", ["displacement", "velocity"]
@@ -325,11 +325,6 @@ class OutputTable(Section):
     )
     every: int = described("every n-th cell is stored", 1, ge=1, le=MOST_STRIDE)
     stride: int = described("every n-th sample is stored", 1, ge=1, le=MOST_STRIDE)
-    writer: Literal["auto", "gather", "parallel"] = described(
-        "rank 0 collects and writes all samples (gather), or each rank writes its own cells (parallel);"
-        " auto: parallel from 2 GiB of fields",
-        "auto",
-    )
     figures: bool = described("whether pictures are drawn", True)
     points: list[PointTable] | None = described(
         "named masses whose motion is stored at every sample, independently of the stored cells; `nfrc`:"

@@ -1,4 +1,4 @@
-"""Checks of an installation: versions of packages, PETSc's scalar type, one MPI for all packages, BLAS, HDF5, SLEPc."""
+"""Checks of an installation: versions of packages, PETSc's scalar type, one MPI for all packages, BLAS, SLEPc."""
 
 import importlib
 import os
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
-import h5py
 import numpy as np
 
 from vipetsc.case import CaseError
@@ -81,7 +80,6 @@ def checks(comm: MPI.Comm) -> list[Check]:
         check_mpi(loaded_libraries(MPI_LIBRARY), comm.size, os.environ),
         check_mpirun(),
         check_blas(loaded_libraries(BLAS_LIBRARY)),
-        check_parallel_hdf5(comm.size),
         check_native_calls(),
         check_slepc(),
     ]
@@ -183,17 +181,6 @@ def check_blas(libraries: list[str]) -> Check:
     if any(Path(library).parent.name == REFERENCE_BLAS for library in libraries):
         note = "the reference BLAS: analyses, nnm and nfrc are faster with OpenBLAS (Debian: libopenblas0-serial)"
     return Check("BLAS", ", ".join(libraries) or "within numpy", note=note)
-
-
-def check_parallel_hdf5(size: int) -> Check:
-    """Check whether ``size`` ranks can write one file together, which only ``output.writer = "parallel"`` asks for."""
-    # Debian loads its MPI build under mpirun alone.
-    if size == 1:
-        return Check("parallel HDF5", "only visible under mpirun")
-    if h5py.get_config().mpi:
-        return Check("parallel HDF5", "yes")
-    remedy = "Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*"
-    return Check("parallel HDF5", "no", note=f'output.writer = "parallel" needs an h5py with MPI support ({remedy})')
 
 
 def check_native_calls() -> Check:

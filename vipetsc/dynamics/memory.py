@@ -15,8 +15,7 @@ from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.petsc_library import refused_scalars
 from vipetsc.dynamics.propagator.step_choice import step_series
-from vipetsc.dynamics.recorded_sizes import chunk_samples, possible_output, recorded_cells, written_together
-from vipetsc.io.store import GATHER_LIMIT
+from vipetsc.dynamics.recorded_sizes import chunk_samples, recorded_cells
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
@@ -30,10 +29,12 @@ SAMPLE_BYTES = 300
 POINT_BYTES = 48
 SITE_BYTES = 600
 OWN_SITE_BYTES = 2500
+# Bytes that the ranks send to rank 0 at once.
+LARGEST_MESSAGE = 2 * 2**30
 REMEDIES = {
     "lattice.cells": 'fewer cells, more machines or time.engine = "propagator" reduce it',
     "contacts.sites": "fewer sites or more machines reduce it",
-    "output.window": 'fewer cells or output.writer = "parallel" reduce it',
+    "output.window": "fewer cells reduce it",
     "time.sample_interval": "fewer samples reduce it",
 }
 
@@ -87,7 +88,7 @@ def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: in
     per_site = 1 + bool(output.forces)  # losses, and forces if they are kept
     local = min(-(-chain.cells // ranks), recorded) * per_cell + per_site * own_sites
     every = recorded * per_cell + per_site * len(chain.sites)
-    if ranks == 1 or written_together(model, output, ranks):
+    if ranks == 1:
         return 8 * min(chunk_samples(8 * local), model.samples) * COPIES * local
     # A chunk that is gathered lies on rank 0 whole: its length follows from all cells.
     return 8 * min(chunk_samples(8 * every), model.samples) * (COPIES * local + GATHERED * every)
@@ -128,14 +129,13 @@ def check_numbers(model: Model, scalar: Any = PETSc.ScalarType) -> None:
 def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
     """Raise CaseError on all ranks if one has less memory left than the run needs; all must call it.
 
-    The same error is raised if PETSc's numbers or indices do not suffice, or if every rank shall write and h5py cannot.
+    The same error is raised if PETSc's numbers or indices do not suffice.
     """
     check_numbers(model)
-    output = possible_output(output, comm.size)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
-    if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:
-        remedy = f'a sample of {sample / 1e9:.3g} GB exceeds the size of one MPI message; "parallel" sends none'
-        raise CaseError([Problem("output.writer", output.writer, remedy)])
+    if comm.size > 1 and sample > LARGEST_MESSAGE:
+        remedy = f"a sample of {sample / 1e9:.3g} GB exceeds the size of one MPI message; fewer cells reduce it"
+        raise CaseError([Problem("output.window", output.window, remedy)])
 
     # The ranks of a machine divide what it has left.
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)

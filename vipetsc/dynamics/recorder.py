@@ -1,8 +1,7 @@
 """The observer ``recorder``, which collects fields, energies and episodes and passes them to the output in chunks.
 
 An engine fills the arrays of ``room`` in place with a block of samples; ``observe`` takes note of them. Chunks have a
-bounded size, since a run may be longer than memory, and each is written once. Rank 0 gathers the parts of all ranks
-unless they write one file together.
+bounded size, since a run may be longer than memory, and each is written once. Rank 0 gathers the parts of all ranks.
 """
 
 import sys
@@ -17,15 +16,9 @@ from vipetsc.case.points import PointTable
 from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.points import PointMotion
-from vipetsc.dynamics.recorded_sizes import (
-    CHUNK_SAMPLES,
-    chunk_samples,
-    possible_output,
-    recorded_cells,
-    written_together,
-)
+from vipetsc.dynamics.recorded_sizes import CHUNK_SAMPLES, chunk_samples, recorded_cells
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording, ranges
+from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording
 
 # Samples of all cells, each as large as a state, after which a checkpoint follows: it adds a quarter to the bytes.
 SAMPLES_A_STATE = 4
@@ -46,11 +39,10 @@ class Recorder(Observer):
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
         layout = setup.layout
-        output = possible_output(setup.case.output, layout.comm.size)
+        output = setup.case.output
         recorded = np.array(recorded_cells(output, setup.model.chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
-        together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
 
         self._of_sites: tuple[str, ...] = (LOSSES,)
         if output.forces:
@@ -65,7 +57,6 @@ class Recorder(Observer):
         setup.output.recording = Recording(
             given=_coordinates(setup.model, recorded) | _places(points),
             fields=tuple(output.fields),
-            together=together,
             rows=-(-setup.model.samples // output.stride),
             sampled=sampled,
             of_sites=self._of_sites,
@@ -73,13 +64,8 @@ class Recorder(Observer):
 
         self._sample_numbers = len(output.fields) * layout.dofs * len(recorded) // output.stride
         numbers = len(output.fields) * layout.dofs * local.size + len(self._of_sites) * len(layout.sites)
-        if together:
-            self._columns = np.array([[first, stop]])
-            most = layout.comm.allreduce(numbers, MPI.MAX)
-        else:
-            # Rank 0 keeps the chunks that it gathers from all ranks.
-            self._columns = np.array([[0, len(recorded)]])
-            most = layout.comm.allreduce(numbers, MPI.SUM)
+        # Rank 0 keeps the chunks that it gathers from all ranks.
+        most = layout.comm.allreduce(numbers, MPI.SUM)
         length = setup.output.chunk_length or chunk_samples(8 * most)
         # One more than there are samples: a chunk that is full at the end would have an empty one behind it.
         self._length = min(length, setup.model.samples + 1)
@@ -189,7 +175,7 @@ class Recorder(Observer):
             chunk |= {name: values[: self._held] for name, values in self._kept.items()}
             # Rows of fields are the samples whose number in the run is a multiple of the stride.
             chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
-        output.append(chunk or None)
+        output.append(chunk)
 
         self.unsaved_samples += self._held
         self.episodes += comm.allreduce(len(episodes))
@@ -197,7 +183,7 @@ class Recorder(Observer):
         self._begin_chunk()
 
     def _gather(self, episodes: np.ndarray) -> dict[str, np.ndarray]:
-        """Fields, losses and ``episodes`` of the chunk: this rank's, or those of all on rank 0 and none elsewhere."""
+        """Fields, losses and ``episodes`` of the chunk of all ranks, on rank 0; nothing on the others."""
         comm = self.setup.layout.comm
         recording = self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
@@ -206,7 +192,7 @@ class Recorder(Observer):
             of_sites.append(self._forces[: self._held])
         rank_part = sites, np.array(of_sites), episodes, self._fields[:, : self._rows]
         gathered: list[Any] | None = [rank_part]
-        if comm.size > 1 and not recording.together:
+        if comm.size > 1:
             gathered = comm.gather(rank_part)
         if gathered is None:
             return {}
@@ -220,7 +206,7 @@ class Recorder(Observer):
         all_cells = all_fields[0]
         if len(all_fields) > 1:
             all_cells = np.concatenate(all_fields, axis=3)
-        chunk = {"sites": ranges(numbers[order]), "impacts": log, "columns": self._columns}
+        chunk = {"impacts": log}
         chunk |= dict(zip(self._of_sites, np.concatenate(all_of_sites, axis=2)[:, :, order], strict=True))
         return chunk | dict(zip(recording.fields, all_cells, strict=True))
 

@@ -1,6 +1,6 @@
 """Files that are complete or absent: written under a temporary name, and renamed when complete."""
 
-import math
+import io
 import os
 import platform
 import re
@@ -10,13 +10,12 @@ import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
+import h5py
 import numpy as np
-from numpy.lib import format as npy
 
 Arrays = Mapping[str, np.ndarray]
-LARGEST_RECORD = 2**31 - 1  # bytes, which numpy counts in a C int
 
 
 @contextmanager
@@ -38,6 +37,70 @@ def atomic_write(path: Path) -> Iterator[Path]:
         raise unwritten(path, error) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+class _WholeFile(io.RawIOBase):
+    """A new file at ``path`` for HDF5 that keeps the first ``error`` in writing instead of raising it.
+
+    HDF5 does not free a file that it failed to write, and crashes later. It is told that all was written, and what
+    comes after the error is dropped.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self.error: OSError | None = None
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def readinto(self, buffer: Any) -> int | None:
+        return self._file.readinto(buffer)
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        # A disk that is nearly full takes a part.
+        while len(rest) and self.error is None:
+            try:
+                rest = rest[self._file.write(rest) :]
+            except OSError as error:
+                self.error = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.error is None:
+            try:
+                return self._file.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size or 0
+
+    def close(self) -> None:
+        if not self.closed:
+            try:
+                self._file.close()
+            except OSError as error:
+                self.error = self.error or error
+        super().close()
+
+
+@contextmanager
+def hdf5_file(path: Path) -> Iterator[h5py.File]:
+    """Create the HDF5 file ``path`` and fill it within the block; raises OSError if it could not be written."""
+    file = _WholeFile(path)
+    try:
+        with h5py.File(file, "w") as opened:
+            yield opened
+    except Exception as error:
+        # HDF5 may stumble over what was dropped: the first error is the cause.
+        raise file.error or error from None
+    finally:
+        file.close()
+    if file.error:
+        raise file.error
 
 
 def remove_abandoned(folder: Path) -> None:
@@ -98,77 +161,47 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Write ``arrays`` to ``path`` in numpy's format (.npy); raises OSError as ``atomic_write``.
+    """Write ``arrays`` to ``path`` as datasets of an HDF5 file; raises OSError as ``atomic_write``."""
+    with atomic_write(path) as aside, hdf5_file(aside) as file:
+        for name, values in arrays.items():
+            file[name] = values
 
-    They are the fields of one record or, if they are too large for it, arrays one after another, of which the first
-    has the names of the others. numpy's own format for several arrays, a zip file, takes three times as long as a
-    record, and cannot be mapped.
+
+class StoredArrays(Mapping[str, np.ndarray]):
+    """The arrays in a file that ``save_arrays`` wrote, each read when it is asked for.
+
+    Raises an OSError that names the file if it cannot be read, or lacks an array.
     """
-    with atomic_write(path) as aside, aside.open("wb") as file:
-        if sum(values.nbytes for values in arrays.values()) > LARGEST_RECORD:
-            _write_sequence(file, arrays)
-        else:
-            _write_record(file, arrays)
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._names: list[str] = []
+        with self._opened() as file:
+            file.visititems(self._note)
 
-def _write_record(file: BinaryIO, arrays: Arrays) -> None:
-    """Write ``arrays`` as the fields of one record."""
-    record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
-    # The header is numpy's. The values follow it one after another, without a copy of all in one array.
-    header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
-    npy.write_array_header_2_0(file, header)
+    def _note(self, name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            self._names.append(name)
 
-    # Byte 6 is the version of the format. Version 3 differs from 2 in the header's encoding, UTF-8, and
-    # numpy 1.24 takes a header of version 2 apart into tokens, which takes longer than the rest of the reading.
-    file.seek(6)
-    file.write(b"\3")
-    file.seek(0, os.SEEK_END)
+    @contextmanager
+    def _opened(self) -> Iterator[h5py.File]:
+        try:
+            with h5py.File(self.path) as file:
+                yield file
+        except (OSError, RuntimeError, KeyError) as error:
+            raise OSError(f"{self.path} cannot be read: {error}") from error
 
-    # By ``write``, whose error has a number; numpy's ``tofile`` gives none.
-    for values in arrays.values():
-        file.write(np.ascontiguousarray(values).data)
+    def __getitem__(self, name: str) -> np.ndarray:
+        with self._opened() as file:
+            return np.asarray(file[name][()])
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
 
-def _write_sequence(file: BinaryIO, arrays: Arrays) -> None:
-    """Write the names of ``arrays`` as an array, and behind it each of them."""
-    for values in (np.array(list(arrays)), *arrays.values()):
-        header = {"descr": npy.dtype_to_descr(values.dtype), "fortran_order": False, "shape": values.shape}
-        npy.write_array_header_2_0(file, header)
-        file.write(np.ascontiguousarray(values).data)
+    def __len__(self) -> int:
+        return len(self._names)
 
-
-def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
-    """Load the arrays ``wanted``, by default all, that ``save_arrays`` wrote, in the shapes that they had.
-
-    Without a ``copy`` they are parts of the file, read when they are used. Raises an OSError that names the file if it
-    cannot be read, or lacks an array.
-    """
-    try:
-        # numpy refuses headers of more than 10,000 letters, since a hostile one could stop it; this one is ours.
-        record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
-        names = record.dtype.names
-        arrays: Any = record
-        # Without fields it is the array of names of a sequence.
-        if names is None:
-            arrays = _mapped_sequence(path)
-            names = tuple(arrays)
-        if wanted is None:
-            wanted = names
-        return {name: np.array(arrays[name], copy=copy) for name in wanted}
-    except (OSError, ValueError, KeyError) as error:
-        raise OSError(f"{path} cannot be read: {error}") from error
-
-
-def _mapped_sequence(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that ``_write_sequence`` wrote, as parts of the file."""
-    content = np.memmap(path, np.uint8, mode="r")
-    mapped: dict[str, np.ndarray] = {}
-    with path.open("rb") as file:
-        for name in npy.read_array(file).tolist():
-            npy.read_magic(file)
-            shape, _, dtype = npy.read_array_header_2_0(file)
-            start = file.tell()
-            stop = start + math.prod(shape) * dtype.itemsize
-            mapped[name] = content[start:stop].view(dtype).reshape(shape)
-            file.seek(stop)
-    return mapped
+    def only(self, wanted: Collection[str]) -> dict[str, np.ndarray]:
+        """Read the arrays ``wanted``."""
+        with self._opened() as file:
+            return {name: np.asarray(file[name][()]) for name in wanted}

@@ -1,22 +1,19 @@
 """The variables of ``run.h5``, and their assembly from the chunks of a run.
 
-A chunk holds the samples between two checkpoints. Each rank stores a part of it, arrays by name:
+A chunk holds the samples between two checkpoints, as arrays by name:
 
-- fields (sample, dof, cell) such as ``displacement``, whose cells are the half-open ranges ``columns`` (range, 2) of
-  the recorded cells, numbered from 0;
-- losses and forces (sample, site), whose sites are the half-open ranges ``sites`` (range, 2), from 0;
+- fields (sample, dof, cell) such as ``displacement``, of the recorded cells;
+- losses and forces (sample, site);
 - ``impacts`` (episode,), a record of each contact episode that ended in the chunk; in the last chunk also of those that
   are still open;
-- in the part of rank 0 what belongs to a sample as a whole (``SAMPLED``, ``DAMPING`` and ``MOTION``).
+- what belongs to a sample as a whole (``SAMPLED``, ``DAMPING`` and ``MOTION``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Collection, Container, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
-
-from mpi4py import MPI
 
 import h5py
 import numpy as np
@@ -28,8 +25,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Variables of the file by name: dimensions, units, text.
-# ``SAMPLED``, ``DAMPING`` and ``MOTION`` are known on rank 0 for every sample; ``GIVEN`` is known before the first one.
-# ``LARGE`` are fields, losses, forces and the log of contacts, of which each rank has a part.
+# ``SAMPLED``, ``DAMPING`` and ``MOTION`` are known for every sample; ``GIVEN`` is known before the first one.
+# ``LARGE`` are fields, losses, forces and the log of contacts.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -95,8 +92,6 @@ class Recording:
         The arrays of ``GIVEN`` by name.
     fields
         Names of the fields that are recorded.
-    together
-        Whether all ranks write into one common file; otherwise rank 0 writes it alone.
     rows
         Number of samples in a field of the whole run.
     sampled
@@ -107,34 +102,24 @@ class Recording:
 
     given: Arrays
     fields: tuple[str, ...]
-    together: bool
     rows: int
     sampled: Collection[str] = tuple(SAMPLED)
     of_sites: tuple[str, ...] = (LOSSES,)
 
 
 class Chunks(Protocol):
-    """The ``count`` chunks of a run; ``ranks(k)`` have stored parts of chunk k, from which ``read`` reads arrays."""
+    """The ``count`` chunks of a run, from which ``read`` reads arrays."""
 
-    comm: MPI.Comm
     case: str
     count: int
     recording: Recording
 
-    def ranks(self, number: int) -> list[int]: ...  # noqa: D102
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays: ...  # noqa: D102
-
-
-def ranges(numbers: np.ndarray) -> np.ndarray:
-    """Half-open ranges (range, 2) of consecutive integers in ``numbers`` (number,), which rise from 0 or more."""
-    # Neither -2 nor a neighbour of -2 is among the numbers: there is a break at both ends.
-    breaks = np.diff(numbers, prepend=-2, append=-2) != 1
-    return np.stack([numbers[breaks[:-1]], numbers[breaks[1:]] + 1], axis=1)
+    def read(self, number: int, wanted: Collection[str]) -> Arrays: ...  # noqa: D102
 
 
 def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays ``names`` (sample, ...) of rank 0, all chunks one after the other."""
-    chunks = [output.read(number, 0, names) for number in range(output.count)]
+    """Return the arrays ``names`` (sample, ...), all chunks one after the other."""
+    chunks = [output.read(number, names) for number in range(output.count)]
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
 
 
@@ -181,39 +166,16 @@ def coordinates(name: str) -> dict[str, str]:
     return {}
 
 
-def writers(output: Chunks) -> MPI.Comm:
-    """The ranks that write the file: all of them together, or this one alone."""
-    if output.recording.together:
-        return output.comm
-    return MPI.COMM_SELF
-
-
-def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Iterator[Arrays]:
-    """Arrays ``wanted`` of those parts of chunk ``number`` that this rank copies to the file.
-
-    Parts are dealt out to the writers in turn, since other ranks, and more or fewer, may have stored them.
-    """
-    comm = writers(output)
-    for rank in output.ranks(number):
-        if rank % comm.size == comm.rank:
-            yield output.read(number, rank, wanted)
-
-
 def read_log(output: Chunks) -> np.ndarray:
-    """The episodes (episode,) in the parts that this rank copies, in no order; a record has the fields of ``impacts``.
-
-    There is a part for every writer: each rank of a run that ended has stored one in the last chunk.
-    """
-    # Episodes of all ranks are sorted together later.
-    parts = [part for number in range(output.count) for part in parts_to_copy(output, number, ["impacts"])]
-    return np.concatenate([part["impacts"] for part in parts])
+    """Return the episodes (episode,) of all chunks, sorted by onset; a record has the fields of ``impacts``."""
+    log = np.concatenate([output.read(number, ["impacts"])["impacts"] for number in range(output.count)])
+    return log[np.lexsort([log["site"], log["onset"]])]
 
 
-def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
-    """The variables (episode,) of the file for the episodes ``log`` (episode,), sorted, after ``first`` others."""
-    names = log.dtype.names or ()
-    columns: dict[str, np.ndarray] = {"episode": np.arange(first, first + len(log)) + 1}
-    for name in names:
+def log_columns(log: np.ndarray) -> Arrays:
+    """Return the variables (episode,) of the file for the sorted episodes ``log`` (episode,)."""
+    columns: dict[str, np.ndarray] = {"episode": np.arange(len(log)) + 1}
+    for name in log.dtype.names or ():
         columns[f"impacts/{name}"] = log[name]
     return columns
 
@@ -221,25 +183,12 @@ def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
 def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
     """Copy the variable ``name``, a field or one over sites, from all chunks to ``dataset``.
 
-    Each writer copies the parts that it reads; a field becomes (sample, cell, dof), what is over sites (sample, site).
+    A field becomes (sample, cell, dof), what is over sites (sample, site).
     """
-    time = "field_time"
-    places = "columns"
-    if name in output.recording.of_sites:
-        time = "time"
-        places = "sites"
-
     first = 0
     for number in range(output.count):
-        rows = output.read(number, 0, [time])[time].size
-        for part in parts_to_copy(output, number, [name, places]):
-            # Parts have cells last, as the compiled engine fills them; the file has them after the samples.
-            values = np.moveaxis(part[name], -1, 1)
-            column = 0
-            for start, stop in part[places].tolist():
-                width = stop - start
-                # h5py leaves out empty selections, on which writing together would hang.
-                if rows and start < stop:
-                    dataset[first : first + rows, start:stop] = values[:, column : column + width]
-                column += width
-        first += rows
+        # Chunks have cells last, as the compiled engine fills them; the file has them after the samples.
+        values = np.moveaxis(output.read(number, [name])[name], -1, 1)
+        if values.size:
+            dataset[first : first + len(values)] = values
+        first += len(values)

@@ -1,26 +1,24 @@
 """Output of a run: a folder, which contains ``run.h5`` and ``summary.json`` at the end, or memory.
 
 During a run its samples are stored as chunks: chunk k holds the samples between the checkpoints k - 1 and k. A chunk
-and a checkpoint are arrays by name; each rank writes its part of them into a file of its own, so that ranks send each
-other nothing. Every part says which cells and sites it has, so that another number of ranks can go on with the run.
+is arrays by name, which rank 0 has of all ranks. Of a checkpoint each rank writes its part into a file of its own. The
+part says which cells and sites it has, so that another number of ranks can go on with the run.
 
 When the run has ended, ``io.chunks`` puts the parts together. Fields (t, cell, dof) and losses (t, site) may be too
-large for the memory: they are copied chunk by chunk, by rank 0 alone or by all ranks into a common file. The log of
-contacts is sorted by onset, and each rank that writes holds a part of it.
+large for the memory: rank 0 copies them chunk by chunk. The log of contacts is sorted by onset.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 import tomllib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -28,29 +26,15 @@ import h5py
 import numpy as np
 
 from vipetsc.io import chunks
-from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
+from vipetsc.io.atomic import Arrays, StoredArrays, atomic_write, discard, hdf5_file, save_arrays, write_text
 from vipetsc.io.chunks import Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run, with_point_names
-from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
+from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
     import xarray as xr
-
-# Bytes of fields above which all ranks write the file together if output.writer is "auto". Fewer are copied by one rank
-# in some seconds, and a file that ranks write together needs a file system that all of them see.
-GATHER_LIMIT = 2 * 2**30
-
-
-class _Contents(NamedTuple):
-    """Contents of ``run.h5`` but for fields, losses and forces, which are copied from the chunks.
-
-    ``small`` is the dataset whose values rank 0 writes, ``log`` this rank's part of all episodes in order.
-    """
-
-    small: xr.Dataset
-    log: SortedRows
 
 
 class RunFolder:
@@ -111,23 +95,14 @@ class RunFolder:
         """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         return np.empty(shape)
 
-    def append(self, chunk: Arrays | None) -> None:
-        """Store this rank's part of the next chunk, None for no part; all ranks must call it.
-
-        Raises OSError on all ranks if one cannot write.
-        """
-        path = self._chunk(self.count, self.comm.rank)
-
-        def save() -> None:
-            if chunk is not None:
-                save_arrays(path, chunk)
-
-        on_every_rank(self.comm, save)
+    def append(self, chunk: Arrays) -> None:
+        """Store the next chunk, which rank 0 has; all ranks must call it. Raises OSError on all if it cannot write."""
+        on_root(self.comm, lambda: save_arrays(self._chunk(self.count), chunk))
         self.count += 1
 
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """The arrays ``wanted`` of the part of chunk ``number`` that ``rank`` has stored."""
-        return load_arrays(self._chunk(number, rank), wanted)
+    def read(self, number: int, wanted: Collection[str]) -> Arrays:
+        """Return the arrays ``wanted`` of chunk ``number``."""
+        return StoredArrays(self._chunk(number)).only(wanted)
 
     def save_state(self, state: Arrays) -> None:
         """Store this rank's checkpoint after the last chunk, and keep the one before; all ranks must call it.
@@ -161,36 +136,32 @@ class RunFolder:
         if not size:
             return None
         paths = [self._state(number, rank, size) for rank in range(size)]
-        return on_every_rank(self.comm, lambda: [load_arrays(path, copy=False) for path in paths])
+        return on_every_rank(self.comm, lambda: [StoredArrays(path) for path in paths])
 
     def _last_complete_state(self) -> tuple[int, int]:
         """Number of the last complete checkpoint, and of the ranks that wrote it; (-1, 0) if there is none.
 
         Files of later chunks and checkpoints are removed.
         """
-        names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
+        names = [path.stem.split("-") for path in self._parts.glob("state-*.h5")]
         counts = Counter((int(number), int(size)) for _, number, _, size in names)
         # A checkpoint is complete when there are as many parts as ranks that wrote it.
         complete = [key for key, count in counts.items() if count == key[1]]
         number, size = max(complete, default=(-1, 0))
 
-        for path in self._parts.glob("*-*-*.npy"):
+        for path in self._parts.glob("*-*.h5"):
             # Another number of ranks, which goes on with the run, would not replace all of them.
             if int(path.stem.split("-")[1]) > number:
                 path.unlink()
         return number, size
 
-    def _chunk(self, number: int, rank: int) -> Path:
-        """The file of a rank's part of chunk ``number``."""
-        return self._parts / f"part-{number:06d}-{rank}.npy"
+    def _chunk(self, number: int) -> Path:
+        """Return the file of chunk ``number``."""
+        return self._parts / f"part-{number:06d}.h5"
 
     def _state(self, number: int, rank: int, size: int) -> Path:
-        """The file of a rank's part of the checkpoint after chunk ``number``, which ``size`` ranks have written."""
-        return self._parts / f"state-{number:06d}-{rank}-{size}.npy"
-
-    def ranks(self, number: int) -> list[int]:
-        """The ranks that have stored a part of chunk ``number``."""
-        return [int(path.stem.split("-")[2]) for path in self._parts.glob(f"part-{number:06d}-*.npy")]
+        """Return the file of a rank's part of the checkpoint after chunk ``number``, which ``size`` ranks wrote."""
+        return self._parts / f"state-{number:06d}-{rank}-{size}.h5"
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Put the chunks together to ``run.h5``; all ranks must call it. Raises OSError on all if one cannot write.
@@ -199,71 +170,37 @@ class RunFolder:
         ``summary``. The file has a temporary name until it is complete; the chunks are removed after that.
         """
         target = self.folder / "run.h5"
-        aside = self.folder / ".run.h5.part"
-        writes = self.recording.together or self.comm.rank == 0
-
-        def read_chunks() -> tuple[xr.Dataset, np.ndarray] | None:
-            sys.audit("vipetsc.assemble", str(target))
-            if not writes:
-                return None
-            small = chunks.run_dataset(self, chunks.small_variables(self), attributes)
-            return small, chunks.read_log(self)
 
         def write() -> None:
-            try:
-                self._write(aside, contents)
-            except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
-                raise unwritten(target, error) from error
-
-        def conclude() -> None:
+            sys.audit("vipetsc.assemble", str(target))
+            small = chunks.run_dataset(self, chunks.small_variables(self), attributes)
+            log = chunks.read_log(self)
+            with atomic_write(target) as aside, hdf5_file(aside) as file:
+                self._fill(file, small, log)
             sys.audit("vipetsc.conclude", str(self.folder))
-            os.replace(aside, target)
             self._summarise({**attributes, **summary})
             sys.audit("vipetsc.clean", str(self._parts))
             discard(self._parts)
 
-        try:
-            # All ranks read before any creates the file: ranks create it together, and one that failed would leave the
-            # others waiting.
-            read = on_every_rank(self.comm, read_chunks)
-            if read:
-                small, log = read
-                in_order = sort_over_ranks(chunks.writers(self), log, ("onset", "site"))
-                contents = _Contents(small=small, log=in_order)
-            # Ranks that do not write wait here as well, so that an error of a writer is raised on all.
-            on_every_rank(self.comm, write if writes else lambda: None)
-            on_root(self.comm, conclude)
-        finally:
-            if self.comm.rank == 0:
-                aside.unlink(missing_ok=True)
+        on_root(self.comm, write)
 
-    def _write(self, path: Path, contents: _Contents) -> None:
-        """Write a file of the run to ``path``, together with the other writers."""
-        together: dict[str, Any] = {}
-        if self.recording.together:
-            together = {"driver": "mpio", "comm": self.comm}
-        log = contents.log
-        columns = chunks.log_columns(log.rows, log.first)
-        sizes = {**contents.small.sizes, "episode": log.total}
-        with h5py.File(path, "w", **together) as file:
-            put_dataset(file, contents.small, write=self.comm.rank == 0)
-            # All datasets are created before any is filled: ranks create them together, but each copies by itself, and
-            # may fail.
-            large = {}
-            for name in (*columns, *self.recording.of_sites, *self.recording.fields):
-                description = chunks.described(name, contents.small)
-                dtype = np.dtype(float)
-                if name in columns:
-                    dtype = columns[name].dtype
-                about = description.attributes | chunks.coordinates(name)
-                shape = [sizes[dim] for dim in description.dims]
-                large[name] = add_variable(file, name, description.dims, shape, dtype, about)
-
-            for name, dataset in large.items():
-                if name not in columns:
-                    chunks.put_chunks(dataset, self, name)
-                elif log.rows.size:
-                    dataset[log.first : log.first + log.rows.size] = columns[name]
+    def _fill(self, file: h5py.File, small: xr.Dataset, log: np.ndarray) -> None:
+        """Put the ``small`` variables, the ``log`` of episodes and the content of the chunks into the ``file``."""
+        put_dataset(file, small)
+        columns = chunks.log_columns(log)
+        sizes = {**small.sizes, "episode": len(log)}
+        for name in (*columns, *self.recording.of_sites, *self.recording.fields):
+            description = chunks.described(name, small)
+            dtype = np.dtype(float)
+            if name in columns:
+                dtype = columns[name].dtype
+            about = description.attributes | chunks.coordinates(name)
+            shape = [sizes[dim] for dim in description.dims]
+            dataset = add_variable(file, name, description.dims, shape, dtype, about)
+            if name not in columns:
+                chunks.put_chunks(dataset, self, name)
+            elif len(log):
+                dataset[...] = columns[name]
 
 
 class FieldMemory:
@@ -287,7 +224,7 @@ class FieldMemory:
 class RunMemory:
     """Output of a run into memory instead of a ``RunFolder``, with the same methods; a run that is stopped is lost.
 
-    Rank 0 of ``comm`` has all fields, whatever ``output.writer`` is; they lie in memory as (t, dof, cell), and on one
+    Rank 0 of ``comm`` has all fields; they lie in memory as (t, dof, cell), and on one
     rank the engine writes them where they stay.
 
     Parameters
@@ -354,9 +291,9 @@ class RunMemory:
             return np.empty(shape)
         return self._fields[:, self._rows : self._rows + shape[1]]
 
-    def append(self, chunk: Arrays | None) -> None:
-        """Store the next chunk in memory."""
-        arrays = dict(chunk or {})
+    def append(self, chunk: Arrays) -> None:
+        """Store the next chunk, which rank 0 has, in memory."""
+        arrays = dict(chunk)
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
         # On one rank the engine has written the fields there already, into the ``room`` that it asked for.
@@ -366,12 +303,8 @@ class RunMemory:
         self._chunks.append(arrays)
         self.count += 1
 
-    def ranks(self, number: int) -> list[int]:
-        """The ranks with a part of chunk ``number``: rank 0 alone."""
-        return [0]
-
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """All arrays of chunk ``number``, the ``wanted`` ones among them, without a copy."""
+    def read(self, number: int, wanted: Collection[str]) -> Arrays:
+        """Return all arrays of chunk ``number``, the ``wanted`` ones among them, without a copy."""
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
@@ -385,8 +318,7 @@ class RunMemory:
         """Create the dataset; all ranks must call it."""
         if self.comm.rank == 0:
             variables = chunks.small_variables(self)
-            log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
-            large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(log.rows)}
+            large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(chunks.read_log(self))}
             recorded = self._fields[:, : self._rows].swapaxes(2, 3)
             large |= dict(zip(self.recording.fields, recorded, strict=True))
             if self.end is not None:

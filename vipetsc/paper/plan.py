@@ -36,7 +36,7 @@ from vipetsc.parallel import StopRequest
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Results
 from vipetsc.studies.prediction import predict
-from vipetsc.studies.sweep import run_sweep
+from vipetsc.studies.sweep import has_all_records, run_sweep
 
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
@@ -184,8 +184,11 @@ class PaperStep:
         with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
             if "ending" in file.attrs:
                 return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
-            is_indexed = not isinstance(self.case, Sweep) or path.with_name("index.json").exists()
-            return is_indexed and self._is_same_case(file.attrs["case"])
+            if isinstance(self.case, Sweep):
+                folder = path.parent
+                if not (folder / "index.json").exists() or not has_all_records(folder):
+                    return False
+            return self._is_same_case(file.attrs["case"])
         return False
 
     def _is_same_case(self, text: str) -> bool:

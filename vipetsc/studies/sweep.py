@@ -29,7 +29,8 @@ from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.progress import say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
-from vipetsc.studies.linear_run import LinearRun, first_site_cell, linear_name
+from vipetsc.studies.linear_run import MEMBERS, LinearRun, first_site_cell, linear_name
+from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sweep_runs import NeededRun, SweepRuns
 from vipetsc.wording import counted
 
@@ -335,19 +336,25 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     path = folder / "index.json"
     text = json.dumps(index, indent=1, default=int) + "\n"
     is_current = not afresh and path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    # The index is written last, and the one before is removed first: an ensemble with an index is complete, and of its
-    # members.
-    if not is_current:
-        path.unlink(missing_ok=True)
+    # Records first, then the ensemble, then the index, each whole before it replaces the one before: after a kill the
+    # folder can be read, and an ensemble that is older than its records is made again.
     if not count[STATUS[MISSING]]:
         lost: list[str] = []
+        results.merge_files()
+        is_current = is_current and has_all_records(folder)
         if not is_current or not is_whole(folder / "ensemble.h5", lost):
             assemble(results, warnings)
         warnings += lost
-        results.merge_files()
     if not is_current:
         write_text(path, text)
     return status, warnings
+
+
+def has_all_records(folder: Path) -> bool:
+    """Return whether the ensemble in the folder of a sweep was made after the last record of its members."""
+    ensemble = folder / "ensemble.h5"
+    records = RecordPaths(folder, MEMBERS).existing()
+    return ensemble.exists() and all(file.stat().st_mtime_ns <= ensemble.stat().st_mtime_ns for file in records)
 
 
 def _failed_member(results: Results, number: int) -> dict[str, Any]:

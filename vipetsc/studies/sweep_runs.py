@@ -243,7 +243,7 @@ def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
 
 def _with_everything(case: Case, fields: list[str]) -> Case:
     """The ``case`` of which all samples and cells of the ``fields`` are recorded."""
-    output = {"fields": fields, "window": None, "every": 1, "stride": 1, "writer": "gather"}
+    output = {"fields": fields, "window": None, "every": 1, "stride": 1}
     return case.model_copy(update={"output": case.output.model_copy(update=output)})
 
 

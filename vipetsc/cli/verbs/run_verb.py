@@ -104,7 +104,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
     """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_numbers, memory_available, memory_needed
-    from vipetsc.dynamics.recorded_sizes import recorded_cells, written_together
+    from vipetsc.dynamics.recorded_sizes import recorded_cells
 
     model = case.model()
     check_numbers(model)
@@ -120,9 +120,6 @@ def run_rows(case: Case, ranks: int) -> Rows:
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
     every_sample = len(chain.sites) * (1 + bool(case.output.forces)) + 3 * len(case.output.points or [])
     size = 8 * (columns * -(-model.samples // case.output.stride) + every_sample * model.samples)
-    writer = "gather"
-    if written_together(model, case.output, ranks):
-        writer = "parallel"
     free = shutil.disk_usage(".").free
 
     # Ranks on one machine divide its memory among them.
@@ -147,7 +144,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         ("points", ", ".join(f"{p.name} (cell {p.cell}, mass {p.mass})" for p in case.output.points or [])),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", engine),
-        ("disk", f"{size / 2**20:.4g} MiB ({writer}), twice that during the run; {free / 2**30:.4g} GiB free here"),
+        ("disk", f"{size / 2**20:.4g} MiB, twice that during the run; {free / 2**30:.4g} GiB free here"),
         ("memory", memory),
         ("time", time),
         ("faster", cost.faster),

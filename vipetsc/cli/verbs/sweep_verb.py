@@ -28,7 +28,18 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
     work.warn(result.warnings)
     # The table is made where the index was written: other ranks may not see the file.
     work.report(on_root(work.comm, lambda: sweep_table(result)))
-    return Outcome(complete=result.complete)
+    return Outcome(complete=result.complete, failures=on_root(work.comm, lambda: failure_of(result)))
+
+
+def failure_of(result: "SweepResult") -> list[str]:
+    """Return the sentence of a sweep of which members failed, with the first of them; nothing where none did."""
+    assert result.folder
+    index = result.folder / "index.json"
+    failures = json.loads(index.read_text(encoding="utf-8"))["failed"]
+    if not failures:
+        return []
+    first = failures[0]
+    return [f"{len(failures)} of {result.status.size} members failed, first {first['place']}: {first['reason']}"]
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
