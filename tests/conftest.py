@@ -32,7 +32,6 @@ import pytest
 import xarray as xr
 
 from tests.coarse import coarse_pictures
-from vipetsc import __version__
 from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
@@ -42,6 +41,7 @@ from vipetsc.io.read import RUN_NEEDS
 from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, wait_for_all
+from vipetsc.sources import source_key
 
 # A search for garbage goes through what earlier tests have left. With this threshold the searches take half the time
 # that they take with the program's own, and a worker has 70 MB more.
@@ -232,7 +232,7 @@ def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[s
         row = outcome(number, plan.case(number))
         if isinstance(row, str):
             row = {"reason": row}
-        about = {"kind": "member", "key": name, "vipetsc_version": __version__}
+        about = {"kind": "member", "key": name, "source": source_key()}
         about |= {"warnings": [], "cpu_seconds": 0.1, "rtol": 1e-10}
         records.append(about | row)
     records.close()
@@ -243,7 +243,7 @@ def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[s
 def record_of_linear(run: Any, name: str) -> dict[str, Any]:
     """Return the record of a linear ``run`` of that ``name``, as a sweep writes it."""
     key = " ".join([name, *map(str, run.measures)])
-    return {"kind": "linear", "key": key, "vipetsc_version": __version__} | run.record(name)
+    return {"kind": "linear", "key": key, "source": source_key()} | run.record(name)
 
 
 def modified(folder: Path) -> dict[Path, int]:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import vipetsc
 from tests.conftest import put_members, record_of_linear
 from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
-from vipetsc.io.records import RecordFile
+from vipetsc.io.records import RecordFile, read_records
 from vipetsc.lattice import four_band
+from vipetsc.sources import source_key
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, _fits, fit_curve
 from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, measured, read_linear
@@ -321,7 +321,7 @@ def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
     assert again.arrival_at(2) == 0.2
 
 
-def test_records_of_another_version_count_as_missing(folder, monkeypatch):
+def test_records_of_other_sources_count_as_missing(folder):
     sweep = Sweep.from_table(SWEEP)
     run = LinearRun(
         envelope=np.array([1.0, 2.0]),
@@ -334,7 +334,13 @@ def test_records_of_another_version_count_as_missing(folder, monkeypatch):
     assert not (results.status == MISSING).any()
     assert results.linear
 
-    monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
+    for path in folder.glob("*.jsonl"):
+        records = [record for record, _ in read_records(path, pytest.fail)]
+        path.unlink()
+        file = RecordFile(path)
+        for record in records:
+            file.append(record | {"source": f"{record['source']}0"})
+        file.close()
     older = Results(sweep, folder)
     assert (older.status == MISSING).all()
     assert not older.linear
@@ -360,7 +366,7 @@ def scaled_record(name: str, site: int, work: float, warnings: list[str]) -> dic
     return {
         "kind": "member",
         "key": name,
-        "vipetsc_version": vipetsc.__version__,
+        "source": source_key(),
         "warnings": warnings,
         "statistics": statistics,
         "cpu_seconds": 0.0,

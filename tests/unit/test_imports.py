@@ -36,6 +36,7 @@ FLOORS = (
     "plugins",
     "register",
     "progress",
+    "sources",
     "process",
     "wording",
     "__init__",

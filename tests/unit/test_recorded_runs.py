@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 import pytest
 
-import vipetsc
 from vipetsc.case.law import LawCase
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import StopRequest
+from vipetsc.sources import hash_of, source_key
 from vipetsc.studies.recorded_runs import RecordedRuns, RecordPaths
 from vipetsc.studies.ring import Ring
 
@@ -22,7 +22,7 @@ def recorded_runs(folder) -> RecordedRuns:
 def append(path, key, value):
     """Append the record of one run to a file."""
     file = RecordFile(path)
-    file.append({"key": key, "vipetsc_version": vipetsc.__version__, "value": value})
+    file.append({"key": key, "source": source_key(), "value": value})
     file.close()
 
 
@@ -49,6 +49,32 @@ def test_a_key_of_two_parts_is_found_again(tmp_path):
     runs.make([key], lambda key: pytest.fail("it is there"))
 
     assert runs.records[key]["value"] == 1
+
+
+def test_records_of_other_sources_are_not_continued(tmp_path):
+    file = RecordFile(RecordPaths(tmp_path, "some-runs").for_rank(0))
+    file.append({"key": "run", "source": f"{source_key()}0", "value": 1})
+    file.close()
+    assert not recorded_runs(tmp_path).read().records
+
+
+@pytest.mark.parametrize(
+    ("path", "counts"),
+    [("constants.py", True), ("room/rule.csv", True), ("room/__pycache__/a.py", False), ("figures/style.py", False)],
+)
+def test_the_key_follows_from_sources_with_numbers(tmp_path, path, counts):
+    """A changed or a renamed file changes the hash, unless no number follows from it."""
+    (tmp_path / "constants.py").write_text("HALF = 0.5")
+    file = tmp_path / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("a = 1")
+    first = hash_of(tmp_path)
+    assert hash_of(tmp_path) == first
+
+    file.write_text("a = 2")
+    second = hash_of(tmp_path)
+    file.rename(file.with_name(f"other{file.suffix}"))
+    assert len({first, second, hash_of(tmp_path)}) == (3 if counts else 1)
 
 
 def test_the_ring_is_endless_and_has_one_site_or_none():

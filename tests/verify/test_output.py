@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, run_of, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.dynamics.recorder import Recorder
@@ -109,6 +113,56 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
         assert simulate(case, folder / "run", resume=resume).complete
     assert_same_bits(run, datasets(folder / "run" / "run.h5"))
     assert {p.name for p in (folder / "run").iterdir()} == {"run.h5", "case.toml", "summary.json"}
+
+
+def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
+    """A run that other sources of the program have begun begins again, and its checkpoints are not read."""
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 16)
+    case = small_case(time={"end": 0.02})
+    assert simulate(case, folder / "run", stop=StopAt(120)).resumable
+    parts = folder / "run" / "parts"
+    assert any(parts.glob("state-*"))
+    for path in parts.iterdir():
+        path.write_text("of other sources")
+
+    assert simulate(case, folder / "run").complete
+    simulate(case, folder / "straight")
+    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENOSPC])
+@pytest.mark.parametrize("after", [0, 1, 5])
+def test_a_run_that_cannot_be_written_names_its_file_and_can_be_resumed(folder, monkeypatch, number, after):
+    """A call of the system that fails is one error with the file and the reason; the same command then completes."""
+    case = small_case(time={"end": 0.01})
+    opened = Path.open
+    left = after
+
+    class Failing(io.FileIO):
+        def write(self, data):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise OSError(number, os.strerror(number))
+            return super().write(data)
+
+    def failing(path, *arguments, **options):
+        if not path.name.startswith(".run.h5"):
+            return opened(path, *arguments, **options)
+        if not after:
+            raise OSError(number, os.strerror(number))
+        return Failing(path, "w+")
+
+    with monkeypatch.context() as context:
+        context.setattr(Path, "open", failing)
+        with pytest.raises(OSError, match=rf"run\.h5 could not be written: {os.strerror(number)}") as caught:
+            simulate(case, folder / "run")
+    assert caught.value.errno == number
+    assert {path.name for path in (folder / "run").iterdir()} == {"case.toml", "parts"}
+
+    assert simulate(case, folder / "run").complete
+    simulate(case, folder / "straight")
+    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
 
 
 def test_episodes_stand_in_the_order_of_their_onsets():

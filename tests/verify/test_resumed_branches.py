@@ -7,6 +7,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+import h5py
 import pytest
 
 from vipetsc.case import NnmCase
@@ -67,6 +68,23 @@ def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
 
     assert (resumed.ending, resumed.findings) == (whole.ending, whole.findings)
     assert len(resumed.points) == len(whole.points)
+
+
+def test_a_branch_that_other_sources_began_is_computed_again(tmp_path):
+    """The points of other sources are dropped while a branch is not complete, and stay where it is."""
+    stopped_at(tmp_path, 3)
+    path = tmp_path / "branch-out-of-phase.h5"
+    with h5py.File(path, "r+") as file:
+        file.attrs["source"] = "0.1.0+other"
+        file["energy"][0] = -1.0
+    whole = follow(tmp_path)
+    assert whole.complete and whole.points[0].energy > 0
+
+    with h5py.File(path, "r+") as file:
+        file.attrs["source"] = "0.1.0+other"
+    before = path.read_bytes()
+    follow(tmp_path)
+    assert path.read_bytes() == before
 
 
 def test_a_branch_that_goes_on_has_the_orbits_that_it_lacked(tmp_path):

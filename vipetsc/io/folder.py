@@ -31,6 +31,7 @@ from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
 from vipetsc.process import say
+from vipetsc.sources import source_key
 
 FORMAT_VERSION = 1
 MOST_NAMED = 6  # keys of another case that a message names: more do not help to tell which case it is
@@ -293,6 +294,7 @@ def origin() -> dict[str, Any]:
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
         "revision": revision(),
+        "source": source_key(),
         "petsc_version": ".".join(map(str, PETSc.Sys.getVersion())),
         "mpi_version": MPI.Get_library_version().split(",")[0].strip(),
         "hdf5_version": h5py.version.hdf5_version,

@@ -32,6 +32,8 @@ from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run, with_point_names
 from vipetsc.parallel import on_every_rank, on_root
+from vipetsc.process import say
+from vipetsc.sources import source_key
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -58,7 +60,18 @@ class RunFolder:
     def begin(self, case: str) -> None:
         """Prepare the output of a new or continued run of ``case`` (TOML); all ranks must call it."""
         self.case = case
-        on_root(self.comm, lambda: self._parts.mkdir(parents=True, exist_ok=True))
+        on_root(self.comm, self._prepare_parts)
+
+    def _prepare_parts(self) -> None:
+        """Make the folder of the chunks; what other sources of the program have begun there is dropped."""
+        stamp = self._parts / "source"
+        if stamp.exists() and stamp.read_text(encoding="utf-8") == source_key():
+            return
+        if self._parts.exists() and any(self._parts.iterdir()):
+            say(f"{self._parts}: was begun by other sources of vipetsc; the run begins again")
+            discard(self._parts)
+        self._parts.mkdir(parents=True, exist_ok=True)
+        write_text(stamp, source_key())
 
     def ending(self) -> dict[str, Any] | None:
         """The root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.

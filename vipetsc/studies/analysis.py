@@ -24,6 +24,7 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import divided, on_every_rank, on_root
+from vipetsc.sources import source_key
 from vipetsc.spectra.measures import MEASURES, PART, row_of, take
 from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
@@ -114,6 +115,7 @@ def analyse(
     about = {
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
+        "source": source_key(),
         "case": run.attrs["case"],
         "status": run.attrs.get("status", ""),
         "analysis": describe_options(options),

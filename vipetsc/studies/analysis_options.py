@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-import vipetsc
 from vipetsc.case import Case
 from vipetsc.case.case_file import read_toml
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.io.read import RUN_NEEDS
+from vipetsc.sources import source_key
 
 
 def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
@@ -34,7 +34,7 @@ def is_measured(folder: Path) -> bool:
     expected = {
         "case": run["case"],
         "status": run.get("status"),
-        "vipetsc_version": vipetsc.__version__,
+        "source": source_key(),
         "analysis": describe_options(options_of(run["case"], folder)),
     }
     # One that is not there or was cut off raises OSError.

@@ -21,11 +21,11 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import minimize_scalar
 
-import vipetsc
 from vipetsc.case import Case, Sweep
 from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble
+from vipetsc.sources import source_key
 from vipetsc.spectra import power_law
 from vipetsc.studies.linear_run import factor, first_site_cell, is_proportional, read_linear
 
@@ -283,7 +283,7 @@ def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
     """Whether ``folder/backbone.h5`` is of this version and of the sweep and the ``branches`` as they are now."""
     with suppress(OSError), open_netcdf(folder / "backbone.h5", "relation") as file:  # none, or one that was cut off
-        if file.attrs.get("vipetsc_version") == vipetsc.__version__:
+        if file.attrs.get("source") == source_key():
             return bool(json.loads(file.attrs.get("sources", "{}")) == _sources(folder, branches))
     return False
 

@@ -18,9 +18,9 @@ from vipetsc.case import Case, CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.eigen import modes_near
 from vipetsc.dynamics.matrices import Joint, LatticeMatrices
+from vipetsc.dynamics.memory import LARGEST_MESSAGE
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
-from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import Band, Chain, wave_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
@@ -103,7 +103,7 @@ def check_modes(case: Case, count: int, near: float) -> None:
     # The comparison is false for NaN too; far below 1e50 squares of frequencies do not overflow.
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
-    if 8 * count * masses > GATHER_LIMIT:
+    if 8 * count * masses > LARGEST_MESSAGE:
         raise CaseError([Problem("--modes", count, "one rank cannot gather all shapes; request fewer modes")])
 
 

@@ -13,7 +13,6 @@ from mpi4py import MPI
 
 import xarray as xr
 
-import vipetsc
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.result import Result
@@ -21,6 +20,7 @@ from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_rec
 from vipetsc.io.store import RunMemory, RunOutput
 from vipetsc.parallel import StoppedError, StopRequest, StudyError, on_every_rank, on_root
 from vipetsc.progress import Progress
+from vipetsc.sources import source_key
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float] | tuple[str, float, int]
@@ -59,15 +59,15 @@ class RecordPaths:
         return files
 
     def read(self, damaged: Callable[[str], None] = lambda text: None) -> Iterator[tuple[Key, Record, Line]]:
-        """Yield the records of this version with their keys and places; a later one of a key replaces an earlier one.
+        """Yield the records of these sources with their keys and places; a later one of a key replaces an earlier one.
 
         A failure after a success is passed over. ``damaged`` gets a sentence about each line that cannot be used.
         """
         succeeded: set[Key] = set()
         for path in self.existing():
             for record, line in read_records(path, damaged):
-                # Another version may simulate and measure otherwise: its runs are made again.
-                if record["vipetsc_version"] != vipetsc.__version__:
+                # Other sources may simulate and measure otherwise: its runs are made again.
+                if record["source"] != source_key():
                     continue
                 key = record["key"]
                 # JSON has no tuples.
@@ -195,7 +195,7 @@ class RecordedRuns:
 
     def _append(self, key: Key, record: Record, kind: str) -> Record:
         """Append the ``record`` of ``key`` to this rank's file; returns it with its key, its kind and the version."""
-        whole = {"kind": kind, "key": key, "vipetsc_version": vipetsc.__version__} | record
+        whole = {"kind": kind, "key": key, "source": source_key()} | record
         self.file.append(whole)
         return whole
 

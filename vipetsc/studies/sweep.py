@@ -20,7 +20,6 @@ from mpi4py import MPI
 import h5py
 import numpy as np
 
-import vipetsc
 from vipetsc.case import Case, CaseError, Problem, Sweep
 from vipetsc.case.html import html_table
 from vipetsc.io.atomic import discard, write_text
@@ -28,6 +27,7 @@ from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.progress import say
+from vipetsc.sources import source_key
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import MEMBERS, LinearRun, first_site_cell, linear_name
 from vipetsc.studies.recorded_runs import RecordPaths
@@ -326,7 +326,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
     index = {
         "format_version": FORMAT_VERSION,
-        "vipetsc_version": vipetsc.__version__,
+        "source": source_key(),
         "sweep": plan.name,
         "members": count,
         "failed": [_failed_member(results, number) for number in np.flatnonzero(status == FAILED)],

@@ -60,6 +60,7 @@ from mpi4py import MPI
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.io.netcdf import root_attributes
 from vipetsc.modes.branches.branch import Branch, FailureBelow
 from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
@@ -70,6 +71,7 @@ from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.problem import ContinuationError, PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.sources import source_key
 
 logger = logging.getLogger(__name__)
 BranchCase = NnmCase | NfrcCase
@@ -290,8 +292,12 @@ class Follower:
         try:
             # Read by one rank: the others must not find another file, or none.
             stored = on_root(self.comm, lambda: read_branch(path))
+            source = on_root(self.comm, lambda: root_attributes(path, "branch").get("source"))
         except OSError as error:
             self._warn(f"{error}; computed again")
+            return new
+        if not stored.complete and source != source_key():
+            self._warn(f"{path} was begun by other sources of vipetsc; computed again")
             return new
         # The case's bounds may be new.
         branch = replace(stored, case=new.case, about=new.about, extra=new.extra)
