@@ -130,8 +130,7 @@ def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
 
 
-@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENOSPC])
-@pytest.mark.parametrize("after", [0, 1, 5])
+@pytest.mark.parametrize(("number", "after"), [(errno.EMFILE, 0), (errno.EIO, 1), (errno.ESTALE, 2), (errno.ENOSPC, 5)])
 def test_a_run_that_cannot_be_written_names_its_file_and_can_be_resumed(folder, monkeypatch, number, after):
     """A call of the system that fails is one error with the file and the reason; the same command then completes."""
     case = small_case(time={"end": 0.01})
