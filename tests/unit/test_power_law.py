@@ -161,11 +161,26 @@ def test_a_constant_has_no_coefficient_of_determination():
     assert np.isnan(r2_adjusted([1.0, 1.0, 1.0], [1.0, 1.0, 1.0]))
 
 
-def test_three_points_or_a_fit_worse_than_the_mean_are_no_power_law():
-    """A fit counts from four points on and if it is no worse than their mean; otherwise a reason is given."""
-    assert doubt(4, 0.0) == ""
+def test_three_points_or_no_fit_are_no_power_law():
+    """A fit counts from four points on; otherwise a reason is given."""
     assert doubt(9, 0.99) == ""
     assert doubt(3, 0.999) == "too few points (3)"
     assert doubt(5, -0.04) == "adjusted R² -0.04"
     assert doubt(5, np.nan) == "no fit"
     assert doubt(np.nan, np.nan) == "no fit"
+
+
+@pytest.mark.parametrize("points", [4, 5, 12, 40])
+@pytest.mark.parametrize("slope", [0.0, -0.1, -0.3, 0.5, -2.0])
+def test_a_power_law_is_a_fit_whose_exponent_is_not_zero(points, slope):
+    """A fit is a power law exactly if the 95 % interval of its exponent does not contain 0."""
+    x = np.geomspace(1.0, 100.0, points)
+    scatter = np.random.default_rng(points).standard_normal((20, points))
+    found = set()
+    for noise in scatter:
+        law = power_law(x, 2.0 * x**slope * np.exp(0.5 * noise))
+        low, high = law.exponent_interval
+        found.add(bool(low > 0 or high < 0))
+        assert (doubt(points, law.r2_adjusted) == "") == (low > 0 or high < 0)
+    if slope == -2.0 and points > 4:
+        assert found == {True}

@@ -11,6 +11,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, Sweep
+from vipetsc.dynamics import simulate
 from vipetsc.io.read import open_ensemble
 from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
@@ -296,3 +297,55 @@ def test_measures_that_fail_for_one_first_site_fail_its_members_alone(tmp_path):
     result = run_sweep(Sweep.from_table(table), tmp_path / "out")
 
     assert result.status.tolist() == [SCALED, SCALED, FAILED, FAILED]
+
+
+SHORT_STEPS = TABLE | {"time": TABLE["time"] | {"sample_interval": 1e-4, "engine": "propagator"}}
+
+
+def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
+    """A member has the same bits with other members, with stored fields, and as a run of its own."""
+    amplitudes = [1.0, 30.0, 40.0]
+    records = {}
+    for name, values in {"all": amplitudes, "one": amplitudes[1:2], "fields": amplitudes[1:]}.items():
+        sweep = {"drive": {"amplitude": values}, "measures": ["transfer", "entropy"], "fields": name == "fields"}
+        plan = Sweep.from_table(SHORT_STEPS | {"sweep": sweep})
+        assert run_sweep(plan, tmp_path / name).complete
+        rows = [record for _, record, _ in RecordPaths(tmp_path / name, MEMBERS).read()]
+        records[name] = {row["key"]: row for row in rows if row["kind"] == "member"}
+
+    # Sweeps of the same base case give the same names to equal members.
+    (member,) = records["one"]
+    alone = records["one"][member]
+    for name in ("all", "fields"):
+        found = records[name][member]
+        assert found["statistics"]["work"] == alone["statistics"]["work"]
+        assert found["measures"]["entropy/history"] == alone["measures"]["entropy/history"]
+    assert records["all"][member]["measures"] == alone["measures"]
+
+    simulate(plan.case(0), tmp_path / "alone")
+    assert_same_bits(datasets(tmp_path / "alone" / "run.h5"), datasets(tmp_path / "fields" / member / "run.h5"))
+
+
+@pytest.fixture(scope="module")
+def between_samples():
+    """Return a clearance that a linear wave passes between two samples 0.8 ms apart, and not at any sample."""
+    far = {"contacts": {"sites": [9], "clearance": 1.0}, "drive": TABLE["drive"] | {"cycles": 1, "amplitude": 30.0}}
+
+    def largest(interval: float) -> float:
+        case = Case.from_table(SHORT_STEPS | far | {"time": SHORT_STEPS["time"] | {"sample_interval": interval}})
+        run = simulate(case, comm=MPI.COMM_SELF).dataset
+        cell = case.model().chain.cell
+        u = run["displacement"].values[:, 8]
+        return np.abs(u[:, cell.resonator] - u[:, cell.host]).max()
+
+    at_samples = largest(8e-4)
+    between = largest(5e-5)
+    assert between > 1.01 * at_samples
+    return far | {"contacts": {"sites": [9], "clearance": float(np.sqrt(at_samples * between))}}
+
+
+def test_a_member_with_a_contact_that_no_sample_shows_is_simulated(between_samples):
+    """A member whose linear wave passes its clearance between two samples has its contact: it is not scaled."""
+    table = SHORT_STEPS | between_samples | {"time": SHORT_STEPS["time"] | {"sample_interval": 8e-4}}
+    sweep = {"drive": {"amplitude": [30.0]}, "measures": ["transfer"]}
+    assert run_sweep(Sweep.from_table(table | {"sweep": sweep})).dataset["contact_episodes"].item() > 0

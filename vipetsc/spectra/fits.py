@@ -32,13 +32,18 @@ class PowerLaw:
 
 
 def doubt(points: float, r2: float) -> str:
-    """Reason not to call a fit over so many ``points`` a power law, empty if it is one; ``r2`` is its adjusted R^2."""
+    """Return why a fit over so many ``points`` is not a power law, empty if it is one; ``r2`` is its adjusted R^2.
+
+    It is one if the exponent differs from zero, at the confidence ``LEVEL``: t^2 = R^2 (n - 2)/(1 - R^2), with the R^2
+    that is not adjusted, then exceeds the square of Student's quantile.
+    """
     if points < FEWEST:
         return f"too few points ({points:g})"
     if np.isnan(r2):
         return "no fit"
-    # A constant fits better.
-    if r2 < 0:
+    freedom = points - 2
+    plain = 1 - (1 - r2) * freedom / (points - 1)
+    if plain * freedom < (1 - plain) * stdtrit(freedom, 0.5 + LEVEL / 2) ** 2:
         return f"adjusted R² {r2:.2g}"
     return ""
 

@@ -46,7 +46,7 @@ FIT = {
     "exponent_nonlinear": ("1", "exponent of the nonlinear fit"),
     "factor_nonlinear": ("{fitted}", "value of the nonlinear fit at 1 {unit}"),
     "r2_nonlinear": ("1", "adjusted R^2 of the nonlinear fit"),
-    "is_power_law": ("1", f"1 where the log-log fit is a power law: {FEWEST} points or more, adjusted R^2 not below 0"),
+    "is_power_law": ("1", f"1 where the fit is a power law: {FEWEST} points or more, an exponent that is not 0"),
 }
 # Groups of the fits: of the values as they are, and, for entropies, of values scaled to [0.01, 1] as the paper does.
 FITS = "fits"
