@@ -224,14 +224,14 @@ def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypat
 
 
 def test_remainders_are_carried_so_that_those_of_many_cells_do_not_overflow():
-    """The sum of remainders of nearly half a unit stays below a unit: those of 2^24 cells would add up to 2^63."""
-    energy = 5.5 - 2.0**-40
+    """The sum of remainders of nearly half a unit stays below a unit: those of 2^12 cells would add up to 2^63."""
+    energy = 0.5 - 2.0**-40
     sums = np.zeros((ENERGY_SUMS, 2), np.int64)
     for _ in range(3):
         add_energy(sums, energy, 1.0)
     whole, fine = sums[1].tolist()
-    assert 0 <= fine < 2**40
-    assert whole + fine / 2**40 == pytest.approx(3 * energy, rel=1e-15)
+    assert 0 <= fine < 2**52
+    assert whole + fine / 2**52 == pytest.approx(3 * energy, rel=1e-15)
 
 
 @pytest.mark.parametrize("ranks", [3, 2**14])
@@ -240,8 +240,8 @@ def test_the_sum_over_ranks_does_not_depend_on_their_order_nor_number(ranks):
     sums = np.zeros((ranks, ENERGY_SUMS, 2), np.int64)
     rng = np.random.default_rng(2)
     sums[:, :, 0] = rng.integers(0, 2**45, (ranks, ENERGY_SUMS))
-    sums[:, :, 1] = 2**40 - 1 - rng.integers(0, 7, (ranks, ENERGY_SUMS))
-    expected = [sum((whole << 40) + fine for whole, fine in of_rank) for of_rank in sums.swapaxes(0, 1).tolist()]
+    sums[:, :, 1] = 2**52 - 1 - rng.integers(0, 7, (ranks, ENERGY_SUMS))
+    expected = [sum((whole << 52) + fine for whole, fine in of_rank) for of_rank in sums.swapaxes(0, 1).tolist()]
 
     found = []
     for order in (slice(None), slice(None, None, -1)):
@@ -250,12 +250,12 @@ def test_the_sum_over_ranks_does_not_depend_on_their_order_nor_number(ranks):
             total += energies.parts(of_rank[None])
         found.append(energies.joined(total)[:, 0])
     # All of them on one rank, which carries whole units out of the remainders as it adds.
-    alone = np.array([[divmod(number, 2**40) for number in expected]], np.int64)
+    alone = np.array([[divmod(number, 2**52) for number in expected]], np.int64)
     found.append(energies.joined(energies.parts(alone))[:, 0])
 
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
-    np.testing.assert_allclose(found[0], [number / 2**40 for number in expected], rtol=3e-16)
+    np.testing.assert_allclose(found[0], [number / 2**52 for number in expected], rtol=3e-16)
 
 
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])

@@ -1,9 +1,9 @@
 """Energies of a distributed state, as sums of integers.
 
 Sums of floating-point numbers depend on their order in the last bits, and so on the number of ranks. Each cell's energy
-is therefore a whole number of a unit and a remainder in multiples of unit/2^40; both are summed as integers, whose sums
-are exact in any order. The unit is 2^-20 of the run's scale of energy, so that rounding a cell's energy to unit/2^40
-loses less than 2^-60 of that scale, and a sum may grow to 2^32 times the scale: that of an undamped resonance does not
+is therefore a whole number of a unit and a remainder in multiples of unit/2^52; both are summed as integers, whose sums
+are exact in any order. The unit is 2^-20 of the run's scale of energy, so that rounding a cell's energy to unit/2^52
+loses less than 2^-72 of that scale, and a sum may grow to 2^32 times the scale: that of an undamped resonance does not
 stay near the scale, which is the energy of the forced wave.
 """
 
@@ -22,7 +22,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, damping_powers, displacement, is_varied
 
-_FINE_BITS = 40
+_FINE_BITS = 52
 _FINE = 2.0**_FINE_BITS  # multiples of the finer remainder in one unit
 _UNIT_BITS = 20  # of the scale of energy in a unit
 # Whole multiples from which on a sum counts as a runaway energy, and at which a cell's energy is cut off.
@@ -30,8 +30,10 @@ LARGEST = 2.0**52
 # Whole multiples at which a sum is cut off. A chunk of cells adds 2^61 at most, so that a sum of 64 bits never
 # overflows, however many cells run away at once.
 SATURATED = 2**61
-# Ranks add their sums in parts of so many bits, as floats: exact for 2^22 ranks, since floats are so below 2^53.
+# Ranks add their sums in parts of so many bits, as floats, which are exact below 2^53: for up to 2^20 ranks. The whole
+# multiples have two such parts, an upper one of 32 bits and a lower one, and so have the remainders.
 _PART_BITS = 30
+_FINE_PART_BITS = 26
 # Energies in J below this fraction of the scale are too small for the balance to be judged: in the first samples of a
 # burst of 30 cycles the error may be as large as the work, with either engine. From there on it is below 1e-10 of it.
 _NEGLIGIBLE = 1e-8
@@ -41,7 +43,7 @@ ENERGY_SUMS = 5
 
 @kernel
 def _multiples(energy: float, unit: float) -> tuple[np.int64, np.int64]:
-    """An ``energy`` in J as a multiple of ``unit`` and one of unit/2^40."""
+    """An ``energy`` in J as a multiple of ``unit`` and one of unit/2^52."""
     multiple = energy * (1.0 / unit)
     whole = np.rint(multiple)
     # An energy that is not finite or far beyond the scale is cut off at LARGEST, where the guard ends the run.
@@ -52,7 +54,7 @@ def _multiples(energy: float, unit: float) -> tuple[np.int64, np.int64]:
 
 @kernel
 def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None:
-    """Add energies in J to row ``kind`` of ``sums`` (energy, 2), as multiples of ``unit`` and of unit/2^40.
+    """Add energies in J to row ``kind`` of ``sums`` (energy, 2), as multiples of ``unit`` and of unit/2^52.
 
     Whole multiples are cut off at ``SATURATED``.
     """
@@ -62,7 +64,7 @@ def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None
             whole, fine = _multiples(energies[i], unit)
             whole_sum += whole
             fine_sum += fine
-        # Remainders are 2^39 at most: those of a chunk cannot overflow, those of all cells of a rank could.
+        # Remainders are 2^51 at most: those of a chunk cannot overflow, those of all cells of a rank could.
         fine_sum += sums[kind, 1]
         whole_sum += fine_sum >> _FINE_BITS
         sums[kind, 0] = min(sums[kind, 0] + whole_sum, SATURATED)
@@ -179,7 +181,7 @@ def add_powers(y: np.ndarray, lattice: LatticeRecord, seconds: float, unit: floa
 def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
     """Add an ``energy`` in J to that of the springs.
 
-    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^40, as ``measure`` fills them.
+    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
     """
     _add_one(sums, _SPRING, energy, unit)
 
@@ -188,7 +190,7 @@ def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
 def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
     """Add an ``energy`` in J to what contacts have dissipated.
 
-    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^40, as ``measure`` fills them.
+    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
     """
     _add_one(sums, _DISSIPATED, energy, unit)
 
@@ -225,11 +227,10 @@ class Energies:
 def parts(sums: np.ndarray) -> np.ndarray:
     """The ``sums`` (sample, energy, 2) of a rank as floats (part and energy, sample), to be added to those of others.
 
-    An energy has four parts, of ``_PART_BITS`` bits at most: the upper and lower ones of the whole multiple and of the
-    remainder.
+    An energy has four parts: the upper and lower ones of the whole multiple and of the remainder.
     """
     pieces = []
-    for number, bits in zip(sums.T, (_PART_BITS, _FINE_BITS // 2), strict=True):
+    for number, bits in zip(sums.T, (_PART_BITS, _FINE_PART_BITS), strict=True):
         upper = number >> bits
         pieces += [upper, number - (upper << bits)]
     return np.vstack(pieces).astype(float)
@@ -238,13 +239,18 @@ def parts(sums: np.ndarray) -> np.ndarray:
 def joined(total: np.ndarray) -> np.ndarray:
     """Energies (energy, sample) in units of sums of ``parts``; the same for any division of the cells among ranks."""
     upper, lower, fine_upper, fine_lower = np.split(total.astype(np.int64), 4)
-    fine = (fine_upper << (_FINE_BITS // 2)) + fine_lower
-    lower += fine >> _FINE_BITS
-    fine -= (fine >> _FINE_BITS) << _FINE_BITS
-    upper += lower >> _PART_BITS
-    lower -= (lower >> _PART_BITS) << _PART_BITS
-    # Each of the three is exact: no more than these two additions round.
+    fine_upper, fine_lower = _carried(fine_upper, fine_lower, _FINE_PART_BITS)
+    lower, fine_upper = _carried(lower, fine_upper, _FINE_BITS - _FINE_PART_BITS)
+    upper, lower = _carried(upper, lower, _PART_BITS)
+    # Each of the three numbers is exact: no more than these two additions round.
+    fine = (fine_upper << _FINE_PART_BITS) + fine_lower
     return upper * 2.0**_PART_BITS + (lower + fine / _FINE)
+
+
+def _carried(upper: np.ndarray, lower: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Carry what the ``lower`` part of a number has beyond so many ``bits`` into the ``upper`` one."""
+    carry = lower >> bits
+    return upper + carry, lower - (carry << bits)
 
 
 class EnergyMeter:
