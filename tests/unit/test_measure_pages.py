@@ -77,12 +77,18 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
 def with_samples(*axes: dict[str, list]) -> xr.Dataset:
     """Return an ensemble over eight seeds and ``axes``, with the statistics that a finished sweep has."""
     ensemble = ensemble_of({"disorder.seed": list(range(8))}, *axes)
+    return sampled(ensemble)
+
+
+def sampled(ensemble: xr.Dataset) -> xr.Dataset:
+    """Return an ensemble over seeds with its statistics."""
     for name in ("ibtet", "contact_episodes"):
         values = ensemble[name]
         quantiles = values.quantile([0.05, 0.5, 0.95], dim="seed")
+        ensemble[f"statistics/{name}/samples"] = values.notnull().sum("seed")
         ensemble[f"statistics/{name}/mean"] = values.mean("seed")
         ensemble[f"statistics/{name}/quantiles"] = quantiles.transpose("quantile", ...).drop_vars("quantile")
-    ensemble["statistics/samples"] = values.notnull().sum("seed")
+    ensemble["statistics/samples"] = ensemble["contact_episodes"].notnull().sum("seed")
     return ensemble
 
 
@@ -242,6 +248,41 @@ def test_samples_are_a_mean_and_a_band():
     assert edges[:, 1].max() == pytest.approx(high.max())
     assert "means over 8 samples; bands: 5 to 95 % of the samples" in title(figure)
     assert "disorder.seed" not in title(figure)
+
+
+@pytest.mark.parametrize(
+    ("failed", "missing", "means", "failures"),
+    [
+        # Seeds of failed members with the indices of their amplitudes; seeds that lack this measure alone.
+        ({}, {}, "8 samples", ""),
+        ({1: range(6), 5: range(6)}, {}, "6 of 8 samples", "12 of 48 members failed"),
+        ({1: [0], 5: [0, 3]}, {}, "6 to 8 of 8 samples", "3 of 48 members failed"),
+        ({seed: [2] for seed in range(8)}, {}, "0 to 8 of 8 samples", "8 of 48 members failed"),
+        ({}, {7: [0]}, "7 to 8 of 8 samples", ""),
+    ],
+)
+def test_a_page_counts_the_samples_that_have_a_value(failed, missing, means, failures):
+    """The title has the number of samples that the means are over, and of members that failed."""
+    ensemble = ensemble_of({"disorder.seed": list(range(8))}, AMPLITUDES)
+    for seed, places in failed.items():
+        for name in ("ibtet", "contact_episodes"):
+            ensemble[name][seed, list(places)] = np.nan
+    for seed, places in missing.items():
+        ensemble["ibtet"][seed, list(places)] = np.nan
+    text = title(only(sampled(ensemble)))
+    assert f"means over {means};" in text
+    assert failures in text
+    assert ("members failed" in text) == bool(failures)
+
+
+def test_samples_alone_that_failed_are_counted():
+    """A page over seeds says how many of them have a value."""
+    ensemble = ensemble_of({"disorder.seed": list(range(8))})
+    for name in ("ibtet", "contact_episodes"):
+        ensemble[name][[2, 6]] = np.nan
+    text = title(only(sampled(ensemble)))
+    assert "of 6 of 8 samples" in text
+    assert "2 of 8 members failed" in text
 
 
 def test_samples_alone_are_points_over_their_seeds():

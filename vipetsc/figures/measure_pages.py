@@ -58,9 +58,10 @@ ON_REQUEST = {
 class Measure(NamedTuple):
     """A measure of a sweep over the dimensions of ``axes``.
 
-    ``values`` are the measure, NaN where it is not finite; ``band`` the lowest and the highest quantile over
-    ``samples`` samples of disorder, None without samples; ``failed`` tells which members failed. ``text`` says what the
-    measure is.
+    ``values`` are the measure, NaN where it is not finite. Where the sweep has ``samples`` samples of disorder, these
+    are means over the ``counted`` samples that have a value, and ``band`` are the lowest and the highest quantile over
+    them; without samples both are None. ``failed`` is the number of failed members at each place of the axes, one for
+    each sample. ``text`` says what the measure is.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Measure(NamedTuple):
     values: xr.DataArray
     band: tuple[xr.DataArray, xr.DataArray] | None
     samples: int
+    counted: xr.DataArray | None
     axes: tuple[SweptAxis, ...]
     failed: xr.DataArray
 
@@ -77,6 +79,13 @@ class Measure(NamedTuple):
         """Return the measure ``name`` of an ensemble, means over its samples if it has any."""
         means = over_samples(ensemble)
         values = means[name]
+        seeds = _seeds(ensemble)
+        failed = ensemble["contact_episodes"].isnull()
+        counted = None
+        if seeds.size:
+            failed = failed.sum(_seed_dimension(ensemble))
+            counted = means.get(f"statistics/{name}/samples", means["statistics/samples"])
+
         ends = []
         if f"statistics/{name}/quantiles" in means:
             quantiles = means[f"statistics/{name}/quantiles"]
@@ -94,6 +103,8 @@ class Measure(NamedTuple):
         shown = {axis.dimension for axis in axes}
         first = {str(dimension): 0 for dimension in values.dims if dimension not in shown}
         values, *ends = (item.isel(place).isel(first) for item in (values, *ends))
+        if counted is not None:
+            counted = counted.isel({**place, **first}, missing_dims="ignore")
 
         # Files have the unit "1" where texts have none.
         unit = str(values.attrs.get("units", "1"))
@@ -108,9 +119,10 @@ class Measure(NamedTuple):
             text=str(values.attrs.get("long_name", "")),
             values=values.where(np.isfinite),
             band=band,
-            samples=_seeds(ensemble).size,
+            samples=seeds.size,
+            counted=counted,
             axes=tuple(axes),
-            failed=means["contact_episodes"].isel(first, missing_dims="ignore").isnull(),
+            failed=failed.isel(first, missing_dims="ignore"),
         )
 
     @property
@@ -125,13 +137,36 @@ class Measure(NamedTuple):
 
     def at(self, place: Mapping[str, int]) -> Self:
         """Return the measure at the indices ``place`` of its dimensions, without these."""
-        present = {dimension: index for dimension, index in place.items() if dimension in self.failed.dims}
+        counted = self.counted
+        if counted is not None:
+            counted = counted.isel(place, missing_dims="ignore")
         return self._replace(
             values=self.values.isel(place),
             band=self.band and (self.band[0].isel(place), self.band[1].isel(place)),
             axes=tuple(axis for axis in self.axes if axis.dimension not in place),
-            failed=self.failed.isel(present),
+            counted=counted,
+            failed=self.failed.isel(place, missing_dims="ignore"),
         )
+
+    @property
+    def failures(self) -> str:
+        """A sentence on the members that failed; empty if none did."""
+        failed = int(self.failed.sum())
+        if not failed:
+            return ""
+        return f"{failed} of {self.failed.size * max(self.samples, 1)} members failed and are left out"
+
+    @property
+    def sample_text(self) -> str:
+        """How many samples the values are means over: "8 samples", "6 of 8 samples", "5 to 8 of 8 samples"."""
+        assert self.counted is not None
+        least = int(self.counted.min())
+        most = int(self.counted.max())
+        if least == self.samples:
+            return f"{self.samples} samples"
+        if least == most:
+            return f"{least} of {self.samples} samples"
+        return f"{least} to {most} of {self.samples} samples"
 
     def largest(self) -> dict[str, int]:
         """Return the place of the largest value: its index along every dimension."""
@@ -285,7 +320,8 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
         # The quantiles of the band that curves over keys have.
         low, high = np.nanquantile(samples, (0.05, 0.95))
         labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
-    page = MeasurePage(measure.label, [heading, f"of {measure.samples} samples"], labels)
+    lines = filter(None, [heading, f"of {measure.sample_text}", measure.failures])
+    page = MeasurePage(measure.label, list(lines), labels)
     page.lay_out([""])
     drawn = []
     for number, (samples, colour) in enumerate(zip(series, colours, strict=True)):
@@ -344,14 +380,14 @@ def _lines_above(measure: Measure, roles: Roles, title: Sequence[str]) -> list[s
     lines = [heading, over, *further]
 
     if measure.samples:
-        means = f"means over {measure.samples} samples"
+        means = f"means over {measure.sample_text}"
         if roles.y is None:
             means += "; bands: 5 to 95 % of the samples"
         lines.append(means)
-    failed = int(measure.failed.sum())
-    if failed:
-        lines.append(f"{failed} of {measure.failed.size} members failed and are left out")
-    without_value = int((measure.values.isnull() & ~measure.failed).sum())
+    if measure.failures:
+        lines.append(measure.failures)
+    all_failed = measure.failed == max(measure.samples, 1)
+    without_value = int((measure.values.isnull() & ~all_failed).sum())
     if without_value:
         lines.append(f"{without_value} of {measure.values.size} values are missing")
     return lines
