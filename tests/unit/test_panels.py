@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib import colormaps
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -88,6 +89,40 @@ def test_colours_follow_the_data(axes):
 
     assert panels.log_norm(0.0).vmax == 1.0
     assert panels.log_norm(np.nan).vmax == 1.0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_value_that_is_not_finite_does_not_blank_a_map(bad, place):
+    """Colours are those of the finite values; as before a NaN is drawn as nothing."""
+    field = np.array([1e-6, 1e-5, 1e-7])
+    field[place] = bad
+    assert panels.log_norm(field, [1e-9]).vmax == np.max(field[np.isfinite(field)])
+
+
+@pytest.mark.parametrize("count", [5, 600, 601, 1000, 1799])
+def test_a_map_of_blocks_ends_where_its_field_does(axes, count):
+    """Block k of a map with means over blocks lies over its cells, though the last block has fewer."""
+    cells = np.arange(1, count + 1)
+    image = panels.draw_map(axes, cells, np.arange(3), np.ones((3, count)), panels.log_norm(1.0))
+    left, right, _, _ = image.get_extent()
+    columns = image.get_array().shape[1]
+    assert (right - left) / columns == -(-count // panels.PIXELS)
+    assert axes.get_xlim() == (0.5, count + 0.5)
+
+
+def contrast(text, background) -> float:
+    """The contrast of two colours (WCAG 2.1), by the formula for the smaller and the larger luminance."""
+    low, high = sorted([panels.luminance(text), panels.luminance(background)])
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("name", ["RdBu_r", "viridis", "inferno"])
+def test_numbers_on_a_map_can_be_read(name):
+    """Numbers have the contrast of 4.5 that WCAG asks for on every colour of a map, and on the paper of a NaN."""
+    colours = colormaps[name](np.linspace(0, 1, 64))
+    assert min(contrast(panels.text_colour(colour), colour) for colour in colours) >= 4.5
+    assert panels.text_colour((0, 0, 0, 0)) == style.BLACK
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -256,7 +291,7 @@ def test_windows_of_an_identification_have_whole_numbers(monkeypatch):
         },
         coords={"window": number},
     )
-    misfit, course, _ = growing_windows(identified).axes
+    misfit, course = growing_windows(identified).axes
     for axes in (misfit, course):
         ticks = axes.get_xticks()
         assert np.array_equal(ticks, np.round(ticks))

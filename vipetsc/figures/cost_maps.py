@@ -89,7 +89,7 @@ def _draw_cost(axes: Axes, result: xr.Dataset, cost: str) -> None:
     values = result[cost].values.T
     # Without a feasible cell all of them set the colours.
     in_range = values[feasible] if feasible.any() else values
-    norm = Normalize(in_range.min(), in_range.max())
+    norm = Normalize(np.nanmin(in_range), np.nanmax(in_range))
 
     # The other costs hold the signed deflection, whose largest value means nothing where the sign changes.
     shown = values

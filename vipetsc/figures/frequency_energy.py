@@ -46,6 +46,7 @@ HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 MOST_MARKS = 12
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 
+MOST_ORBITS = 4  # whose portraits have room
 SLOPE = r"|d$f$/d$E$| (Hz/J)"
 
 # Heights of the panels of a column, in units of 1.55 inches.
@@ -238,7 +239,8 @@ def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
         annotate_empty(part.subplots(), "no orbits stored")
         return
 
-    orbits = branch.isel(orbit=slice(4))
+    stored = branch.sizes["orbit"]
+    orbits = branch.isel(orbit=slice(MOST_ORBITS))
     regular = branch.isel(point=branch["kind"].values == "regular")
     grid = part.subplots(1, orbits.sizes["orbit"], sharey=True, squeeze=False)[0]
     for k, axes in enumerate(grid):
@@ -252,7 +254,10 @@ def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
         axes.set_title(f"{region}\n{float(f'{energy:.2g}'):g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
     grid[0].set_ylabel(r"$\dot u$/max")
-    part.suptitle(f"({tag}) Orbits", x=0.02, ha="left")
+    heading = f"({tag}) Orbits"
+    if stored > MOST_ORBITS:
+        heading += f", {MOST_ORBITS} of {stored} in the file"
+    part.suptitle(heading, x=0.02, ha="left")
     part.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
 
-MOST_CHANNELS = 8  # on a page, which is 15 inches high then
+MOST_CHANNELS = 8  # on a page, which is 15 inches high then; a note says that there are more
 MOST_NAMES = 12  # parameters that are named in a legend, and whose correlations are written out: more would overlap
 # Largest lag, in samples, to which the correlation of residuals is drawn: a few periods of a record, in which physics
 # that the model neglects shows.
@@ -47,7 +47,15 @@ def record_and_model(identified: xr.Dataset) -> Figure:
         residual.set(xlabel="Time (ms)", ylabel=f"({unit})", title=f"Measured - model; white: p = {probability:.2g}")
     rows[0, 0].legend(loc="best", fontsize=6)
     panels.label_panels(rows)
+    _note_channels(figure, identified)
     return figure
+
+
+def _note_channels(figure: Figure, identified: xr.Dataset) -> None:
+    """Say below a ``figure`` how many channels it leaves out."""
+    count = identified.sizes["channel"]
+    if count > MOST_CHANNELS:
+        style.add_note(figure, f"the first {MOST_CHANNELS} of {count} channels; the file has all")
 
 
 def residual_correlations(identified: xr.Dataset) -> Figure:
@@ -74,7 +82,15 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
 
     axes[0].set_ylabel("autocorrelation of residuals")
     panels.label_panels(axes)
+    _note_channels(figure, identified)
     return figure
+
+
+def without_profiles(identified: xr.Dataset) -> str:
+    """Return why an identification has no profiles; empty where it has some."""
+    if not identified.sizes["place"]:
+        return "no profile was computed ([identify] profile = 0)"
+    return ""
 
 
 def misfit_profiles(identified: xr.Dataset) -> Figure:
@@ -99,10 +115,6 @@ def misfit_profiles(identified: xr.Dataset) -> Figure:
 def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
     """Draw the profile of one ``parameter``, and the parabola of its standard error; see ``misfit_profiles``."""
     axes.set_title(str(parameter["parameter"].values))
-    if not parameter.sizes["place"]:
-        panels.annotate_empty(axes, "[identify] profile = 0")
-        return
-
     value = float(parameter["value"])
     error = float(parameter["standard_error"])
     unit = parameter["unit"].item()
@@ -144,12 +156,14 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
     if count <= MOST_NAMES:
         for row, column in np.ndindex(count, count):
             value = float(identified["correlation"].values[row, column])
-            matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5)
+            colour = panels.text_colour(shown.to_rgba(value))
+            matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5, color=colour)
 
     # The error along a direction is 1 over its singular value, which may be 0.
     singular = np.maximum(identified["singular"].values, 1 / LARGEST_ERROR)
     directions.semilogy(identified["direction"].values, 1 / singular, "o", color=style.BLUE, ms=4)
     directions.axhline(DETERMINED, color=style.GREY, lw=0.7, ls=style.DASHED)
+    directions.xaxis.set_major_locator(MaxNLocator(integer=True))
     directions.set(xlabel="direction", ylabel="relative error along it", title="Dashed: no longer determined")
     panels.label_panels([matrix, directions])
     return figure
@@ -163,8 +177,12 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     number. A start that failed has neither, and is counted in the title.
     """
     plan = IdentifyCase.of(identified)
+    valley = identified["starts/valley"].values
+    columns = 2
+    if len(valley) > 1:
+        columns = 3
     figure = style.new_figure(style.PAGE, 2.6)
-    misfit, course, starts = figure.subplots(1, 3)
+    misfit, course, *starts = figure.subplots(1, columns)
     windows = identified["window"].values
     misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     # The number of contact episodes in each window stands at the foot of the panel.
@@ -185,21 +203,22 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     if len(plan.parameters) <= MOST_NAMES:
         course.legend(loc="best", fontsize=5)
 
-    valley = identified["starts/valley"].values
-    if len(valley) == 1:
-        panels.annotate_empty(starts, "one start: no other valley was sought")
-    else:
-        starts.plot(valley, identified["starts/deviance"].values, "o", color=style.VERMILION, ms=3)
-        starts.set_yscale("symlog")
+    # With one start there is nothing to compare.
+    for axes in starts:
+        axes.plot(valley, identified["starts/deviance"].values, "o", color=style.VERMILION, ms=3)
+        axes.set_yscale("symlog")
         title = f"{len(valley)} starts"
         failed = int((valley == 0).sum())
         if failed:
             title += f", {failed} failed"
-        starts.set(xlabel="valley", ylabel="deviance - least", title=title)
-        starts.xaxis.set_major_locator(MaxNLocator(integer=True))
-    panels.label_panels([misfit, course, starts])
+        axes.set(xlabel="valley", ylabel="deviance - least", title=title)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels.label_panels([misfit, course, *starts])
     return figure
 
+
+WITHOUT = {"misfit_profiles": without_profiles}
+"""Why an identification lacks a picture, by the picture's name; the others are always there."""
 
 FIGURES = (record_and_model, residual_correlations, misfit_profiles, parameter_correlation, growing_windows)
 """All pictures of an identification, which bear the names of their functions."""

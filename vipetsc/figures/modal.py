@@ -28,11 +28,13 @@ SEVERAL = "several"  # the label of the row for clusters with episodes of severa
 class MovedEnergies(NamedTuple):
     """``energy`` (row, part + 1) in J that each site transferred to the parts of the spectrum, and lost (last column).
 
-    ``labels`` (row) are the cells of the sites, or ``SEVERAL`` for clusters that cannot be separated by site.
+    ``labels`` (row) are the cells of the sites, or ``SEVERAL`` for clusters that cannot be separated by site. ``rows``
+    is the number of rows that there would be without a limit.
     """
 
     labels: list[str]
     energy: np.ndarray
+    rows: int
 
     @classmethod
     def of(cls, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> Self:
@@ -53,15 +55,16 @@ class MovedEnergies(NamedTuple):
 
         # From the log, not from what all parts together lose: the energy in a contact that is closed when the run
         # begins or ends is not dissipated. Clusters of several sites have a row behind those of the sites.
-        lost = np.bincount(cluster, run["impacts/loss"].values, len(transfer))
+        # An episode that has not ended has no loss.
+        lost = np.bincount(cluster, np.nan_to_num(run["impacts/loss"].values), len(transfer))
         moved = np.zeros((len(sites) + 1, len(parts) + 1))
         np.add.at(moved, row, np.column_stack([transfer[:, parts], lost]))
 
         rows = np.unique(row)
         by_size = np.argsort(-np.abs(moved[rows]).sum(axis=1), kind="stable")
-        rows = np.sort(rows[by_size][:MOST_ROWS])
+        shown = np.sort(rows[by_size][:MOST_ROWS])
         labels = [*map(str, sites), SEVERAL]
-        return cls(labels=[labels[i] for i in rows], energy=moved[rows])
+        return cls(labels=[labels[i] for i in shown], energy=moved[shown], rows=len(rows))
 
 
 def without_modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
@@ -103,6 +106,8 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     percent = 100 * moved.energy / float(run["energy/work"][-1])
     _draw_matrix(panel["matrix"], moved.labels, [*(names[p] for p in parts), "lost"], percent)
     panels.label_panels([panel["steps"], panel["impacts"], panel["matrix"]])
+    if len(moved.labels) < moved.rows:
+        style.add_note(figure, f"transfers: the {MOST_ROWS} of {moved.rows} rows with the largest ones")
     return figure
 
 
@@ -141,13 +146,13 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
     # Linear within a tenth of the largest: small transfers of either sign keep a colour.
     top = max(float(np.abs(percent).max()), 1e-300)
     norm = SymLogNorm(top / 10, vmin=-top, vmax=top)
-    axes.imshow(percent, cmap="RdBu_r", norm=norm, aspect="auto", origin="upper")
+    image = axes.imshow(percent, cmap="RdBu_r", norm=norm, aspect="auto", origin="upper")
 
     is_wide = len(columns) > 7
     is_long = len(rows) > 12
     size = 5 if is_long or is_wide else 7
     for (y, x), value in np.ndenumerate(percent):
-        colour = "white" if abs(value) > 0.35 * top else style.BLACK
+        colour = panels.text_colour(image.to_rgba(value))
         axes.text(x, y, _in_cell(value, is_wide), ha="center", va="center", fontsize=size, color=colour)
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)

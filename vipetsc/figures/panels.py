@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize, to_rgba
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
@@ -51,6 +51,25 @@ def annotate_empty(axes: Axes, reason: str) -> None:
     axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, wrap=True, transform=axes.transAxes)
 
 
+def text_colour(background: Any) -> str:
+    """Return black or white, whichever can be read better on the ``background``, a colour of matplotlib.
+
+    It is the one of higher contrast, (L1 + 0.05) / (L2 + 0.05) of their luminances (WCAG 2.1), at least 4.5.
+    """
+    if luminance(background) > 0.179:
+        return style.BLACK
+    return "white"
+
+
+def luminance(colour: Any) -> float:
+    """Return the relative luminance of a ``colour`` (WCAG 2.1), 0 for black and 1 for white."""
+    *channels, opacity = to_rgba(colour)
+    # On white paper.
+    channels = 1 - opacity + opacity * np.array(channels)
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
 def label_panels(panels: Iterable[Axes]) -> None:
     """Begin the titles of ``panels`` with (a), (b), ...; panels beyond the 26th have no letter.
 
@@ -78,12 +97,11 @@ def block_means(values: np.ndarray) -> np.ndarray:
 def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
     """Return logarithmic colours over ``decades`` below the largest value of all ``fields``.
 
-    Colours go up to 1 if all fields vanish, or one has a value that is not finite.
+    Values that are not finite have no part in it. Colours go up to 1 if no value is positive.
     """
     # One scale for all fields, so that equal colours are equal energies.
-    top = float(np.max([np.max(np.asarray(field)) for field in fields]))
-    if not (np.isfinite(top) and top > 0):
-        top = 1.0
+    values = np.concatenate([np.ravel(field) for field in fields])
+    top = float(np.max(values, where=np.isfinite(values), initial=0.0)) or 1.0
     return LogNorm(top * 10.0**-decades, top, clip=True)
 
 
@@ -103,8 +121,23 @@ def draw_map(
 
     Of more than ``PIXELS`` rows or columns it shows means over blocks.
     """
-    extent = (*_edges(x), *_edges(y))
-    return axes.imshow(block_means(values), norm=norm, cmap=cmap, extent=extent)
+    x_edges = _edges(x)
+    y_edges = _edges(y)
+    shown = block_means(values)
+    # The last block may have fewer cells than the others, but has the same size in the picture: the picture ends where
+    # the field does.
+    extent = (*_block_edges(x_edges, len(x)), *_block_edges(y_edges, len(y)))
+    image = axes.imshow(shown, norm=norm, cmap=cmap, extent=extent)
+    axes.set(xlim=x_edges, ylim=y_edges)
+    return image
+
+
+def _block_edges(edges: tuple[float, float], count: int) -> tuple[float, float]:
+    """Return where blocks of `block_means` begin and end that have ``count`` cells between these ``edges``."""
+    block = -(-count // PIXELS)
+    blocks = -(-count // block)
+    begin, end = edges
+    return begin, begin + (end - begin) * block * blocks / count
 
 
 def _edges(positions: np.ndarray) -> tuple[float, float]:

@@ -40,6 +40,7 @@ from vipetsc.figures.style import Drawing, Shown, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
+from vipetsc.io.errors import ResultFileError
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
@@ -60,7 +61,8 @@ class FigureSpec(NamedTuple):
     needs
         Of sweeps, what a message says that they must hold.
     without
-        Of runs (run, analysis or None), of branches (branches), -> the reason why there is no such picture, or "".
+        Of runs (run, analysis or None), of branches (branches), of a source in ``FILES`` (data), -> the reason why
+        there is no such picture, or "".
     together
         Whether one picture shows all branches of all folders.
     """
@@ -90,6 +92,25 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
 
 BRANCH = "branch"  # the figure of branches
 OVER_BRANCHES = "ibtet_backbone"  # the figure of sweeps that shows branches too
+
+# What every run holds, and pictures take for granted.
+RUN_NEEDS = (
+    "site",
+    "episode",
+    "energy/kinetic",
+    "energy/spring",
+    "energy/contact",
+    "energy/work",
+    "energy/dissipated",
+    "sites/cell",
+    "sites/clearance",
+    "impacts/site",
+    "impacts/side",
+    "impacts/onset",
+    "impacts/approach_velocity",
+    "impacts/force",
+    "impacts/loss",
+)
 
 # What sweeps must hold for a figure.
 WHOLE_MEMBERS = "members with their fields ([sweep] fields = true), contact sites and a band above the driven one"
@@ -135,7 +156,10 @@ _SPECS = (
     FigureSpec("convergence", OPTIMUM, optimum.convergence),
     FigureSpec("compared_designs", OPTIMUM, optimum.compared_designs),
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
-    *(FigureSpec(draw.__name__, IDENTIFIED, draw) for draw in identified.FIGURES),
+    *(
+        FigureSpec(draw.__name__, IDENTIFIED, draw, without=identified.WITHOUT.get(draw.__name__))
+        for draw in identified.FIGURES
+    ),
 )
 # Nothing may take a figure out and put it back: pictures, and messages about them, come in the order of this table.
 FIGURES: Mapping[str, FigureSpec] = MappingProxyType({spec.name: spec for spec in _SPECS})
@@ -382,8 +406,11 @@ def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> It
 
 
 def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Return the run in ``folder``, and its analysis if there is one."""
+    """Return the run in ``folder``, and its analysis if any; raise ResultFileError for a run that lacks parts."""
     run = files.get(folder / "run.h5", open_run)
+    missing = [name for name in RUN_NEEDS if name not in run.variables and name not in run.dims]
+    if missing:
+        raise ResultFileError(f"{folder / 'run.h5'} is not a run of vipetsc: it lacks {', '.join(missing)}")
     if not (folder / "analysis.h5").exists():
         return run, None
     return run, files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
@@ -392,6 +419,12 @@ def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset
 def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
     """Yield every figure of ``specs`` from the one file in ``folder`` that has its results."""
     for spec in specs:
-        file = FILES[spec.source]
-        data = files.get(folder / file.name, partial(open_netcdf, kind=spec.source, needs=file.needs))
-        yield Drawing(spec.name, partial(spec.function, data))
+        data = result_of(spec.source, folder, files)
+        if not (spec.without and spec.without(data)):
+            yield Drawing(spec.name, partial(spec.function, data))
+
+
+def result_of(source: str, folder: Path, files: Files) -> xr.Dataset:
+    """Return the results in the one file of a ``source`` in ``folder``, opened as one of the ``files``."""
+    file = FILES[source]
+    return files.get(folder / file.name, partial(open_netcdf, kind=source, needs=file.needs))

@@ -44,7 +44,8 @@ def response_family(paths: Sequence[Path]) -> Figure:
     curves = responses_in(paths)
     rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
     labels = ["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"]
-    for name in _common_locations(curves)[:MOST_LOCATIONS]:
+    locations = _common_locations(curves)
+    for name in locations[:MOST_LOCATIONS]:
         rows.append(partial(_displacement, name=name))
         labels.append(f"displacement\nof {name} (m)")
     nfrc = NfrcCase.of(curves[0]).nfrc
@@ -72,8 +73,12 @@ def response_family(paths: Sequence[Path]) -> Figure:
     of_curves = [handle for handle, text in zip(handles, texts, strict=True) if text != UNDECIDED]
     crosses = [handle for handle, text in zip(handles, texts, strict=True) if text == UNDECIDED]
     lower.legend(handles=[*of_curves[:MOST_CURVES], *crosses], loc="center", fontsize=6)
+    if len(curves) > MOST_CURVES:
+        style.add_note(figure, f"the legend names the first {MOST_CURVES} of {len(curves)} curves")
     if len(rows) > 1:
         panels.label_panels(column)
+    if len(locations) > MOST_LOCATIONS:
+        style.add_note(figure, f"the first {MOST_LOCATIONS} of {len(locations)} named masses")
     return figure
 
 

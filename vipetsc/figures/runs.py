@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case, Model
@@ -156,8 +156,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     # Room for the legend above the curves, 0.12 of the work for each of its rows.
     rows = -(-len(upper.get_lines()) // 2)
     top = (1.04 + 0.12 * rows) * largest
-    upper.set(ylabel="Energy", xlim=run["time"].values[[0, -1]], ylim=(-0.03 * largest, top))
-    upper.yaxis.set_major_formatter(EngFormatter("J"))
+    upper.set(ylabel="Energy (J)", xlim=run["time"].values[[0, -1]], ylim=(-0.03 * largest, top))
     upper.legend(loc="upper center", ncol=2, columnspacing=1.2, labelspacing=0.25)
     _draw_residual(lower, run, largest)
     upper.set_title("Energies")

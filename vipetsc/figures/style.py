@@ -18,6 +18,7 @@ from matplotlib.transforms import Bbox
 from vipetsc.figures.figure_data import figure_data
 from vipetsc.figures.layout import apply_aspects, lay_out
 from vipetsc.figures.log_ticks import label_log_axes
+from vipetsc.figures.prefixed_units import prefix_units
 from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN = 3.4  # width of one journal column in inches
@@ -114,6 +115,11 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
     return figure
 
 
+def add_note(figure: Figure, sentence: str) -> None:
+    """Put a ``sentence`` below a ``figure``, as on what it leaves out; `save` prints it."""
+    figure.set_label("\n".join(filter(None, [figure.get_label(), sentence])))
+
+
 def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, whole or not at all, and return the path.
 
@@ -158,8 +164,9 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Label the logarithmic axes of ``figure``, and lay it out, once for all formats."""
+    """Label the axes of ``figure``, and lay it out, once for all formats."""
     label_log_axes(figure)
+    prefix_units(figure)
     figure.set_dpi(SCREEN)
     lay_out(figure)
     # Legends are placed in fractions of the figure, not of the box that is printed, which is higher by the strip of a

@@ -13,10 +13,11 @@ from string import ascii_lowercase
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.case import Case, Sweep
+from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
 from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
@@ -247,17 +248,21 @@ def _superposition(axes: Axes, aligned: TransferCurve) -> str:
     region = curve["branch/region"]
     grazing = curve["grazing_energy"]
     floor = curve["floor"]
-    scaled_slope = np.where(region == 1, 0.0, np.abs(curve["branch/slope"])) / curve["divisor"]
+    slope = np.where(region == 1, 0.0, curve["branch/slope"]) / curve["divisor"]
+    # The fit takes the parts where the frequency rises with the energy.
+    rising = np.where(slope > 0, slope, np.nan)
+    falling = np.where(slope < 0, -slope, np.nan)
     left = 0.5 * min(energy.min(), 0.1 * grazing)
     right = 2 * energy.max()
 
     # Region I goes on to the left of the branch, with a slope of zero as well.
     extended = np.append(left, branch)
-    with_floor = floor + np.append(0.0, scaled_slope)
+    with_floor = floor + np.append(0.0, np.where(slope < 0, np.nan, slope))
     axes.plot(extended, with_floor, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
-    positive = np.where(scaled_slope > 0, scaled_slope, np.nan)
     label = f"slope, $E^{{{curve['slope_exponent']:.2f}}}$ there"
-    axes.plot(branch, positive, color=style.BLACK, lw=0.8, ls=style.DASHED, label=label)
+    axes.plot(branch, rising, color=style.BLACK, lw=0.8, ls=style.DASHED, label=label)
+    if np.isfinite(falling).any():
+        axes.plot(branch, falling, color=style.BLACK, lw=0.8, ls=style.DOTTED, label="slope < 0, not fitted")
 
     axes.plot(energy, transfer, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
     axes.plot(energy[fitted], transfer[fitted], "o", color=style.RED, ms=2.8, label="in region III")
@@ -291,10 +296,8 @@ class ContactMotion(NamedTuple):
     def of(cls, member: MemberRun) -> Self:
         """Return the motion of ``member`` for ``PERIODS`` of the drive about its largest relative displacement."""
         run = member.run
-        cell = member.model.chain.cell
-        motion = run.sel(cell=run["sites/cell"].values[0]).isel(dof=[cell.host, cell.resonator])
-        displacement = motion["displacement"].values
-        velocity = motion["velocity"].values
+        displacement = _of_contact(run, member.model, "displacement")
+        velocity = _of_contact(run, member.model, "velocity")
 
         # The motion at its strongest: earlier the wave has not come, later it has left.
         middle = int(np.argmax(np.abs(displacement[:, 1] - displacement[:, 0])))
@@ -302,6 +305,19 @@ class ContactMotion(NamedTuple):
         shown = slice(max(middle - half, 0), middle + half + 1)
         u, v, _ = refined(displacement[shown], velocity[shown], field_time(run)[shown])
         return cls(case=member.case, displacement=u, velocity=v, ibtet=float(member.analysis["ibtet"]))
+
+
+def _of_contact(run: xr.Dataset, model: Model, quantity: str) -> np.ndarray:
+    """Return a ``quantity`` (t, 2) of the host and the resonator of the first contact; 0 for one with the ground."""
+    pair = model.chain.contact_pairs[0]
+    cell = int(run["sites/cell"].values[0])
+    # The resonator may be in the next cell, which of a ring's last cell is the first one.
+    resonator_cell = (cell - 1 + pair.next_cell) % model.chain.cells + 1
+    resonator = run[quantity].sel(cell=resonator_cell).isel(dof=pair.resonator).values
+    host = np.zeros_like(resonator)
+    if pair.host >= 0:
+        host = run[quantity].sel(cell=cell).isel(dof=pair.host).values
+    return np.stack([host, resonator], axis=1)
 
 
 def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:

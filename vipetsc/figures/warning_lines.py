@@ -15,7 +15,7 @@ MOST_NAMES = 4  # of members before a warning; of more their number is given
 
 
 def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], Figure]:
-    """Return a function like ``make`` whose figure has as its label the warnings of the results ``shown``.
+    """Return a function like ``make`` whose figure has the warnings of the results ``shown`` as lines of its label.
 
     Results have them as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the
     picture.
@@ -24,7 +24,9 @@ def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], F
 
     def labelled() -> Figure:
         figure = make()
-        figure.set_label("\n".join(lines))
+        # A figure may have notes of its own, as on what it leaves out.
+        notes = filter(None, figure.get_label().splitlines())
+        figure.set_label("\n".join([*notes, *lines]))
         return figure
 
     return labelled

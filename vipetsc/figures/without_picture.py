@@ -15,11 +15,12 @@ from vipetsc.figures.registry import (
     figures_of,
     has_points,
     open_branch,
+    result_of,
     run_and_analysis,
     specified_drawings,
     with_ensemble,
 )
-from vipetsc.figures.sources import BRANCHES, RUN, SWEEP
+from vipetsc.figures.sources import BRANCHES, FILES, RUN, SWEEP
 from vipetsc.figures.sweep_members import Files
 from vipetsc.io.read import open_ensemble
 
@@ -45,6 +46,11 @@ def reasons_without_pictures(
             reasons[name] = without(run, analysis) if without else ""
     elif source == BRANCHES:
         reasons = _reasons_of_branches(folders, files, names or ())
+    elif source in FILES:
+        specs = figures_of(source, folders)
+        for name in figure_names(source, names, folders, files):
+            without = specs[name].without
+            reasons[name] = without(result_of(source, folders[0], files)) if without else ""
     return {name: reason for name, reason in reasons.items() if reason}
 
 
