@@ -49,19 +49,26 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
 
 
 @pytest.mark.slow
-def test_a_search_in_whose_place_a_foreign_file_lies_is_computed_again(in_process, tmp_path):
-    """A search replaces a foreign design.h5 in its own folder, and says so."""
-    scenario = SCENARIOS["design"]
+@pytest.mark.parametrize("name", ["design", "law"])
+def test_a_study_in_whose_place_a_foreign_file_lies_is_refused_or_computed_again(in_process, tmp_path, name):
+    """A study replaces what is no HDF5 file in its own folder, and says so; it does not replace another program's."""
+    scenario = SCENARIOS[name]
     out = tmp_path / "out"
     words = words_of(f"{scenario.words} {PLAIN}", prepare(scenario, tmp_path), out)
     assert in_process(*words).returncode == 0
 
+    (out / f"{name}.h5").write_text("no HDF5")
+    ended = in_process(*words)
+    assert ended.returncode == 0
+    assert f"{name}.h5" in ended.stderr
+    assert "computed again" in ended.stderr
+
     for contents in ("numbers", "link to itself"):
-        put_foreign(out / "design.h5", contents)
+        put_foreign(out / f"{name}.h5", contents)
         ended = in_process(*words)
-        assert ended.returncode == 0, contents
-        assert "design.h5" in ended.stderr
-        assert "computed again" in ended.stderr
+        assert ended.returncode == 2, contents
+        assert f"{name}.h5" in ended.stderr
+        assert "--force" in ended.stderr
 
 
 @pytest.mark.parametrize("kind", [ResultFileError, UnreadableFileError])

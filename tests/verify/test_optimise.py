@@ -105,7 +105,7 @@ def test_a_free_motion_is_searched_over_its_amplitude(tmp_path):
     options = {"budget": 3, "population": 4, "curve": [5e-4], "variables": {"restitution": [0.3, 0.9]}}
     options["objective"] = [{"measure": "band_share", "band": 1, "amplitudes": [5e-4, 1e-3]}]
     plan = OptimiseCase.from_table(free_table(PACKET) | {"optimise": options})
-    summary = optimum_search.run_search(plan, tmp_path)
+    summary = optimum_search.run_search(plan, tmp_path).attrs["summary"]
 
     found = datasets(tmp_path / "optimum.h5")
     assert "the worst at 0.0005, 0.001 m" in summary

@@ -120,7 +120,7 @@ def searched(tmp_path_factory):
     folder = tmp_path_factory.mktemp("search")
     # Curves of few points are enough, since the tests compare values of the same curves.
     plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": {"largest_step": 0.3}}))
-    return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
+    return plan, folder, run_search(plan, folder, MPI.COMM_SELF).attrs["summary"]
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     table = with_sections(TABLE, {"nfrc": {"points": 5}, "time": {"end": 20.0}})
     table["optimise"] |= {"budget": 2, "curve": [1.0]}
     table["optimise"]["constraint"] = [{"measure": "peak_displacement/mass", "at_most": 100.0}]
-    summary = run_search(OptimiseCase.from_table(table), tmp_path, MPI.COMM_SELF)
+    summary = run_search(OptimiseCase.from_table(table), tmp_path, MPI.COMM_SELF).attrs["summary"]
     found = datasets(tmp_path / "optimum.h5")
     assert np.isnan(found["value"]).all()
     assert found["reason"][0].startswith(b"curve r1-1: 5 points reached: increase nfrc.points")

@@ -135,7 +135,7 @@ def searched(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("search")
     plan = OptimiseCase.from_table(table)
-    return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
+    return plan, folder, run_search(plan, folder, MPI.COMM_SELF).attrs["summary"]
 
 
 def test_a_search_takes_measures_of_points_and_keeps_to_its_constraints(searched):

@@ -11,8 +11,9 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -24,6 +25,9 @@ from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Exit codes.
 DONE = 0
@@ -112,6 +116,26 @@ class Outcome:
     complete: bool = True
     drawable: bool = True
     failures: Sequence[str] = ()
+
+
+def study_of(name: str, shown: Callable[[Any], str]) -> Callable[[Any, Work], Outcome]:
+    """The ``study`` of a verb that calls the function called ``name``, as "module:function", and prints its result.
+
+    ``shown`` gives the text of the result. The module is imported when the verb is called: most calls are of others.
+    """
+
+    def study(case: Any, work: Work) -> Outcome:
+        module, _, function = name.partition(":")
+        result = getattr(import_module(module), function)(case, work.folder, work.comm, **work.keywords)
+        work.report(shown(result))
+        return Outcome()
+
+    return study
+
+
+def summary(data: "xr.Dataset") -> str:
+    """The table of results that a study keeps in its file."""
+    return str(data.attrs["summary"])
 
 
 @dataclass(frozen=True, kw_only=True)

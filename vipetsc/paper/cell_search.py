@@ -1,11 +1,10 @@
 """The (lambda, eta) search of the supplement: a case in, ``design.h5`` out."""
 
-import logging
 import sys
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mpi4py import MPI
 
@@ -13,14 +12,13 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case.design import DesignCase
-from vipetsc.io.folder import SEARCH, claimed, provenance
-from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
+from vipetsc.io.folder import SEARCH, provenance
+from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
 from vipetsc.paper.cell_costs import COSTS, PAPER_CELL, CellSearch, search_cells, signed_deflection, unit_vectors
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.studies.study import How, Study
 
-logger = logging.getLogger(__name__)
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
 BEST = ("optimum_lambda", "optimum_eta", "optimum_value")
 # Dimensions of the values of every cell of the grid, and of every cost's best cell.
@@ -53,44 +51,24 @@ LAYOUT = {
 
 
 def search_design(
-    case: DesignCase,
-    folder: str | Path,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    stop: StopRequest | None = None,
-    progress: bool = False,
-) -> str:
-    """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
+    case: DesignCase, folder: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, **how: Unpack[How]
+) -> xr.Dataset:
+    """Search the grid of ``case`` in each of its readings; writes ``design.h5``, and returns its content.
 
-    All ranks of ``comm`` must call it; rank 0 searches. That takes seconds, so that ``stop`` and ``progress``, which
-    every study takes, are not used. A search of the same case in ``folder`` is kept unless ``force`` replaces it;
-    ``resume`` requires one. Raises FolderError if the folder contains anything else.
+    ``how`` it is computed, and what it raises, is in ``Study.run``. Rank 0 searches. That takes seconds, so that
+    requests to stop are not looked at.
     """
-    with claimed(comm, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
-        on_root(comm, lambda: _make_search(case, claim.folder / "design.h5"))
-        claim.publish()
-
-        def summary() -> str:
-            with open_netcdf(claim.folder / "design.h5", "search", BEST) as data:
-                return _table(data)
-
-        return on_root(comm, summary)
+    DesignCase.expect(case, "search_design")
+    return STUDY.run(case, folder, comm, **how)
 
 
-def _make_search(case: DesignCase, path: Path) -> None:
-    """Write the search of ``case`` to ``path`` unless it is there, or if the file there cannot be read."""
-    try:
-        # A file of this name is complete: it is written under another name, and renamed at the end.
-        with open_netcdf(path, "search", BEST):
-            return
-    except (OSError, ValueError) as error:
-        # Usually there is no file yet; the user is warned of one that cannot be read.
-        if path.exists():
-            logger.warning("vipetsc: warning: %s; computed again", error)
+def read_design(folder: str | Path) -> xr.Dataset:
+    """The content of ``design.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    with open_netcdf(Path(folder) / "design.h5", "search", (*BEST, "summary")) as data:
+        return data.load()
 
-    write_netcdf(path, _search(case))
+
+STUDY = Study(SEARCH, "design.h5", make=lambda case, work: lambda: _search(case), read=read_design)
 
 
 def _search(case: DesignCase) -> xr.Dataset:
@@ -125,7 +103,8 @@ def _search(case: DesignCase) -> xr.Dataset:
     about = provenance(MPI.COMM_SELF) | {"case": case.to_toml()}
     if options.eta.last == 1:
         about["left_out"] = "eta = 1: the host mass m (1 - eta) vanishes"
-    return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    return data.assign_attrs(summary=_table(data))
 
 
 def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:

@@ -10,10 +10,9 @@ records and derivatives of a start. The solution of each window is recorded at o
 stopped goes on where it was. The files are the same, to the bit, on any number of ranks.
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mpi4py import MPI
 
@@ -30,45 +29,26 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, ProfileCosts, Side, profile_about, profile_costs
 from vipetsc.identification.motion import MotionError
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import IDENTIFIED, claimed, provenance
-from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
+from vipetsc.io.folder import IDENTIFIED, provenance
+from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, StudyError, divided, on_root
 from vipetsc.studies.identified import identified_values, summary_of, warnings_of
 from vipetsc.studies.identified_layout import LAYOUT
 from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
-from vipetsc.studies.sweep import is_whole
+from vipetsc.studies.study import How, Study, StudyWork
 
 
 def run_identification(
-    plan: IdentifyCase,
-    folder: str | Path,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    stop: StopRequest | None = None,
-    progress: bool = False,
-) -> str:
-    """Fit the parameters of ``plan`` to its records in ``folder``; returns a table of the results.
+    plan: IdentifyCase, folder: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, **how: Unpack[How]
+) -> xr.Dataset:
+    """Fit the parameters of ``plan`` to its records in ``folder``; returns the content of ``identified.h5``.
 
-    All ranks of ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this
-    identification, CaseError if a record has changed, StudyError if no start leads to a fit.
+    The attribute ``summary`` is a table of the results. ``how`` it is computed, and what it raises, is in
+    ``Study.run``; moreover CaseError if a record has changed, StudyError if no start leads to a fit.
     """
     IdentifyCase.expect(plan, "run_identification")
-    with claimed(comm, folder, IDENTIFIED, plan.to_toml(), force=force, resume=resume) as claim:
-        path = claim.folder / "identified.h5"
-        # A file that was cut off is written again, from the records of its fits.
-        if not on_root(comm, lambda: is_whole(path, [])):
-            measured = on_root(comm, lambda: read_measured_records(plan))
-            _identify(Identification(plan, measured, stop or StopRequest()), claim.folder, comm, progress)
-        claim.publish()
-
-        def summary() -> str:
-            with open_netcdf(claim.folder / "identified.h5", "identification", ("value", "summary")) as data:
-                return str(data.attrs["summary"])
-
-        return on_root(comm, summary)
+    return STUDY.run(plan, folder, comm, **how)
 
 
 def read_measured_records(plan: IdentifyCase) -> list[Measured]:
@@ -175,31 +155,33 @@ class Identification:
         return {"costs": profile_costs(windows, z, profile, number, side)}
 
 
-def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool) -> None:
-    """Fit from all starts, profile the best fit, and write the results."""
-    plan = work.plan
+def _make(plan: IdentifyCase, work: StudyWork) -> Callable[[], xr.Dataset]:
+    """Fit from all starts, and profile the best fit; returns the function that gives the results, for rank 0."""
+    comm = work.comm
+    measured = on_root(comm, lambda: read_measured_records(plan))
+    fitting = Identification(plan, measured, work.stop)
     starts = [f"start {number}" for number in range(plan.options.starts)]
-    fits = _fits(work, starts, folder, comm, progress)
+    fits = _fits(fitting, starts, work)
     fitted = [number for number, record in enumerate(fits) if "deviance" in record]
     if not fitted:
         raise StudyError(f"no start leads to a fit: {fits[0]['reason']}")
     # The number decides between equal fits, so that every rank takes the same one.
     best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
-    recorded = _recorded_runs(work, folder, comm, ranks=1)
-    profile = on_root(comm, lambda: work.profile(fits[best]))
+    recorded = _recorded_runs(fitting, work, ranks=1)
+    profile = on_root(comm, lambda: fitting.profile(fits[best]))
 
     def take_profile(key: Key) -> Record:
         _, number, name = str(key).split()
         side: Side = "above"
         if name == "below":
             side = "below"
-        return work.profile_record(fits[best], profile, int(number), side)
+        return fitting.profile_record(fits[best], profile, int(number), side)
 
     keys = [f"profile {number} {side}" for number in range(len(plan.parameters)) for side in SIDES]
-    recorded.make(keys, take_profile, what="profiles", progress=progress, allow_failures=True)
+    recorded.make(keys, take_profile, what="profiles", progress=work.progress, allow_failures=True)
     costs = _profile_costs(recorded.records, profile, np.array(fits[best]["coordinates"]))
     recorded.finish()
-    on_root(comm, lambda: _write(work, fits, best, costs, folder, comm))
+    return lambda: _results(fitting, fits, best, costs, work)
 
 
 def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.ndarray) -> ProfileCosts:
@@ -212,16 +194,16 @@ def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.
     return ProfileCosts(places=profile.places, costs=costs)
 
 
-def _recorded_runs(work: Identification, folder: Path, comm: MPI.Comm, ranks: int) -> RecordedRuns:
+def _recorded_runs(fitting: Identification, work: StudyWork, ranks: int) -> RecordedRuns:
     """The records of fits by teams of so many ``ranks``."""
     failures = (*FAILURES, CaseError, MotionError)
-    return RecordedRuns("identified-runs", folder, comm, work.stop, ranks=ranks, failures=failures).read()
+    return RecordedRuns("identified-runs", work.folder, work.comm, fitting.stop, ranks=ranks, failures=failures).read()
 
 
-def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm, progress: bool) -> list[Record]:
+def _fits(fitting: Identification, starts: list[str], work: StudyWork) -> list[Record]:
     """The records of the fits from all ``starts``, which the ranks divide."""
-    recorded = _recorded_runs(work, folder, comm, ranks=max(comm.size // len(starts), 1))
-    by_team = Identification(work.plan, work.measured, work.stop, recorded.team)
+    recorded = _recorded_runs(fitting, work, ranks=max(work.comm.size // len(starts), 1))
+    by_team = Identification(fitting.plan, fitting.measured, fitting.stop, recorded.team)
 
     def fit(key: Key) -> Record:
         solved: list[list[float]] = []
@@ -234,26 +216,34 @@ def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm,
 
         return by_team.fit(int(str(key).split()[-1]), solved, keep)
 
-    recorded.make(starts, fit, what="starts", progress=progress, allow_failures=True)
+    recorded.make(starts, fit, what="starts", progress=work.progress, allow_failures=True)
     recorded.finish()
     return [recorded.records[key] for key in starts]
 
 
-def _write(
-    work: Identification, fits: list[Record], best: int, profile: ProfileCosts, folder: Path, comm: MPI.Comm
-) -> None:
-    """Write the case that was fitted, then ``identified.h5``, whose presence says that all is done.
+def _results(
+    fitting: Identification, fits: list[Record], best: int, profile: ProfileCosts, work: StudyWork
+) -> xr.Dataset:
+    """The content of ``identified.h5``; writes the case that was fitted, ``identified.toml``.
 
     ``best`` is the number of the best one of the ``fits``.
     """
-    sys.audit("vipetsc.conclude", str(folder))
-    plan = work.plan
-    windows, z = work.solution(fits[best])
+    plan = fitting.plan
+    windows, z = fitting.solution(fits[best])
     case = plan.case_of(windows.misfit.values(z), name=f"{plan.name}-identified")
-    write_text(folder / "identified.toml", case.to_toml())
+    write_text(work.folder / "identified.toml", case.to_toml())
 
     values = identified_values(windows, z, fits, best, profile)
-    about: dict[str, Any] = provenance(comm) | {"case": plan.to_toml()}
+    about: dict[str, Any] = provenance(work.comm) | {"case": plan.to_toml()}
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     data = data.assign_attrs(warnings=warnings_of(data))
-    write_netcdf(folder / "identified.h5", data.assign_attrs(summary=summary_of(data)))
+    return data.assign_attrs(summary=summary_of(data))
+
+
+def read_identified(folder: str | Path) -> xr.Dataset:
+    """The content of ``identified.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    with open_netcdf(Path(folder) / "identified.h5", "identification", ("value", "summary")) as data:
+        return data.load()
+
+
+STUDY = Study(IDENTIFIED, "identified.h5", make=_make, read=read_identified)

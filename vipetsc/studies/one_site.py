@@ -29,10 +29,10 @@ min(jitter, (z - 1)/10)).
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mpi4py import MPI
 
@@ -41,16 +41,17 @@ import xarray as xr
 
 from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.law import LawCase
-from vipetsc.io.folder import LAW, claimed, provenance
-from vipetsc.io.netcdf import tabulated, write_netcdf
+from vipetsc.io.folder import LAW, provenance
+from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import Record
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import StopRequest
 from vipetsc.spectra.directions import by_direction, wave_energies
 from vipetsc.studies.pair_motion import ContactSpan, PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.ring import Ring
 from vipetsc.studies.scattering_law import BACKWARD, DAMPED, FORWARD, LAYOUT, NEAR, POINT_LAYOUT, ScatteringLaw
 from vipetsc.studies.site_waves import SiteWaves
+from vipetsc.studies.study import How, Study, StudyWork
 
 LINEAR = 0.0  # the z of the run without a site
 # Ratio of neighbouring points to begin with: two an octave. What is added between them decides: with ratios of 2 and 4
@@ -59,39 +60,24 @@ STEP = np.sqrt(2.0)
 REFINED = ("transmitted", "reflected", "upper", "dissipated")  # what is to lie near the line between two points
 
 
-def make_law(
-    case: LawCase,
-    folder: str | Path,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    stop: StopRequest | None = None,
-    progress: bool = False,
-) -> ScatteringLaw:
+def make_law(case: LawCase, folder: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, **how: Unpack[How]) -> ScatteringLaw:
     """Compute the scattering law of ``case`` on all ranks of ``comm``, and write ``law.h5`` to ``folder``.
 
-    Recorded runs are not simulated again: an interrupted law is continued, with the same bits on any number of ranks.
-    ``force`` starts again, ``resume`` requires an existing law.
-
-    Raises FolderError if the folder contains anything else, RuntimeError if a run fails, StoppedError
-    on a request to ``stop``.
+    ``how`` it is computed, and what it raises, is in ``Study.run``.
     """
     LawCase.expect(case, "make_law")
-    with claimed(comm, folder, LAW, case.to_toml(), force=force, resume=resume) as claim:
-        path = claim.folder / "law.h5"
-        # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
-        if not on_root(comm, path.exists):
-            stop = stop or StopRequest()
-            runs = ScatteringRuns(case, claim.folder, comm, stop)
-            errors = refine(runs, progress)
-            # Before law.h5 is written: a folder with its result is complete, a kill before that leaves the records.
-            runs.recorded.finish()
-            with stop.at_once():
-                on_root(comm, lambda: write_netcdf(path, runs.dataset(errors)))
+    return STUDY.run(case, folder, comm, **how)
 
-        claim.publish()
-        return on_root(comm, lambda: ScatteringLaw.read(claim.folder / "law.h5"))
+
+def _make(case: LawCase, work: StudyWork) -> Callable[[], xr.Dataset]:
+    """Refine the law; returns the function that gives its dataset."""
+    runs = ScatteringRuns(case, work.folder, work.comm, work.stop)
+    errors = refine(runs, work.progress)
+    runs.recorded.finish()
+    return lambda: runs.dataset(errors)
+
+
+STUDY = Study(LAW, "law.h5", make=_make, read=lambda folder: ScatteringLaw.read(folder / "law.h5"))
 
 
 class ScatteringRuns:

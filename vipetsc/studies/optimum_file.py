@@ -1,7 +1,6 @@
 """The results of a search: ``optimum.h5``, the best cases, and the comparison of these with the initial one."""
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
-from vipetsc.io.netcdf import tabulated, write_netcdf
+from vipetsc.io.netcdf import tabulated
 from vipetsc.studies.designs import OptimumSearch
 from vipetsc.studies.optimum_layout import LAYOUT
 from vipetsc.studies.sampler import front
@@ -59,9 +58,8 @@ def curves_of(search: OptimumSearch) -> dict[str, list[Case]]:
     return curves
 
 
-def write_optimum(search: OptimumSearch, folder: Path) -> None:
-    """Write the best cases, then ``optimum.h5``, whose presence says that the search is complete."""
-    sys.audit("vipetsc.conclude", str(folder))
+def optimum_of(search: OptimumSearch, folder: Path) -> xr.Dataset:
+    """The content of ``optimum.h5`` of a search that has ended; writes its best cases to ``folder``."""
     plan = search.plan
     cases: dict[str, Case] = {}
     for name, number in search.compared().items():
@@ -82,7 +80,7 @@ def write_optimum(search: OptimumSearch, folder: Path) -> None:
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     if plan.options.measures_runs:
         data["amplitude"].attrs["units"] = plan.amplitude_unit
-    write_netcdf(folder / "optimum.h5", data.assign_attrs(summary=_summary(data, plan)))
+    return data.assign_attrs(summary=_summary(data, plan))
 
 
 def _counts(search: OptimumSearch) -> dict[str, int]:

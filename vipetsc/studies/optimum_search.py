@@ -8,71 +8,60 @@ Rank 0 asks the sampler for designs and reports their losses in that order; all 
 a run is recorded at once, so a search that was stopped or killed repeats the same exchange and goes on.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Unpack
 
 from mpi4py import MPI
 
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import LawCase
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.io.folder import OPTIMUM, claimed
+from vipetsc.io.folder import OPTIMUM
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import on_root
 from vipetsc.progress import Progress
 from vipetsc.studies.designs import OptimumSearch
 from vipetsc.studies.linear_run import LinearRun, linear_case
 from vipetsc.studies.objective import ObjectiveRuns
 from vipetsc.studies.one_site import make_law
-from vipetsc.studies.optimum_file import curves_of, write_optimum
+from vipetsc.studies.optimum_file import curves_of, optimum_of
 from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, smooth
 from vipetsc.studies.scattering_law import matched_clearances
-from vipetsc.studies.sweep import is_whole
+from vipetsc.studies.study import How, Study, StudyWork
 
 POPULATION = 24  # of NSGA-II: a front of as many designs, and generations enough within the default budget of 100
 
 
 def run_search(
-    plan: OptimiseCase,
-    folder: str | Path,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    stop: StopRequest | None = None,
-    progress: bool = False,
-) -> str:
-    """Search for the best design of ``plan`` in ``folder``; returns a table of the results.
+    plan: OptimiseCase, folder: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, **how: Unpack[How]
+) -> xr.Dataset:
+    """Search for the best design of ``plan`` in ``folder``; returns the content of ``optimum.h5``.
 
     Writes ``optimum.h5`` and ``best.toml``, for two objectives the front's knee, with ``best-1.toml`` and
-    ``best-2.toml`` for its ends. The same files, to the bit, on any number of ranks and after any stop. All ranks of
-    ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this search.
+    ``best-2.toml`` for its ends. The attribute ``summary`` is a table of the results. ``how`` it is computed, and what
+    it raises, is in ``Study.run``.
     """
     OptimiseCase.expect(plan, "run_search")
-    with claimed(comm, folder, OPTIMUM, plan.to_toml(), force=force, resume=resume) as claim:
-        path = claim.folder / "optimum.h5"
-        # A file that was cut off is written again, from the records of its runs.
-        if not on_root(comm, lambda: is_whole(path, [])):
-            _search(plan, claim.folder, comm, stop or StopRequest(), progress)
-        claim.publish()
-
-        def summary() -> str:
-            with open_netcdf(claim.folder / "optimum.h5", "search for an optimum", ("value", "summary")) as data:
-                return str(data.attrs["summary"])
-
-        return on_root(comm, summary)
+    return STUDY.run(plan, folder, comm, **how)
 
 
-def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
-    """Try designs until the budget is spent, compare the best one with the case, and write the results."""
-    objective = ObjectiveRuns(plan, folder, comm, stop)
-    bar = Progress(comm, plan.options.budget, "designs", show=progress)
+def _make(plan: OptimiseCase, work: StudyWork) -> Callable[[], xr.Dataset]:
+    """Try designs until the budget is spent, and compare the best one with the case.
+
+    Returns the function that gives the results, for rank 0.
+    """
+    comm = work.comm
+    objective = ObjectiveRuns(plan, work.folder, comm, work.stop)
+    bar = Progress(comm, plan.options.budget, "designs", show=work.progress)
     searches: list[OptimumSearch] = []  # one on rank 0, none on the others
 
     try:
-        start = _start(plan, folder, comm, stop)
+        start = _start(plan, work)
         on_root(comm, lambda: searches.append(OptimumSearch(plan, objective, _sampler(plan, start), start)))
         more = True
         while more:
@@ -83,23 +72,32 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
 
         objective.make(on_root(comm, lambda: [run for row in curves_of(searches[0]).values() for run in row]))
         objective.recorded.finish()
-        on_root(comm, lambda: write_optimum(searches[0], folder))
     finally:
         bar.close()
+    return lambda: optimum_of(searches[0], work.folder)
 
 
-def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> np.ndarray:
+def read_optimum(folder: str | Path) -> xr.Dataset:
+    """The content of ``optimum.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    with open_netcdf(Path(folder) / "optimum.h5", "search for an optimum", ("value", "summary")) as data:
+        return data.load()
+
+
+STUDY = Study(OPTIMUM, "optimum.h5", make=_make, read=read_optimum)
+
+
+def _start(plan: OptimiseCase, work: StudyWork) -> np.ndarray:
     """The values (variable) at which the search begins; all ranks must call it. Raises StoppedError."""
     if plan.options.start == "case":
         return plan.begin()
 
     table = {key: value for key, value in plan.table.items() if key != "disorder"}
-    law = make_law(LawCase.from_table(table | {"name": "law"}), folder / "law", comm, stop=stop)
+    law = make_law(LawCase.from_table(table | {"name": "law"}), work.folder / "law", work.comm, stop=work.stop)
     lattice = plan.base.lattice
     drive = plan.base.drive
 
     def matched() -> np.ndarray:
-        data, result = run_in_memory(linear_case(plan.base), MPI.COMM_SELF, stop)
+        data, result = run_in_memory(linear_case(plan.base), MPI.COMM_SELF, work.stop)
         linear = LinearRun.of(data, result.statistics, sites=(), names=())
         # The law's sites are in the order in which the wave meets them, the plan's are not.
         sites = np.array(plan.sites)
@@ -108,7 +106,7 @@ def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) 
         clearance[order] = matched_clearances(law, linear, sites[order].tolist(), drive.amplitude)
         return plan.begin(clearance.tolist())
 
-    return on_root(comm, matched)
+    return on_root(work.comm, matched)
 
 
 def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:

@@ -8,9 +8,9 @@ of bands are those of linear modes at the last sample, over the drive's work.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mpi4py import MPI
 
@@ -19,14 +19,14 @@ import xarray as xr
 
 from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.predict import PredictCase
-from vipetsc.io.folder import PREDICTION, claimed, provenance
-from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
+from vipetsc.io.folder import PREDICTION, provenance
+from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.io.records import Record
 from vipetsc.lattice import Chain, pass_bands
-from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.composition import CLOSE, Network
 from vipetsc.studies.prediction_runs import PredictionRuns, Records, amplitudes_of, onset_of
 from vipetsc.studies.response import SiteResponse, SiteResponses
+from vipetsc.studies.study import How, Study, StudyWork
 
 # Defect of the energies over the work above which a prediction warns. That of sites some cells apart is 0.02 at most,
 # while 20 neighbouring sites have 0.4.
@@ -61,44 +61,31 @@ LAYOUT |= {f"simulated/{name}": LAYOUT[f"predicted/{name}"] for name in MEASURED
 LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes")
 
 
-def predict(
-    case: PredictCase,
-    folder: str | Path,
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    stop: StopRequest | None = None,
-    progress: bool = False,
-) -> xr.Dataset:
+def predict(case: PredictCase, folder: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, **how: Unpack[How]) -> xr.Dataset:
     """Predict ``case`` on all ranks of ``comm``, and write ``prediction.h5`` to ``folder``; returns its content.
 
-    Recorded runs are not simulated again; ``force`` starts again, ``resume`` requires existing runs. Raises
-    FolderError if the folder contains anything else, RuntimeError if a required run fails, StoppedError on a
-    request to ``stop``.
+    ``how`` it is computed, and what it raises, is in ``Study.run``.
     """
     PredictCase.expect(case, "predict")
-    with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
-        path = claim.folder / "prediction.h5"
-        # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
-        if not on_root(comm, path.exists):
-            stop = stop or StopRequest()
-            runs = PredictionRuns(case, claim.folder, comm, stop, progress)
-            records = runs.make_all()
-            about = provenance(comm)
-            runs.recorded.finish()
-            # Composing takes seconds, and nobody looks at requests to stop; the runs are recorded.
-            with stop.at_once():
-                on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
+    return STUDY.run(case, folder, comm, **how)
 
-        claim.publish()
-        return on_root(comm, lambda: read_prediction(claim.folder))
+
+def _make(case: PredictCase, work: StudyWork) -> Callable[[], xr.Dataset]:
+    """Simulate all runs; returns the function that composes the prediction."""
+    runs = PredictionRuns(case, work.folder, work.comm, work.stop, work.progress)
+    records = runs.make_all()
+    about = provenance(work.comm)
+    runs.recorded.finish()
+    return lambda: composed(case, records).assign_attrs(about)
 
 
 def read_prediction(folder: str | Path) -> xr.Dataset:
     """The content of ``prediction.h5`` in ``folder``; raises OSError or ValueError if it is none."""
     with open_netcdf(Path(folder) / "prediction.h5", "prediction", ("predicted", "onset_amplitude")) as data:
         return data.load()
+
+
+STUDY = Study(PREDICTION, "prediction.h5", make=_make, read=read_prediction)
 
 
 def composed(case: PredictCase, records: Records) -> xr.Dataset:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
-import h5py
 import numpy as np
 
 from vipetsc.case import Case, CaseError, Problem, Sweep
@@ -31,6 +30,7 @@ from vipetsc.sources import source_key
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import MEMBERS, LinearRun, first_site_cell, linear_name
 from vipetsc.studies.recorded_runs import RecordPaths
+from vipetsc.studies.study import is_whole
 from vipetsc.studies.sweep_runs import NeededRun, SweepRuns
 from vipetsc.wording import counted
 
@@ -297,20 +297,6 @@ def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) ->
         if not plan.options.fields and not measured and site not in run.sites:
             run.sites.append(site)
     return {name: run for name, run in runs.items() if run.sites or name not in results.linear}
-
-
-def is_whole(path: Path, lost: list[str]) -> bool:
-    """Whether an HDF5 file is there and can be opened; if it is there and cannot, ``lost`` gets a sentence.
-
-    HDF5 does not open a file that is shorter than it says itself.
-    """
-    try:
-        h5py.File(path).close()
-    except OSError as error:
-        if path.exists():
-            lost.append(f"{path} cannot be read: {error}; computed again")
-        return False
-    return True
 
 
 def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:

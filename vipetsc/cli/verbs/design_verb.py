@@ -3,16 +3,8 @@
 from vipetsc.case import DesignCase
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
 from vipetsc.io.folder import SEARCH
-
-
-def search_cells(case: DesignCase, work: Work) -> Outcome:
-    """Search the grid of (lambda, eta) in each of its readings."""
-    from vipetsc.paper.cell_search import search_design
-
-    work.report(search_design(case, work.folder, work.comm, **work.keywords))
-    return Outcome()
 
 
 def design_rows(case: DesignCase, ranks: int) -> Rows:
@@ -28,7 +20,7 @@ VERB = StudyVerb(
     example="design runs/examples/design.toml --set design.lambda.count=10",
     arguments=(CASE, *STUDY_ARGUMENTS),
     case=DesignCase,
-    study=search_cells,
+    study=study_of("vipetsc.paper.cell_search:search_design", summary),
     table=design_rows,
     results=SEARCH,
     pictures=Pictures(source="design", file="design.h5", noun=SEARCH.noun),

@@ -4,16 +4,8 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
-from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
 from vipetsc.io.folder import IDENTIFIED
-
-
-def identify_parameters(plan: IdentifyCase, work: Work) -> Outcome:
-    """Fit the parameters to the records."""
-    from vipetsc.studies.identification import run_identification
-
-    work.report(run_identification(plan, work.folder, work.comm, **work.keywords))
-    return Outcome()
 
 
 def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
@@ -35,7 +27,7 @@ VERB = StudyVerb(
     example="identify runs/examples/identify.toml",
     arguments=(case_with("identify"), *STUDY_ARGUMENTS),
     case=IdentifyCase,
-    study=identify_parameters,
+    study=study_of("vipetsc.studies.identification:run_identification", summary),
     table=identify_rows,
     results=IDENTIFIED,
     pictures=Pictures(source="identification", file="identified.h5", noun=IDENTIFIED.noun),

@@ -4,17 +4,8 @@ from vipetsc.case import LawCase
 from vipetsc.cli.arguments import CASE, FORCE, RESUME, SET, output_folder
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
-from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.cli.verb import Rows, StudyVerb, study_of
 from vipetsc.io.folder import LAW
-
-
-def compute_law(case: LawCase, work: Work) -> Outcome:
-    """Compute the scattering law, refined to the tolerance of the case."""
-    from vipetsc.studies.one_site import make_law
-
-    law = make_law(case, work.folder, work.comm, **work.keywords)
-    work.report(table(law.summary()))
-    return Outcome()
 
 
 def law_rows(case: LawCase, ranks: int) -> Rows:
@@ -30,7 +21,7 @@ VERB = StudyVerb(
     example="law runs/examples/law.toml --set law.tolerance=0.02",
     arguments=(CASE, SET, output_folder("runs/NAME-law, with the name of the case"), FORCE, RESUME),
     case=LawCase,
-    study=compute_law,
+    study=study_of("vipetsc.studies.one_site:make_law", lambda law: table(law.summary())),
     table=law_rows,
     results=LAW,
     pictures=Pictures(source="law", file="law.h5", noun=LAW.noun),

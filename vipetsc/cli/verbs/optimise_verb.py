@@ -4,17 +4,9 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
-from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
 from vipetsc.io.folder import OPTIMUM
 from vipetsc.wording import counted
-
-
-def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
-    """Search for the best design, or for the front of two objectives."""
-    from vipetsc.studies.optimum_search import run_search
-
-    work.report(run_search(plan, work.folder, work.comm, **work.keywords))
-    return Outcome()
 
 
 def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
@@ -40,7 +32,7 @@ VERB = StudyVerb(
     example="optimise runs/examples/optimise-clearances.toml --set optimise.budget=40",
     arguments=(case_with("optimise"), *STUDY_ARGUMENTS),
     case=OptimiseCase,
-    study=search_designs,
+    study=study_of("vipetsc.studies.optimum_search:run_search", summary),
     table=optimise_rows,
     results=OPTIMUM,
     pictures=Pictures(source="optimum", file="optimum.h5", noun=OPTIMUM.noun),

@@ -10,7 +10,7 @@ from vipetsc.case.predict import PredictCase
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.cli.verb import Rows, StudyVerb, study_of
 from vipetsc.io.folder import PREDICTION
 
 if TYPE_CHECKING:
@@ -23,15 +23,6 @@ SUMMARY = {
     "worst_dashpots": "largest error of the fraction that dashpots take",
     "cpu_seconds": "CPU time without the simulations (s)",
 }
-
-
-def compose_sites(case: PredictCase, work: Work) -> Outcome:
-    """Predict the case's transfer at every amplitude, and simulate it if requested."""
-    from vipetsc.studies.prediction import predict
-
-    prediction = predict(case, work.folder, work.comm, **work.keywords)
-    work.report(prediction_table(prediction))
-    return Outcome()
 
 
 def predict_rows(case: PredictCase, ranks: int) -> Rows:
@@ -87,7 +78,7 @@ VERB = StudyVerb(
     example="predict runs/examples/predict.toml",
     arguments=(CASE, *STUDY_ARGUMENTS),
     case=PredictCase,
-    study=compose_sites,
+    study=study_of("vipetsc.studies.prediction:predict", prediction_table),
     table=predict_rows,
     results=PREDICTION,
     pictures=Pictures(source="prediction", file="prediction.h5", noun=PREDICTION.noun),
