@@ -277,6 +277,10 @@ class Recorder(CmaEs):
         super().__init__(*arguments, **options)
         self.generations = []
 
+    def know_start(self, losses, excess):
+        self.started = losses.tolist(), excess
+        super().know_start(losses, excess)
+
     def tell(self, losses, excess):
         self.generations.append((losses, excess))
         super().tell(losses, excess)
@@ -359,6 +363,10 @@ def test_a_start_that_is_not_the_case_is_a_design_too():
 
     assert search.designs[1].case.contacts.clearance == pytest.approx([1e-3] * 3)
     assert len(search.runs()) == 2
+    # The sampler is told of the start, not of the case.
+    assert search.tell_and_ask()
+    assert search.sampler.started == ([search.designs[1].losses[0]], 0.0)
+    assert search.designs[1].losses != search.designs[0].losses
 
 
 @pytest.mark.parametrize("clearance", [(), (1.1e-3, 1.3e-3, 1.7e-3)])

@@ -114,6 +114,8 @@ def test_a_search_begins_again_at_the_best_feasible_point():
     assert sampler._best == pytest.approx(best)
     # A loss is least at the edge of what is feasible.
     assert best[0] == pytest.approx(0.5, abs=0.01)
+    # On the way there the search prefers feasible points to others, whose losses are smaller.
+    assert feasible[-200:].mean() > 0.25
     assert any((centre == sampler._centre).all() for centre in points[feasible])
 
 

@@ -33,8 +33,7 @@ from vipetsc.io.folder import IDENTIFIED, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, StudyError, divided, on_root
-from vipetsc.studies.identified import identified_values, summary_of, warnings_of
-from vipetsc.studies.identified_layout import LAYOUT
+from vipetsc.studies.identified import LAYOUT, identified_values, summary_of, warnings_of
 from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
 from vipetsc.studies.study import How, Study, StudyWork
 

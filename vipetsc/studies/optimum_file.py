@@ -17,9 +17,60 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated
 from vipetsc.studies.designs import OptimumSearch
-from vipetsc.studies.optimum_layout import LAYOUT
 from vipetsc.studies.sampler import front
 
+LAYOUT = {
+    "design": ("design", "1", "number of a design; 0 is the initial case"),
+    "variable": ("variable", "1", "what varies"),
+    "objective": ("objective", "1", "objective"),
+    "unit": ("variable", "1", "unit of the variable"),
+    "low": ("variable", "1", "lower bound"),
+    "high": ("variable", "1", "upper bound"),
+    "choices": ("variable", "1", "values that the variable may take, as JSON; empty for one between bounds"),
+    "generation": ("design", "1", "generation; 0 contains the case and the initial design"),
+    "parameter": (
+        "design variable",
+        "1",
+        "value of a variable, in its unit; of one with choices the number of the value, from 1",
+    ),
+    "value": ("design objective", "1", "value of an objective; NaN for a design that failed"),
+    "constraint": ("constraint", "1", "what is bounded"),
+    "constrained": ("design constraint", "1", "value of what is bounded, in its unit; NaN for a design that failed"),
+    "excess": ("design", "1", "by how much bounds are missed, over the bounds; 0 for a design that misses none"),
+    "upper_share_at_end": (
+        "design",
+        "1",
+        "energy of the bands above the driven one at the end over the work, mean over its runs",
+    ),
+    "dissipated": ("design", "1", "dissipated energy over the work, mean over its runs"),
+    "reason": ("design", "1", "reason why a design failed"),
+    "front": ("front", "1", "number of a design on the Pareto front"),
+    "compared": ("compared", "1", "compared designs"),
+    "comparison/number": ("compared", "1", "number of a compared design"),
+    "site": ("site", "1", "contact site"),
+    "comparison/cell": ("compared site", "1", "cell (1-based) of a site"),
+    "comparison/clearance": ("compared site", "m", "clearance"),
+    "band": ("band", "1", "pass band"),
+    "amplitude": ("amplitude", "N", "amplitude of the drive, or of the motion at t = 0"),
+    "curve/bands": ("compared amplitude band", "1", "energy of a pass band at the end over the work"),
+    "curve/upper_share_at_end": (
+        "compared amplitude",
+        "1",
+        "energy of the bands above the driven one at the end over the work",
+    ),
+    "curve/transmitted": ("compared amplitude", "1", "energy beyond the last site at the end over the work"),
+    "curve/dissipated": ("compared amplitude", "1", "dissipated energy over the work"),
+    "response/line": ("response/line", "1", "line of a frequency response of a compared design"),
+    "response/name": ("response/line", "1", "name of its curve, as that of the file that nfrc writes"),
+    "response/compared": ("response/line", "1", "name of the compared design"),
+    "response/point": ("response/point", "1", "point of a line, one line after the other"),
+    "response/of": ("response/point", "1", "line of a point, from 0"),
+    "response/parameter": ("response/point", "1", "parameter that varies along the curves, in its unit"),
+    "response/unstable": ("response/point", "1", "number of growing perturbations; -1: undecided"),
+    "response/value": ("response/point objective", "1", "what the objective measures; NaN for an objective of runs"),
+    "curve/value": ("compared amplitude objective", "1", "measure of the objective"),
+}
+"""Dimensions, unit and text of every variable, by its name."""
 # Designs are compared at CURVE_POINTS amplitudes, log-spaced from the smallest one at which they are measured over
 # CURVE_SPREAD to the largest times CURVE_SPREAD: for a single amplitude over 24 dB, in steps of 2.4 dB. Two designs are
 # compared, four of a front: 22 or 44 runs, besides the hundred designs of the default budget.
