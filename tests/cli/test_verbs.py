@@ -32,7 +32,7 @@ def drawn(monkeypatch):
     """The list of the kinds of results whose pictures are requested; nothing is drawn."""
     sources = []
 
-    def draw(pictures, folders, comm, afresh, helper):
+    def draw(pictures, folders, comm, afresh):
         sources.append(pictures.source)
         return [folders[0] / "figures" / "picture.png"]
 
