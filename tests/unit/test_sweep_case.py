@@ -196,7 +196,7 @@ def test_a_sweep_of_more_than_a_million_members_is_refused():
     """1001 times 1000 members are refused before one of them is resolved."""
     amplitudes = "{ linear = [1, 2], count = 1001 }"
     frequencies = "{ linear = [1, 2], count = 1000 }"
-    with pytest.raises(CaseError, match="makes 1001000 members; at most 1000000"):
+    with pytest.raises(CaseError, match="has 1,001,000 members; the limit is 1,000,000"):
         sweep_of(f"[sweep.drive]\namplitude = {amplitudes}\nfrequency = {frequencies}")
 
 

@@ -297,7 +297,7 @@ def test_a_moved_end_stays_where_its_samples_end():
     [
         ({"waveform": "chirp", "frequency": 5.0}, r"drive\.bandwidth: missing.*"),
         ({**BURST, "ramp": 1.0}, r"drive\.ramp: does not apply to the waveform 'burst'"),
-        ({**BURST, "end": "left"}, r"drive\.cell = 4: omit it"),
+        ({**BURST, "end": "left"}, r"drive\.cell = 4: remove it"),
         ({"waveform": "step", "ramp": 1.0, "duration": 1.0}, r"drive\.ramp = 1\.0: at most half"),
         ({"waveform": "samples", "samples": {"time": [0.0, 1.0], "value": [1.0]}}, r"as many values \(1\)"),
         ({"waveform": "samples", "samples": {"time": [0.0, 1.0], "value": [1.0, 1.0]}, "end": "left"}, "must be 0"),

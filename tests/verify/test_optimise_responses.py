@@ -227,7 +227,7 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     ("objective", "nfrc", "key", "sentence"),
     [
         ({"measure": "response/peak_velocity/mas"}, {}, "measure", "did you mean 'response/peak_velocity/mass'?"),
-        ({"measure": "response/largest_force"}, {}, "measure", "is no measure of these responses"),
+        ({"measure": "response/largest_force"}, {}, "measure", "is not a measure of these responses"),
         ({"measure": PEAK}, None, "measure", "give their [nfrc]"),
         ({"measure": PEAK, "amplitudes": [2.0]}, {}, "amplitudes", "are those of [nfrc]"),
         ({"measure": PEAK, "part": [0.5, 1.0]}, {}, "part", "within nfrc.range, 0.75 to 1.2"),

@@ -169,7 +169,7 @@ def test_a_search_takes_measures_of_points_and_keeps_to_its_constraints(searched
         ({"measure": "band_transmission/base-tip"}, "needs a band, 1 to 4"),
         ({"measure": "band_transmission/base-tip", "band": 5}, "the cell has 4 bands"),
         ({"measure": "peak_velocity/tip", "band": 1}, "has no bands"),
-        ({"measure": "entropy/history"}, "is no measure of this case"),
+        ({"measure": "entropy/history"}, "is not a measure of this case"),
     ],
 )
 def test_measures_that_a_case_has_not_are_one_problem(objective, sentence):

@@ -4,6 +4,18 @@
 ``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers. Each verb has a module
 with its case and the conditions between its keys: ``case`` that of ``run``, all others one of the verb's name;
 ``verb_cases`` lists them. The manual lists keys and units.
+
+A case file passes these stages, each of which reports all of its problems at once:
+
+1. ``read_toml``: the text is TOML; ``--set`` changes it (``changes``).
+2. ``CaseFile.fields_of``: the sections exist, the modules of ``[plugins]`` can be imported (``parts``).
+3. ``read_section``: each key has a type and bounds that its field states (pydantic), and a magnitude that products of a
+   few numbers can bear.
+4. ``check`` of the verb's case: conditions between keys; what the verb does not accept (``refuses``, ``features``).
+5. ``resolve``: every choice becomes a number; problems of numbers that follow, as of an absorbing end or of samples.
+6. ``with_drawn``: scatter is drawn about the resolved values, and the case is checked again.
+
+What depends on the machine, as memory and PETSc's options, is asked by ``dynamics`` when a run begins.
 """
 
 from vipetsc.case.case import Case, Model, case_id

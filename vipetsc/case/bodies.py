@@ -33,14 +33,14 @@ def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def check_apart(body: Sequence[int], ends: Sequence[tuple[int, int]]) -> Iterator[Problem]:
-    """The problem, in unsymmetric motions, of the first site whose contact joins two bodies.
+    """Report the first site whose contact joins two separate bodies (a problem only for asymmetric motions).
 
     ``body`` is that of each mass by its number, 0 of the ground; ``ends`` are the numbers that each site joins.
     """
     for number, (host, resonator) in enumerate(ends, 1):
         if body[host] != body[resonator]:
             cause = f"site {number} joins masses that neither springs nor pressed contacts join"
-            effect = "in unsymmetric motions its mean force pushes them apart"
+            effect = "in asymmetric motions its mean force pushes them apart"
             remedy = "give a precompression, or equal stops on both sides"
             yield Problem("contacts.clearance", None, f"{cause}: {effect}; {remedy}")
             return

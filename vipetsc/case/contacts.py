@@ -115,7 +115,7 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """The problem of a clearance on a side on which none of ``count`` sites has a stop."""
     is_given = contacts.clearance_minus is not None or "clearance_minus" in lists_of(contacts)
     if is_given and count and set(values_of_sites(contacts, "side", count)) == {"plus"}:
-        remedy = 'with side = "plus" no site has a stop on the side -; omit it'
+        remedy = 'side = "plus" leaves no stop on the minus side; remove clearance_minus'
         yield Problem(path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
 
 

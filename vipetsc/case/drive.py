@@ -126,7 +126,7 @@ def _check_place(
         yield Problem(f"{path}.end", drive.end, remedy)
     if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.next_cell):
         yield Problem(
-            f"{path}.end", drive.end, "a wall can only move a linear spring: omit damping, quadratic and cubic"
+            f"{path}.end", drive.end, "a wall can only move a linear spring: remove damping, quadratic and cubic"
         )
     if cell and not cell.joins_cells:
         remedy = "a wall moves the springs from cell to cell that end at it, but the cell has none"
@@ -135,7 +135,7 @@ def _check_place(
         place = _place_at_wall(cell, drive.end, length)
         for key in sorted(place.keys() & drive.model_fields_set):
             if getattr(drive, key) != place[key]:
-                remedy = f"omit it: the wall acts on mass {place['mass']} of cell {place['cell']}"
+                remedy = f"remove it: the wall acts on mass {place['mass']} of cell {place['cell']}"
                 yield Problem(f"{path}.{key}", getattr(drive, key), remedy)
 
 

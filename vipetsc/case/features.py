@@ -15,21 +15,21 @@ from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
 
 FEATURES = {
-    "damping": "omit [lattice.damping] and the dashpots of the cell",
-    "nonlinear springs": "omit quadratic and cubic",
-    "profiles": "omit [lattice.profiles]",
-    "scatter": "omit disorder.cells",
-    "absorbing ends": "omit [lattice.absorbing]",
+    "damping": "remove [lattice.damping] and the dashpots of the cell",
+    "nonlinear springs": "remove quadratic and cubic",
+    "profiles": "remove [lattice.profiles]",
+    "scatter": "remove disorder.cells",
+    "absorbing ends": "remove [lattice.absorbing]",
     "rings": "use fixed or free ends",
     # Laws that differ, stops on one side, other masses than the cell's pair.
-    "unlike sites": "omit the key",
+    "unlike sites": "remove the key",
     "touching stops": "give a clearance above 0",
-    "initial motion": "omit [initial]",
-    "many drives": "omit [[drive.more]]",
-    "moved wall": "omit drive.end",
+    "initial motion": "remove [initial]",
+    "many drives": "remove [[drive.more]]",
+    "moved wall": "remove drive.end",
     # Waveforms that the class does not list in ``waveforms``.
-    "other waveforms": "run accepts all",
-    "disorder": "omit [disorder]",
+    "other waveforms": "`run` accepts every waveform",
+    "disorder": "remove [disorder]",
 }
 """Features that a verb may refuse, each with the remedy that ends the message."""
 

@@ -202,7 +202,7 @@ def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
     """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a ``driven`` cell."""
     if not lattice.undamped_cell().joins_cells:
-        remedy = "without springs from cell to cell no linear waves reach an end; omit it"
+        remedy = "without springs from cell to cell no linear waves reach an end; remove it"
         yield Problem("lattice.absorbing", None, remedy)
     if lattice.ends == "periodic":
         yield Problem("lattice.absorbing", None, 'a ring has no end; use ends = "fixed" or "free"')

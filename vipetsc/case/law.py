@@ -112,14 +112,14 @@ class LawCase(Case):
 
     verb = section = "law"
     refuses: ClassVar[Mapping[str, str]] = {
-        "nonlinear springs": "waves in springs that are not linear depend on their amplitude without any contact too",
+        "nonlinear springs": "with nonlinear springs, waves depend on amplitude even without contact",
         "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
         "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
         "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
         "many drives": "the law is that of one wave",
-        "other waveforms": "the law is that of a wave of one frequency that ends, which a burst is",
+        "other waveforms": 'the scattering law needs a finite single-frequency wave: use waveform = "burst"',
     }
     waveforms = ("burst",)
 
@@ -324,7 +324,7 @@ def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
         if clearance <= 0:
             remedy = (
                 f"site {number + 1} is pressed at rest and acts on the weakest wave; the law is one of amplitude over"
-                " clearance, which has no value there; omit it"
+                " clearance, which has no value there; remove it"
             )
             yield Problem(path_of(contacts, "precompression"), pressed[number], remedy)
             return

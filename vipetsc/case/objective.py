@@ -134,7 +134,9 @@ def measured_problems(
     if objective.amplitudes and not has_free_amplitude(base):
         yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; omit them")
     if objective.below and not objective.is_of_responses:
-        yield Problem(f"{at}.below", objective.below, "only measures of responses have a range below a level; omit it")
+        yield Problem(
+            f"{at}.below", objective.below, "only measures of responses have a range below a level; remove it"
+        )
     if objective.is_of_responses:
         yield from _problems_of_responses(objective, at, responses)
         return
@@ -204,7 +206,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
     measures = response_measures(case)
     if name not in measures:
-        remedy = f"is no measure of these responses; {_nearest(name, [*measures])}"
+        remedy = f"is not a measure of these responses; {_nearest(name, [*measures])}"
         if not case.output.points:
             remedy += "; those of points need output.points, forces output.forces"
         yield Problem(f"{at}.measure", name, remedy)
@@ -242,7 +244,7 @@ def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator
     name = str(objective.measure)
     if name not in measures:
         valid = [*OF_SEARCHES, *(name for name in measures if name not in OF_SEARCHES)]
-        remedy = f"is no measure of this case; {_nearest(name, valid)}"
+        remedy = f"is not a measure of this case; {_nearest(name, valid)}"
         if not base.output.points:
             remedy += "; those of points need output.points"
         yield Problem(f"{at}.measure", name, remedy)

@@ -65,7 +65,7 @@ class PartName:
         names = [repr(name) for name in self.choices]
         expected = f"{', '.join(names[:-1])} or {names[-1]}"
         # The type and the words of pydantic's own error for a choice among names, which messages are made of.
-        message = "Input should be {expected}; plugins.modules names modules that register others"
+        message = "Input should be {expected}; other names come from modules listed in plugins.modules"
         raise PydanticCustomError("literal_error", message, {"expected": expected})
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:

@@ -84,7 +84,7 @@ def check_law(law: Contact) -> str:
 
     values = [*force, *slope, *energy, force_at_rest, slope_at_rest, energy_at_rest, *onset]
     if not np.isfinite(values).all():
-        return f"its force, slope or energy is no number at some x from 0 to {DEPTHS[-1]:g} m"
+        return f"its force, slope or energy is not a number at some x from 0 to {DEPTHS[-1]:g} m"
     if force_at_rest != 0 or energy_at_rest != 0:
         return f"its force and energy at x = 0 are {force_at_rest:g} and {energy_at_rest:g}; both must be 0"
     if not ((force > 0).all() and (onset > 0).all() and (slope >= 0).all()):

@@ -207,7 +207,7 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
     elif loss is not None and (damping.mass or damping.stiffness):
         yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
     elif fitted != (None, None) and (loss is None or [len(values or ()) for values in fitted] != expected):
-        yield Problem("lattice.damping.grounding", fitted[0], "grounding and springs are fitted to loss; omit both")
+        yield Problem("lattice.damping.grounding", fitted[0], "grounding and springs are fitted to loss; remove both")
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:

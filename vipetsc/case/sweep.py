@@ -90,7 +90,9 @@ class Sweep(StudyCase):
         axes, wrong = axes_of(values, options.zip)
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
-            wrong.append(Problem("sweep", None, f"makes {count} members; at most {MOST_MEMBERS}, so split it"))
+            wrong.append(
+                Problem("sweep", None, f"has {count:,} members; the limit is {MOST_MEMBERS:,}: split the sweep")
+            )
         return {"table": table, "options": options, "axes": axes}, problems + wrong
 
     @property
