@@ -21,7 +21,6 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.problem import FlowError
-from vipetsc.parallel import StopRequest
 
 NAME = "branch-out-of-phase"
 
@@ -161,60 +160,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
     assert branch.findings == ["the branch has no orbit of 9 J"]
 
 
-@pytest.mark.slow
-def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path):
-    """A branch that is stopped and resumed in each of its halves leaves the files of one that is never stopped."""
-    nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05]}
-    nnm |= {"switch": ["period-doubling"], "switch_points": 3}
-    parts = tmp_path / "parts"
-    whole = tmp_path / "whole"
-    stop = StopRequest()
-    saved = set()
-
-    def listener(branch, point):
-        saved.update(path.name for path in parts.iterdir())
-        stop.requested = (branch.name, point.index) in {("out-of-phase-down", 5), ("out-of-phase", 7)}
-
-    first = follow(parts, listener, stop, saves_all=True, **nnm)
-    assert first.ending.startswith("stopped on request")
-    assert not (parts / f"{NAME}.h5").exists()
-    second = follow(parts, listener, stop, resume=True, saves_all=True, **nnm)
-    assert second.ending == "stopped on request after point 7; continue with --resume"
-    assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= saved
-
-    last = follow(parts, resume=True, **nnm)
-    uninterrupted = follow(whole, **nnm)
-
-    assert last.complete
-    assert table_of(last) == table_of(uninterrupted)
-    names = {path.name for path in whole.iterdir()}
-    assert names == {path.name for path in parts.iterdir()}
-    for name in names:
-        if name.endswith("csv"):
-            assert (parts / name).read_text() == (whole / name).read_text()
-
-    # A crossing branch whose file is lost is followed again.
-    crossing = next(name for name in names if "doubling" in name and name.endswith("h5"))
-    (parts / crossing).unlink()
-    follow(parts, resume=True, **nnm)
-    assert (parts / crossing).exists()
-
-
-class FailBelow:
-    """A listener that raises ``error`` at point ``index`` of the part of a branch below its start."""
-
-    def __init__(self, index: int, error: BaseException) -> None:
-        self.index = index
-        self.error = error
-
-    def __call__(self, branch, point):
-        if branch.name.endswith("-down") and point.index == self.index:
-            raise self.error
-
-
 BOTH = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
-# A branch that stays without contact above its start too, and has only a few points there.
-SHORT = BOTH | {"energy": [0.015, 0.0291]}
 
 
 def files_of(folder: Path) -> dict[str, str]:
@@ -229,137 +175,33 @@ def files_of(folder: Path) -> dict[str, str]:
     return found
 
 
-def test_a_branch_whose_lower_part_fails_keeps_it_and_its_upper_part(tmp_path):
-    """The file of a branch whose lower part failed has both parts, says what failed and is not complete."""
-    failed = follow(tmp_path, FailBelow(3, FlowError("the flow ends here")), **BOTH)
-
-    # Points go from the last one below the start through the start itself to the end above it.
-    assert [point.index for point in failed.points[:5]] == [3, 2, 1, 0, 1]
-    assert failed.points[0].energy < 0.029
-    assert failed.points[-1].energy > 0.0295
-    # Tangents point along the branch in both parts; the energy grows along it here. The start has no energy tangent.
-    beside_start = failed.points[:3] + failed.points[4:5]
-    assert all(point.energy_tangent > 0 for point in beside_start)
-    assert all(point.tangent @ failed.points[4].tangent > 0 for point in failed.points[:4])
-    assert failed.ending == "failed: below the start: the flow ends here"
-    assert not failed.complete
-    assert failed.findings == ["below the start: the flow ends here"]
-    stored = read_branch(tmp_path / f"{NAME}.h5")
-    assert stored.ending == failed.ending
-    assert stored.failure_below == failed.failure_below
-    assert not stored.complete
-    assert list(files_of(tmp_path)) == [f"{NAME}.csv", f"{NAME}.h5"]
-
-
-def test_a_lower_part_that_failed_is_tried_again_from_its_last_point(tmp_path):
-    """A resumed branch goes on from the last point of the part that failed, and keeps its complete upper part.
-
-    A second failure is reported like the first, with the points up to it. A try without a failure leaves the branch
-    that never failed.
-    """
-    whole = follow(tmp_path / "whole", **BOTH)
-    parts = tmp_path / "parts"
-    first = follow(parts, FailBelow(3, FlowError("the flow ends here")), **BOTH)
-
-    second = follow(parts, FailBelow(5, FlowError("the flow ends there")), resume=True, **BOTH)
-    assert [point.index for point in second.points[:7]] == [5, 4, 3, 2, 1, 0, 1]
-    assert len(second.points) == len(first.points) + 2
-    assert second.ending == "failed: below the start: the flow ends there"
-    assert second.findings == ["below the start: the flow ends there"]
-
-    followed = set()
-    third = follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **BOTH)
-    assert third.complete
-    assert third.failure_below is None
-    assert followed == {"out-of-phase-down"}
-    assert files_of(parts) == files_of(tmp_path / "whole")
-    assert third.ending == whole.ending
-
-
-def test_both_parts_that_failed_are_tried_again(tmp_path):
-    """A resumed branch tries its part below the start and then that above it, and becomes one that never failed."""
-    follow(tmp_path / "whole", **BOTH)
-    parts = tmp_path / "parts"
-
-    def fail(branch, point):
-        if point.index == 3:
-            raise FlowError(f"{branch.name} ends here")
-
-    failed = follow(parts, fail, **BOTH)
-    assert failed.ending == "failed: out-of-phase ends here"
-    assert failed.findings == ["below the start: out-of-phase-down ends here"]
-
-    assert follow(parts, resume=True, **BOTH).complete
-    assert files_of(parts) == files_of(tmp_path / "whole")
-
-
 @pytest.mark.parametrize("killed", [False, True])
-def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, killed):
-    """A second try that a request or a kill stops keeps its points, and resumes to the branch that never failed."""
-    follow(tmp_path / "whole", **SHORT)
-    parts = tmp_path / "parts"
-    follow(parts, FailBelow(3, FlowError("the flow ends here")), **SHORT)
+def test_both_directions_are_two_branches(tmp_path, killed):
+    """Each has files of its own from one start on; one that fails or is killed goes on to the same bits."""
+    whole = follow(tmp_path / "whole", **BOTH)
+    down = read_branch(tmp_path / "whole" / f"{NAME}-down.h5")
+    assert whole.complete
+    assert down.complete
+    assert whole.points[0].energy == down.points[0].energy
+    assert whole.points[1].energy > whole.points[0].energy
+    assert down.points[-1].energy < 0.01 < down.points[-2].energy
 
+    error = KeyboardInterrupt() if killed else FlowError("the flow ends here")
+
+    def fail_below(branch, point):
+        if branch.name.endswith("-down") and point.index == 3:
+            raise error
+
+    parts = tmp_path / "parts"
     if killed:
-        # An exception that is no failure of the method ends the command wherever it is, as a kill does.
         with pytest.raises(KeyboardInterrupt):
-            follow(parts, FailBelow(6, KeyboardInterrupt()), resume=True, saves_all=True, **SHORT)
+            follow(parts, fail_below, saves_all=True, **BOTH)
     else:
-        stop = StopRequest()
-
-        def stop_below(branch, point):
-            stop.requested = point.index == 5
-
-        stopped = follow(parts, stop_below, stop, resume=True, saves_all=True, **SHORT)
-        assert stopped.ending == "stopped on request after point 5; continue with --resume"
-        assert not stopped.complete
-        assert list(files_of(parts)) == [f"{NAME}.csv", f"{NAME}.h5"]
-
-    followed = []
-    resumed = follow(parts, lambda branch, point: followed.append(point.index), resume=True, **SHORT)
-    # The last point before the kill is in no file: the branch is written after the listener.
-    assert followed[0] == 6
-    assert resumed.complete
-    assert files_of(parts) == files_of(tmp_path / "whole")
-
-
-def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
-    """After a kill in the upper part, the lower part, which had ended, is neither followed again nor extended."""
-    follow(tmp_path / "whole", **SHORT)
-    parts = tmp_path / "parts"
-
-    def kill_above(branch, point):
-        if branch.name == "out-of-phase":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        follow(parts, kill_above, saves_all=True, **SHORT)
-    followed = set()
-    follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **SHORT)
-
-    assert followed == {"out-of-phase"}
-    assert files_of(parts) == files_of(tmp_path / "whole")
-
-
-def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
-    """The lower part goes on from the point at which it failed, although no write was due at that point."""
-    follow(tmp_path / "whole", **BOTH)
-    parts = tmp_path / "parts"
-
-    def fail_below_and_kill_above(branch, point):
-        if branch.name == "out-of-phase-down" and point.index == 3:
-            raise FlowError("the flow ends here")
-        if branch.name == "out-of-phase" and point.index == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        follow(parts, fail_below_and_kill_above, saves_all=True, **BOTH)
-    # The branch has been written together with its lower part, whose own files still exist.
-    assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= set(files_of(parts))
-    followed = []
-    follow(parts, lambda branch, point: followed.append((branch.name, point.index)), resume=True, **BOTH)
-
-    assert followed[0] == ("out-of-phase-down", 4)
+        follow(parts, fail_below, **BOTH)
+        failed = read_branch(parts / f"{NAME}-down.h5")
+        assert failed.ending == "failed: the flow ends here"
+        assert not failed.complete
+    follow(parts, resume=True, **BOTH)
     assert files_of(parts) == files_of(tmp_path / "whole")
 
 
@@ -411,99 +253,6 @@ def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatc
     monkeypatch.undo()
     follow(parts, resume=True, **nnm)
 
-    assert files_of(parts) == files_of(tmp_path / "whole")
-
-
-@pytest.fixture
-def marked_points(monkeypatch):
-    """Mark the second and the fifth point of each part of a branch as period doublings.
-
-    Linear motions have no special points: regular points stand for them, and the branch that crosses there is the
-    branch itself.
-    """
-
-    def locate(problem, left, right, **options):
-        return [replace(right, kind="period-doubling")] if right.index in (2, 5) else []
-
-    def switch(shooting, point, amplitude):
-        return shooting, replace(point, kind="regular", index=0)
-
-    monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
-    monkeypatch.setattr("vipetsc.modes.branches.orbits.switch", switch)
-
-
-CROSSING = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points": 1}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stopped", [False, True])
-def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(
-    tmp_path, marked_points, stopped
-):
-    """Crossing branches are named anew when a second try lengthens the lower part and shifts special points' numbers.
-
-    Special points are numbered from the far end of the part below the start. A second try that is stopped after the
-    special point gives the same names.
-    """
-    parts = tmp_path / "parts"
-    follow(tmp_path / "whole", **CROSSING)
-    follow(parts, FailBelow(3, FlowError("the flow ends here")), **CROSSING)
-    before = files_of(parts)
-    assert len(before) < len(files_of(tmp_path / "whole"))
-
-    if stopped:
-        stop = StopRequest()
-
-        def stop_below(branch, point):
-            stop.requested = branch.name.endswith("-down") and point.index == 5
-
-        half = follow(parts, stop_below, stop, resume=True, **CROSSING)
-        assert half.ending.startswith("stopped")
-        # Both special points below the start exist already. The last try adds none, and would not mend a wrong number.
-        above = [point.index for point in half.points].index(0)
-        assert sum(point.kind != "regular" for point in half.points[:above]) == 2
-    follow(parts, resume=True, **CROSSING)
-
-    after = files_of(parts)
-    assert after == files_of(tmp_path / "whole")
-    assert all(text != after[name] for name, text in before.items() if name.endswith("csv"))
-
-
-def regular_points(branch: Branch) -> int:
-    """The number of regular points of a branch beyond its start."""
-    return len(branch.regular()) - 1
-
-
-def test_a_lower_part_that_is_tried_again_leaves_the_branch_its_number_of_points(tmp_path):
-    """A second try counts the points above the start towards nnm.points; with more points the branch is completed."""
-    whole = follow(tmp_path / "whole", **BOTH)
-    # Three points lie below the start at the failure, and the part above takes the one that is left.
-    points = 4
-    parts = tmp_path / "parts"
-    first = follow(parts, FailBelow(3, FlowError("the flow ends here")), points=points, **BOTH)
-    assert regular_points(first) == points < regular_points(whole)
-
-    second = follow(parts, resume=True, points=points, **BOTH)
-    assert regular_points(second) == points
-    assert not second.complete
-    assert second.ending == "below the start: 4 points reached: increase nnm.points and resume to continue"
-
-    third = follow(parts, resume=True, **BOTH)
-    assert third.complete
-    assert files_of(parts) == files_of(tmp_path / "whole")
-
-
-def test_a_branch_that_has_used_up_its_points_below_its_start_goes_on_there(tmp_path):
-    """A branch whose points end below its start, resumed with more points, becomes the one that had them at first."""
-    follow(tmp_path / "whole", **BOTH)
-    parts = tmp_path / "parts"
-    first = follow(parts, points=3, **BOTH)
-    assert [point.index for point in first.points] == [3, 2, 1, 0]
-    assert first.ending == "below the start: 3 points reached: increase nnm.points and resume to continue"
-    assert not first.complete
-    assert list(files_of(parts)) == [f"{NAME}.csv", f"{NAME}.h5"]
-
-    assert follow(parts, resume=True, **BOTH).complete
     assert files_of(parts) == files_of(tmp_path / "whole")
 
 

@@ -15,7 +15,6 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.growth import Listener
-from vipetsc.modes.problem import FlowError
 from vipetsc.parallel import StopRequest
 
 # A step along a branch of these two masses, one on a cubic spring, takes milliseconds.
@@ -113,21 +112,4 @@ def test_findings_of_a_stopped_branch_have_the_order_of_one_that_was_not(tmp_pat
     whole = follow(tmp_path / "whole")
     stopped_at(tmp_path / "parts", 4)
     follow(tmp_path / "parts")
-    assert file_of(tmp_path / "parts").findings == whole.findings
-
-
-def test_findings_below_the_start_stay_before_those_above_it(tmp_path, marked):
-    """A part below the start that failed and goes on has its findings where they are without the failure."""
-    both = {"direction": "both", "energy": [0.2, 20.0]}
-    whole = follow(tmp_path / "whole", **both)
-
-    def fail_below(branch: Branch[Any], point: Any) -> None:
-        if branch.name.endswith("-down") and point.index == 3:
-            raise FlowError("the flow ends there")
-
-    failed = follow(tmp_path / "parts", fail_below, **both)
-    assert failed.ending == "failed: below the start: the flow ends there"
-    resumed = follow(tmp_path / "parts", **both)
-
-    assert resumed.complete
     assert file_of(tmp_path / "parts").findings == whole.findings

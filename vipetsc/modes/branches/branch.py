@@ -1,7 +1,7 @@
 """A branch in memory: its points in order, special ones in their places, and how it ended."""
 
 from dataclasses import dataclass, field
-from typing import Any, Generic, NamedTuple
+from typing import Any, Generic
 
 import numpy as np
 
@@ -10,39 +10,19 @@ from vipetsc.io.netcdf import Variables
 from vipetsc.modes.problem import S
 
 
-class FailureBelow(NamedTuple):
-    """Why the part of a branch below its start is not complete; it goes on when the branch is resumed.
-
-    ``why`` says what failed, or, with ``failed`` false, that the part has used up its points. ``next_step`` is the step
-    with which the part goes on from its far end. The branch's own ending names the part below; how the part above the
-    start has ended is kept here, in ``ending_above`` and ``complete_above``.
-    """
-
-    why: str
-    next_step: float
-    ending_above: str = "not finished"
-    complete_above: bool = False
-    failed: bool = True
-
-    @property
-    def finding(self) -> str:
-        """The failure as a sentence among the branch's findings."""
-        return f"below the start: {self.why}"
-
-
 @dataclass(eq=False)
 class Branch(Generic[S]):
     """Points of a branch of one ``kind`` (``io.branch_kinds``); with ``next_step`` and ``case`` it can go on later.
 
     ``dofs`` counts the displacements (or places) for which a point has unknowns. ``next_step`` is the arclength of the
     step after the last point, 0 without points. ``about`` are further attributes of its file, ``extra`` further
-    variables: orbits, comparisons with other flows.
+    variables: orbits.
 
     ``ending`` says in a sentence how the branch has ended, or that it has failed ("failed: ...") or was stopped
     ("stopped ..."). ``complete`` says that there is nothing left to follow: the branch has left its range or met
-    itself, on both sides of its start if both are asked for. A branch that failed, was stopped or has used up its
-    points is not complete. ``findings`` are further sentences: retracing, return to the linear mode, special
-    points that are not located. They are the attribute ``warnings`` of the file.
+    itself. A branch that failed, was stopped or has used up its points is not complete. ``findings`` are further
+    sentences: retracing, return to the linear mode, special points that are not located. They are the attribute
+    ``warnings`` of the file.
     """
 
     name: str
@@ -54,7 +34,6 @@ class Branch(Generic[S]):
     complete: bool = False
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
-    failure_below: FailureBelow | None = None
     about: dict[str, Any] = field(default_factory=dict)
     extra: Variables = field(default_factory=dict)
 

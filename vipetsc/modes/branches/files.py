@@ -11,7 +11,7 @@ import xarray as xr
 from vipetsc.io.atomic import write_text
 from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
-from vipetsc.modes.branches.branch import Branch, FailureBelow
+from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed_layout import CondensedLayout
 from vipetsc.modes.branches.kinds import kinds_of
 from vipetsc.modes.branches.layout import BranchLayout
@@ -66,8 +66,6 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
         **branch.about,
         **layout.attributes(branch),
     }
-    if branch.failure_below is not None:
-        attributes["failure_below"] = json.dumps(branch.failure_below._asdict())
     return xr.Dataset(data, attrs=attributes)
 
 
@@ -84,9 +82,6 @@ def read_branch(path: Path) -> Branch[Any]:
     if next_step is None:
         # Files of responses have the next step at each point, and none for the branch.
         next_step = float(data["next_step"].values[-1])
-    failure_below = None
-    if "failure_below" in about:
-        failure_below = FailureBelow(**json.loads(about["failure_below"]))
     return Branch(
         name=str(about["name"]),
         case=str(about["case"]),
@@ -97,6 +92,5 @@ def read_branch(path: Path) -> Branch[Any]:
         complete=bool(about["complete"]),
         ending=str(about["ending"]),
         findings=json.loads(about.get("warnings", "[]")),
-        failure_below=failure_below,
         about={name: str(about[name]) for name in ("over", "unit") if name in about},
     )

@@ -56,11 +56,11 @@ def follow_all(
     together, and then the next one.
 
     A branch that fails, by one of ``Method.failures``, is written as far as it came and says why in its ``ending``, and
-    the others go on. Where the part below its start fails, the part above is followed all the same. A ``stop`` ends
+    the others go on. A ``stop`` ends
     each branch at its next point, or earlier if an orbit's search takes long (``ArcLimits``), with an ending that
     begins with "stopped"; of branches that are not begun yet each still computes its start, unless that takes long or
     has steps of its own, and one point. With ``resume`` branches that were stopped go on to the same bits, and branches
-    that failed or have used up their points, above their start or below it, go on from their last point. Returns all
+    that failed or have used up their points, go on from their last point. Returns all
     branches on rank 0, in the order of the case; an empty list on the others.
 
     Any other error of one rank, as where a file cannot be written, is raised on all ranks once the others have followed

@@ -43,29 +43,22 @@ class Growth:
     stop: StopRequest
 
     def run(
-        self,
-        branch: Branch[Any],
-        problem: PeriodicProblem[Any],
-        start: Any,
-        rule_of: RuleOf,
-        direction: int = 1,
-        points_elsewhere: int = 0,
+        self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any, rule_of: RuleOf, direction: int = 1
     ) -> None:
         """Continue ``branch`` from the motion ``start`` until it ends, and set its ``ending`` and ``complete``.
 
         Special points are located between the regular ones.
 
         ``rule_of(problem, start, done)`` gives the steps and the end of a branch that has ``done`` regular points after
-        its start: those of ``branch``, and ``points_elsewhere`` on the other side of the start. A ``start`` with a
-        tangent is continued along it. From one without, a branch goes towards growing energy (of an NFRC, its
-        parameter) if the ``direction`` is 1, towards falling energy if it is -1.
+        its start. A ``start`` with a tangent is continued along it. From one without, a branch goes towards growing
+        energy (of an NFRC, its parameter) if the ``direction`` is 1, towards falling energy if it is -1.
 
         Raises ContinuationError, FlowError or another of the method's ``failures`` if it cannot go on, StoppedError
         on request; the branch holds the points so far.
         """
         regular = branch.regular()
         # Points of an earlier run count against the number that a branch may have; its start does not.
-        done = max(len(regular) - 1, 0) + points_elsewhere
+        done = max(len(regular) - 1, 0)
         rule = rule_of(problem, start, done)
         # The ending of a branch that has used up its points tells their number as its case counts them.
         counted = done + int(self.method.counts_start)
@@ -76,11 +69,8 @@ class Growth:
         monitor = self.method.monitor(problem)
         # The monitor compares each point with all earlier ones, to see whether the branch retraces itself or returns to
         # the linear mode. A resumed branch must be judged as one that was not interrupted: that one began without
-        # points, so that its monitor has not seen the start. Of a branch in two parts the start is not the first point.
-        earlier = regular
-        if regular and regular[0].index == 0:
-            earlier = regular[1:]
-        for point in earlier:
+        # points, so that its monitor has not seen the start.
+        for point in regular[1:]:
             monitor(point)
         if not branch.points:
             branch.points = [self.method.assess(problem, continuation.point)]

@@ -88,14 +88,9 @@ class Method(ABC, Generic[S]):
         """Steps and end of a branch that has ``done`` regular points after its start."""
 
     @property
-    def direction(self) -> int:
-        """1 if a branch is followed from its start towards growing energy, -1 towards falling energy."""
-        return 1
-
-    @property
-    def has_lower_part(self) -> bool:
-        """Whether a branch is followed from its start towards falling energy first, and then along ``direction``."""
-        return False
+    def directions(self) -> tuple[int, ...]:
+        """1 if a branch is followed from its start towards growing energy, -1 towards falling energy; both make two."""
+        return (1,)
 
     def assess(self, problem: PeriodicProblem[S], point: S) -> S:
         """The point with the quantities of its file that continuation does not need."""

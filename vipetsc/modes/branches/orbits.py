@@ -69,16 +69,9 @@ class NnmMethod(Method[Point]):
         return super().stopped_by(problem, stop)
 
     @property
-    def direction(self) -> int:
-        """-1, towards falling energy, if ``nnm.direction`` is down alone; else 1."""
-        if self.options.direction == "down":
-            return -1
-        return 1
-
-    @property
-    def has_lower_part(self) -> bool:
-        """Whether ``nnm.direction`` asks for both directions."""
-        return self.options.direction == "both"
+    def directions(self) -> tuple[int, ...]:
+        """The directions of ``nnm.direction``: 1 towards growing energy, -1 towards falling energy."""
+        return {"up": (1,), "down": (-1,), "both": (1, -1)}[self.options.direction]
 
     def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
         """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one.
