@@ -316,5 +316,5 @@ def test_ends_that_are_no_walls_do_not_move():
 
 
 def test_a_verb_of_one_burst_refuses_other_drives():
-    with pytest.raises(CaseError, match=r"drive\.waveform.*a wave of one frequency that ends"):
+    with pytest.raises(CaseError, match=r"drive\.waveform.*single-frequency wave"):
         LawCase.from_table({"drive": {"waveform": "step", "ramp": 1.0}, "law": {}})
