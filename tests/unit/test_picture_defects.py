@@ -198,6 +198,6 @@ def test_a_portrait_shows_the_masses_that_its_contact_joins(pair, host, resonato
 def test_a_run_that_lacks_a_variable_is_refused_by_its_name(tmp_path, name):
     """The message about a file without a variable names both, and is no KeyError from a figure."""
     run = run_of(small_case(time={"end": 0.01})).drop_vars(name)
-    write_netcdf(tmp_path / "run.h5", {str(key): run[key].variable for key in run.variables}, run.attrs)
+    write_netcdf(tmp_path / "run.h5", run)
     with Files() as files, pytest.raises(ResultFileError, match=name):
         registry.run_and_analysis(tmp_path, files)
