@@ -109,20 +109,6 @@ class Browser:
         log = self.call(f"{session}/se/log", {"type": "browser"})
         return self.ask(session, MEASURE) | {"errors": [line for line in log if line["level"] == "SEVERE"]}
 
-    def drag(self, session: str, *places: tuple[float, float]) -> None:
-        """Drag the mouse from the first of ``places`` (x, y in the window, in pixels) to the others.
-
-        With one place the mouse only moves there, without a pressed button.
-        """
-        moves = [{"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)} for x, y in places]
-        steps = moves
-        if len(moves) > 1:
-            down = {"type": "pointerDown", "button": 0}
-            up = {"type": "pointerUp", "button": 0}
-            steps = [moves[0], down, *moves[1:], up]
-
-        self.call(f"{session}/actions", {"actions": [{"type": "pointer", "id": "mouse", "actions": steps}]})
-
     def processes(self) -> list[int]:
         """The numbers of the driver's processes, and of all browsers with a profile in the folder."""
         numbers = []

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import subprocess
 import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import pytest
 
 from tests.cli.browser import NEEDED, SCREENS, browsing
@@ -96,7 +93,7 @@ def test_every_figure_of_the_paper_is_offered(made):
     assert {stem.partition("-")[0] for stem in ours} == {*DRAWN}
 
     drawn = {path.name for path in (made / "figures").iterdir()}
-    assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf", "json")}
+    assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
 
 
 @pytest.mark.mpirun
@@ -191,65 +188,6 @@ def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
     assert found["linked"] == []
     assert found["dead"] == []
     assert found["errors"] == []
-
-
-# Each script below begins with these lines: they find the figure whose picture has a given text, its choice of panels
-# and its picture.
-LOOK = """
-const figure = [...document.querySelectorAll('figure')].find(f => f.querySelector('img').alt.includes('%s'));
-const box = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; };
-const choice = figure.querySelector('select'), image = figure.querySelector('img');
-"""
-
-
-@pytest.mark.mpirun
-@NEEDED
-def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser):
-    """The values of a picture in the report are those of the results; its plot zooms, resets and hides curves."""
-    session = browser.open(made / "report.html", 1280, 900)
-    look = LOOK % "Transferred energy against amplitude"
-    left, top, width, height = browser.ask(
-        session, look + "image.scrollIntoView({block: 'center'}); return box(image);"
-    )
-
-    # The numbers are those of the results, to four digits.
-    packed = browser.ask(session, look + "return figure.querySelector('script').textContent;")
-    axes = json.loads(zlib.decompress(base64.b64decode(packed)))
-    first = next(panel for panel in axes if panel["curves"])
-    curve = first["curves"][0]
-    with h5py.File(made / "interband/ensemble.h5") as file:
-        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=5e-4)
-
-    # The pointer is in the middle of the panel.
-    west, north, east, south = first["box"]
-    browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
-    text = browser.ask(session, look + "return figure.querySelector('output').textContent;")
-    assert first["x"]["label"] in text
-    assert first["y"]["label"] in text
-
-    # The first choice draws the panel's curves in the page itself.
-    draw = (
-        "choice.value = 0; choice.dispatchEvent(new Event('change')); const plot = figure.querySelector('.plot svg');"
-    )
-    left, top, width, height = browser.ask(
-        session, look + draw + "plot.scrollIntoView({block: 'center'}); return box(plot);"
-    )
-    count = (
-        look + "return [figure.querySelectorAll('.plot path').length, figure.querySelector('.plot svg').textContent];"
-    )
-    paths, ticks = browser.ask(session, count)
-    assert paths == sum(curve["joined"] for curve in first["curves"])
-
-    # A selected part of the plot has other ticks, and the button resets the plot.
-    browser.drag(session, (left + 0.3 * width, top + 0.3 * height), (left + 0.5 * width, top + 0.6 * height))
-    assert browser.ask(session, count)[1] != ticks
-    browser.ask(session, look + "figure.querySelector('.legend .reset').click();")
-    assert browser.ask(session, count) == [paths, ticks]
-
-    # The button of a curve hides it.
-    browser.ask(session, look + "figure.querySelector('.legend button').click();")
-    assert browser.ask(session, count)[0] < paths
-    assert browser.measure(session)["errors"] == []
 
 
 @pytest.mark.mpirun

@@ -228,7 +228,7 @@ def test_all_of_a_picture_can_be_read(tmp_path):
     with rc_style(), Files() as files:
         for name, make, _ in drawings("run", [tmp_path], files):
             figure = make()
-            save(figure, tmp_path / f"{name}.json")
+            save(figure, tmp_path / f"{name}.png")
             assert (name, complaints(figure)) == (name, [])
 
 
@@ -454,7 +454,7 @@ def test_logarithmic_axes_have_three_labels_or_more(low, ratio, tmp_path):
         figure = new_figure(2.4, 1.5)
         axes = figure.subplots()
         axes.loglog([low, low * ratio], [low, low * ratio])
-        save(figure, tmp_path / "ranges.json")
+        save(figure, tmp_path / "ranges.png")
         assert complaints(figure) == []
 
 
@@ -470,5 +470,5 @@ def test_a_long_heading_takes_lines(tmp_path):
     with rc_style():
         figure = new_figure(2, 2, "a heading that is longer than the page is wide, which is two inches and no more")
         figure.subplots()
-        save(figure, tmp_path / "heading.json")
+        save(figure, tmp_path / "heading.png")
         assert complaints(figure) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -113,111 +111,6 @@ def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
     (axes,) = figure.axes
     # Without a bound an axis of many decades has hundreds of minor ticks, which take most of a layout's time.
     assert len(axes.yaxis.get_minorticklocs()) <= 2 * 6 + 2
-
-
-def numbers_of(figure: Figure, path: Path, note: str = "") -> list[dict]:
-    """Return the entries for axes in the JSON file of a figure."""
-    return json.loads(save(figure, path, note).read_text())
-
-
-# A steep curve of more points than a page needs.
-WAVE_X = np.linspace(1, 100, 2001)
-WAVE_Y = 100 + 50 * np.sin(np.linspace(0, 20, 2001))
-
-
-@pytest.fixture
-def curves_and_map():
-    """Draw axes with two curves and points, a map with a colour bar, and axes that are switched off."""
-    # The curve has a gap of two values.
-    x = np.array([1.0, 10.0, np.nan, np.nan, 100.0])
-    with rc_style():
-        figure = new_figure(4, 2)
-        left, right, table = figure.subplots(1, 3)
-
-        left.errorbar(x, 2 * x, 0.1 * x, fmt="o-", color="#0072B2", label="measured")
-        left.plot(WAVE_X, WAVE_Y, label="_many")
-        left.scatter([2, 3], [4, 5], c=[0.1, 0.9], label="by colour")
-        # Neither a line in the units of the page nor a ring that marks a point is data.
-        left.plot([0, 1], [0, 1], transform=left.transAxes)
-        left.scatter([2], [4], facecolors="none", edgecolors="k")
-        left.set(xscale="log", xlabel="Amplitude $A$ (N)", title="")
-
-        mesh = right.pcolormesh(np.eye(3), norm=LogNorm(1e-4, 1), cmap="viridis")
-        figure.colorbar(mesh, ax=right, label="Energy $E$ (J)")
-        right.plot([0, 2], [0, 2])
-        table.axis("off")
-        yield figure
-
-
-@pytest.mark.slow
-def test_curves_and_points_of_a_picture_are_in_its_numbers(curves_and_map, tmp_path):
-    """The numbers hold scales, labels without markup, curves thinned out to what is seen, gaps and points."""
-    axes, _ = numbers_of(curves_and_map, tmp_path / "plain.json")
-
-    assert axes["x"] | {"low": 0, "high": 0} == {"low": 0, "high": 0, "log": True, "label": "Amplitude A (N)"}
-    assert axes["y"]["log"] is False
-    assert "map" not in axes
-
-    curve, many, points = axes["curves"]
-    assert curve["label"] == "measured"
-    assert curve["colour"] == "#0072b2"
-    assert curve["joined"]
-    # Any number of NaN is one gap.
-    assert curve["x"] == [1, 10, None, 100]
-    assert curve["y"] == [2, 20, None, 200]
-
-    assert many["label"] == ""
-    # A page shows fewer than 400 of the 2001 points.
-    assert len(many["x"]) < 400
-    thinned = np.interp(np.log(WAVE_X), np.log(many["x"]), many["y"])
-    # The curve changes by up to 0.5 between neighbouring points: the bound is a dozen of them.
-    assert thinned == pytest.approx(WAVE_Y, abs=6)
-
-    assert points["label"] == "by colour"
-    assert points["x"] == [2, 3]
-    assert not points["joined"]
-
-
-@pytest.mark.slow
-def test_colours_of_a_map_are_in_its_numbers(curves_and_map, tmp_path):
-    """The numbers of a map are its colours and their values; lines on a map are no curves."""
-    _, image = numbers_of(curves_and_map, tmp_path / "plain.json")
-
-    assert image["curves"] == []
-    table = image["map"]
-    assert table["label"] == "Energy E (J)"
-    # The first colour is the darkest of viridis; a colour has six hexadecimal digits.
-    assert table["colours"][:6] == "440154"
-    count = len(table["values"])
-    assert len(table["colours"]) == 6 * count
-    assert table["values"] == pytest.approx(np.geomspace(1e-4, 1, count), rel=1e-3)
-
-
-@pytest.mark.slow
-def test_boxes_of_axes_are_fractions_of_the_picture(curves_and_map, tmp_path):
-    """Boxes stand side by side as the axes do; a note's strip makes the picture higher and the boxes smaller."""
-    axes, image = numbers_of(curves_and_map, tmp_path / "plain.json")
-    noted, _ = numbers_of(curves_and_map, tmp_path / "noted.json", "coarse")
-
-    west, north, east, south = axes["box"]
-    assert 0 <= west < east <= image["box"][0]
-    assert 0 < north < south < 1
-    height = 2
-    assert noted["box"][3] == pytest.approx(south * height / (height + NOTE), abs=1e-4)
-
-
-def test_an_inset_has_numbers_of_its_own_within_its_axes(tmp_path):
-    """An inset's box lies within that of its axes, which take the label of their part of the figure."""
-    with rc_style():
-        figure = new_figure(4, 2)
-        _, right = figure.subfigures(1, 2)
-        right.supxlabel("time (s)")
-        right.subplots().inset_axes((0.5, 0.5, 0.4, 0.4)).plot([0, 1])
-        outer, inset = numbers_of(figure, tmp_path / "parts.json")
-
-    assert 0.5 < outer["box"][0] < inset["box"][0] < inset["box"][2] < outer["box"][2] <= 1
-    assert outer["x"]["label"] == "time (s)"
-    assert len(inset["curves"]) == 1
 
 
 def test_every_claim_has_a_figure_that_shows_it():

@@ -1,5 +1,8 @@
 """The layout of a figure by matplotlib's engine, once for all formats in which it is written."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -15,8 +18,15 @@ def remove_engine(figure: Figure) -> None:
     """Leave ``figure`` without a layout engine: its axes stay where they are."""
     # ``set_layout_engine("none")`` would give the figure an engine that does nothing, with which ``savefig`` draws it
     # twice. None gives it the engine that the settings ask for, here none.
-    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+    with without_engine():
         figure.set_layout_engine(None)
+
+
+@contextmanager
+def without_engine() -> Iterator[None]:
+    """Let the settings ask for no layout engine within the block; ``savefig`` gives a figure that has none theirs."""
+    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        yield
 
 
 def apply_aspects(figure: Figure) -> None:

@@ -1,6 +1,5 @@
 """Sizes, type and colours of all pictures; empty figures; how figures become files, and how ranks share pictures."""
 
-import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,11 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import Bbox
 
-from vipetsc.figures.figure_data import figure_data
-from vipetsc.figures.layout import apply_aspects, lay_out
+from vipetsc.figures.layout import apply_aspects, lay_out, without_engine
 from vipetsc.figures.log_ticks import label_log_axes
 from vipetsc.figures.prefixed_units import prefix_units
-from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.atomic import atomic_write
 
 COLUMN = 3.4  # width of one journal column in inches
 PAGE = 7.0  # width of two
@@ -124,8 +122,7 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, whole or not at all, and return the path.
 
     In a strip below the picture are the ``note`` and the figure's label, in lines of its width. A figure is laid out
-    once, for the first of its formats. A JSON file holds what the picture shows as numbers, see
-    ``vipetsc.figures.figure_data``. Raises OSError, which names the file, if it cannot be written.
+    once, for the first of its formats. Raises OSError, which names the file, if it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():
@@ -135,11 +132,7 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     sentences = [*note.splitlines(), *figure.get_label().splitlines()]
     lines = [line for sentence in sentences for line in wrap(sentence, letters)]
 
-    if path.suffix == ".json":
-        panels = figure_data(figure, strip=NOTE * len(lines))
-        write_text(path, json.dumps(panels, separators=(",", ":"), allow_nan=False))
-    else:
-        _print(figure, path, lines)
+    _print(figure, path, lines)
     return path
 
 
@@ -156,7 +149,7 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
         apply_aspects(figure)
     if path.suffix == ".png":
         options |= {"dpi": SCREEN, "pil_kwargs": {"compress_level": COMPRESSION}}
-    with atomic_write(path) as partial_path:
+    with without_engine(), atomic_write(path) as partial_path:
         figure.savefig(partial_path, format=path.suffix[1:], **options)
 
     # The next format of the figure gets a text of its own.

@@ -8,9 +8,9 @@ from vipetsc.io.atomic import write_text
 from vipetsc.paper.plan import read_json
 
 RECORD = "made.json"
-FORMATS = ("png", "pdf", "json")
+FORMATS = ("png", "pdf")
 # Bytes near the end of every whole file of a kind; a file that was cut off lacks them.
-LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}
+LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".html": b"</html>"}
 
 BuildRecord = dict[str, Any]
 """The content of ``made.json``.

@@ -4,11 +4,9 @@ import base64
 import hashlib
 import io
 import re
-import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib.resources import files
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -89,16 +87,14 @@ def write_report(path: Path, contents: ReportContents) -> None:
         checks={name.removesuffix("-ts"): row["agreement"] for name, row in statistics.items() if "agreement" in row},
         bounds=COMPARED,
         cpu=contents.cpu,
-        script=(files("vipetsc.paper") / "explore.js").read_text(encoding="utf-8"),
     )
     write_text(path, page)
 
 
-def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str, str]:
-    """What the template needs of the picture (PNG) at ``path``.
+def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str]:
+    """Return the width and the height in pixels of the picture (PNG) at ``path``, the hash of its file and a data URI.
 
-    These are its width and height in pixels, the hash of the file, its data URI, and the content of its JSON file (the
-    axes and data that the page can show), compressed, in base64. URIs are taken from ``encoded``, by the hash, or made.
+    URIs are taken from ``encoded``, by the hash, or made.
     """
     data = path.read_bytes()
     key = hashlib.sha256(data).hexdigest()
@@ -106,13 +102,7 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
         uri = encoded.get(key)
         if not uri:
             uri = "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
-
-        content = b"[]"
-        shown = path.with_suffix(".json")
-        if shown.exists():
-            content = shown.read_bytes()
-        axes = zlib.compress(content, 9)
-        return image.width, image.height, key, uri, base64.b64encode(axes).decode()
+        return image.width, image.height, key, uri
 
 
 def small(image: Image.Image) -> bytes:
