@@ -17,6 +17,7 @@ from vipetsc.case import Case, CaseError, Model
 from vipetsc.contact.law import CLOSED
 from vipetsc.dynamics import energies, run
 from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy
+from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_numbers
 from vipetsc.dynamics.ts.integrator import Integrator
@@ -31,7 +32,7 @@ CONTACT_CELLS = (3, 7)
 
 def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
     """Return the energies of one state."""
-    meter = EnergyMeter(model, layout)
+    meter = EnergyMeter(model, layout, create_record(model, layout))
     with state.localForm() as local:
         work = local.array[meter.lattice.shape.work]
         return meter.total(meter.sums(local.array)[None], np.array([work]))
@@ -145,7 +146,7 @@ def test_energies_below_the_unit_of_the_sums_add_up():
     """Energies of 0.4 units a cell are not rounded to zero one by one: their sum is exact."""
     model = small_case().model()
     layout = Layout(model, MPI.COMM_SELF)
-    unit = EnergyMeter(model, layout).unit
+    unit = EnergyMeter(model, layout, create_record(model, layout)).unit
     state = layout.create_vector()
     first = layout.dofs * layout.owned
     state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * unit / model.chain.cell.masses[0])
@@ -164,7 +165,7 @@ def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
     """Sums of energies that are cut off at ``LARGEST`` saturate; 2^14 of them would add up to 2^64, 0 in 64 bits."""
     model = small_case(lattice={"cells": 2**14, "damping": {"mass": 1.0}}).model()
     layout = Layout(model, MPI.COMM_SELF, dashpots=True)
-    sums = EnergyMeter(model, layout).sums(np.full(layout.size, np.nan))
+    sums = EnergyMeter(model, layout, create_record(model, layout)).sums(np.full(layout.size, np.nan))
     kinetic, spring, _, _, damping = sums[:, 0] >= LARGEST
     assert kinetic
     assert spring

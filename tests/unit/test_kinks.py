@@ -74,7 +74,7 @@ class SubstepsOnKinks:
 
     def __init__(self, monkeypatch, kinks: list[float], *, converges: bool = True) -> None:
         self.lengths: list[float] = []
-        self.state = SimpleNamespace(rejected=3, length=9.0)
+        self.state = SimpleNamespace(rejected=3, length=9.0, missed=0)
         remaining = iter(kinks)
 
         def try_substep(cluster: object, trial: object, substep: Substep) -> bool:
@@ -101,6 +101,7 @@ def test_a_substep_without_a_kink_is_not_repeated(monkeypatch):
     loop = SubstepsOnKinks(monkeypatch, [])
     assert loop.end(0.4) == Substep(EXIT, 0.4)
     assert loop.lengths == []
+    assert loop.state.missed == 0
 
 
 @pytest.mark.parametrize(("factor", "is_cut"), [(0.99, False), (1.01, True)])
@@ -113,11 +114,12 @@ def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut
 
 
 def test_repetitions_end_although_each_substep_has_a_kink(monkeypatch):
-    """A substep is repeated at most MOST_ATTEMPTS times."""
+    """A substep is repeated at most MOST_ATTEMPTS times; that a kink is left inside is counted."""
     # Rounding could keep a kink just inside of every substep.
     loop = SubstepsOnKinks(monkeypatch, [0.9] * (MOST_ATTEMPTS + 5))
     assert loop.end(0.4).length == pytest.approx(0.4 * 0.9**MOST_ATTEMPTS)
     assert len(loop.lengths) == MOST_ATTEMPTS
+    assert loop.state.missed == 1
 
 
 def test_a_substep_that_cannot_be_repeated_is_rejected_and_the_next_one_is_shorter(monkeypatch):

@@ -96,7 +96,7 @@ def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
     w_acceleration = acceleration[SITE - 1, resonator] - acceleration[SITE - 1, host]
     assert motion[0, 2] == pytest.approx(w_acceleration, rel=1e-12)
 
-    meter = EnergyMeter(model, layout)
+    meter = EnergyMeter(model, layout, engine.lattice)
     with engine.state.localForm() as local:
         energies = meter.total(meter.sums(local.array)[None], np.array([0.25]))
     assert energies.kinetic == pytest.approx(0.5 * np.sum(masses * v**2), rel=1e-12)

@@ -35,11 +35,11 @@ def test_contacts_that_cannot_be_followed_end_the_run():
     engine = Propagator(model, layout)
 
     # In the first samples the driven cell moves by less than the clearance.
-    assert engine.fill(unrecorded_samples(model, layout, goal=3)) == FillResult(0)
+    assert engine.fill(unrecorded_samples(engine.lattice, goal=3)) == FillResult(0)
     assert engine.steps == 3
     assert engine.time == 3 * model.sample_interval
 
-    stalled = engine.fill(unrecorded_samples(model, layout, goal=model.samples - 1)).stalled
+    stalled = engine.fill(unrecorded_samples(engine.lattice, goal=model.samples - 1)).stalled
     assert re.match(r"the contacts of sites 1 at 0.0\d+ s", stalled)
     # The engine's state is that of the last sample before the stall.
     assert engine.time == engine.steps * model.sample_interval
@@ -81,7 +81,7 @@ def test_ten_thousand_sites_are_set_up_and_restored():
     assert refusal(model) is None
     layout = Layout(model, MPI.COMM_SELF)
     engine = Propagator(model, layout)
-    assert engine.fill(unrecorded_samples(model, layout, goal=1)) == FillResult(0)
+    assert engine.fill(unrecorded_samples(engine.lattice, goal=1)) == FillResult(0)
 
     state = engine.checkpoint()
     other = Propagator(model, layout)

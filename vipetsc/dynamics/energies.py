@@ -17,7 +17,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import elastic_energy
-from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
+from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, damping_powers, displacement, is_varied
@@ -254,17 +254,17 @@ def _carried(upper: np.ndarray, lower: np.ndarray, bits: int) -> tuple[np.ndarra
 
 
 class EnergyMeter:
-    """Measures the energies of a distributed state.
+    """Measures the energies of a distributed state, of which ``lattice`` describes this rank's part.
 
     Energies are summed as integers, whose sums do not depend on their order: multiples of ``unit`` in J, a power of two
     far below the run's energy scale, and a finer remainder. From ``largest`` in J on the sums saturate. With less than
     ``negligible`` in J in the lattice the balance cannot be judged.
     """
 
-    def __init__(self, model: Model, layout: Layout) -> None:
+    def __init__(self, model: Model, layout: Layout, lattice: LatticeRecord) -> None:
         self.comm = layout.comm
         self._balances_damping = layout.damped and not layout.integrates_damping
-        self.lattice = create_record(model, layout)
+        self.lattice = lattice
 
         speed = model.scale * model.drive.frequency
         # The motion's scale in as many cells as the drive's wave train covers; an initial state may be in all cells.

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.samples import Samples
 from vipetsc.parallel import StopRequest
@@ -31,11 +32,13 @@ class Engine(ABC):
 
     ``integrates_damping`` says whether it integrates what dashpots dissipate. Where it does not, that is what the
     energies of a sample leave (``energies``).
-    ``state`` (as ``Layout`` orders it, ghosts up to date) and ``time`` in s are those of the last time reached.
+    ``state`` (as ``Layout`` orders it, ghosts up to date) and ``time`` in s are those of the last time reached;
+    ``lattice`` is the rank's part of the lattice, which compiled code reads.
     """
 
     name: ClassVar[str]
     integrates_damping: ClassVar[bool]
+    lattice: LatticeRecord
     state: PETSc.Vec
     time: float
 

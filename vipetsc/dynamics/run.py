@@ -180,7 +180,7 @@ class Simulation:
                 case=self.case,
                 model=self.model,
                 layout=layout,
-                meter=EnergyMeter(self.model, layout),
+                meter=EnergyMeter(self.model, layout, engine.lattice),
                 engine=engine,
                 output=output,
             )

@@ -18,6 +18,7 @@ from vipetsc.compiled import kernel, njit
 from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.drives import Drives
 from vipetsc.dynamics.engine import Engine, FillResult
+from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
@@ -160,6 +161,7 @@ class Propagator(Engine):
         assert series is not None, "refused"
         self.series = series
         self._layout = layout
+        self.lattice = create_record(model, layout)
         self._stop = stop or StopRequest()
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.

@@ -247,7 +247,7 @@ class TangentPropagator(Propagator):
                 goal = min(pause(number), samples)
             number = goal
             # ``fill`` goes on to the sample ``number``, all ranks alike; without records there is nothing to fill.
-            result = self.fill(unrecorded_samples(self._model, self._layout, goal=number))
+            result = self.fill(unrecorded_samples(self.lattice, goal=number))
             # A full tape goes on to count the rows that it lacks; one without rows counts none.
             needed = self._layout.comm.allreduce(int(tape.used.max(initial=0)), max)
             room = tape.rows.shape[1]

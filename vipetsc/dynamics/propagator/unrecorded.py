@@ -2,19 +2,17 @@
 
 import numpy as np
 
-from vipetsc.case import Model
 from vipetsc.dynamics.energies import ENERGY_SUMS
-from vipetsc.dynamics.lattice_record import create_record
-from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.samples import Samples
 
 
-def unrecorded_samples(model: Model, layout: Layout, goal: int) -> Samples:
+def unrecorded_samples(lattice: LatticeRecord, goal: int) -> Samples:
     """Samples with which ``Propagator.fill`` advances to the sample ``goal``, counted from 0, and stores none.
 
-    With room for k samples from ``number`` on, the engine goes to the sample number + k - 1. Here all arrays are empty,
-    k = 0, and ``number`` is goal + 1. What describes samples (``every``, ``unit``, ``interval`` and so on) is never
-    read.
+    ``lattice`` is that of the engine. With room for k samples from ``number`` on, the engine goes to the sample
+    number + k - 1. Here all arrays are empty, k = 0, and ``number`` is goal + 1. What describes samples (``every``,
+    ``unit``, ``interval`` and so on) is never read.
     """
     return Samples(
         number=goal + 1,
@@ -26,7 +24,7 @@ def unrecorded_samples(model: Model, layout: Layout, goal: int) -> Samples:
         first_cell=0,
         every=1,
         stride=1,
-        lattice=create_record(model, layout),
+        lattice=lattice,
         unit=1.0,
         interval=1.0,
         forces=np.zeros((0, 0)),
