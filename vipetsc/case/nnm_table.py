@@ -145,9 +145,9 @@ class NnmTable(Section):
     map: Literal["auto", "quarter", "half", "whole"] = described(
         "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
     )
-    chart: Literal["auto", "relative", "logarithmic", "grazing"] = described(
-        "unknowns: displacements over the clearance, their logarithms, or square roots of the distance to"
-        " contact; auto: grazing near contact",
+    chart: Literal["auto", "relative", "grazing"] = described(
+        "unknowns: displacements over the clearance, or square roots of the distance to contact;"
+        " auto: grazing near contact",
         "relative",
     )
     start_energy: Annotated[Positive | Literal["auto"], BY_SHAPE] = described(

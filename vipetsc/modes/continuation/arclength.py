@@ -11,8 +11,8 @@ so that the correction is orthogonal to the tangent (Keller 1977, reference in `
 of the chart. The frame's ``measures`` turn a solution into a point of the branch with its energy, frequency and so on.
 
 *Guards* bound what may change from one point to the next (``continuation.guards``): the correction over the step, the
-angle between tangents, contacts, half-traces of Floquet multipliers. The *strain* of a guard is the change over its
-bound, that of a step the largest of these: above 1 a step is refused, since it may have jumped to another branch.
+angle between tangents, contacts, half-traces of Floquet multipliers. A step in which one of them changes by more than
+its bound is refused, since it may have jumped to another branch.
 
 A *step rule* decides what follows after each attempt. ``GuardedSteps`` is the rule for normal modes, by the section
 [nnm] of a case file; other kinds of branches bring their own.
@@ -25,7 +25,7 @@ from typing import Any, Generic, NamedTuple, Protocol
 import numpy as np
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, strain
+from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, largest_change
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Frame, PeriodicProblem, S
 
@@ -34,7 +34,8 @@ from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Frame, 
 # attempts in vain) each may be changed by a quarter or more, and the Newton steps of all points together change by 13 %
 # at most.
 #
-# Strain at which the step after an accepted one aims. At 1, nearly twice as many steps are refused.
+# The largest change over its bound at which the step after an accepted one aims. At 1, nearly twice as many steps are
+# refused.
 AIM = 0.7
 # Newton steps up to which the next step need not be shorter.
 EASY = 5
@@ -42,7 +43,7 @@ EASY = 5
 MOST_GROWTH = 2
 # Factor of a step where Newton's method fails.
 FAILED_FACTOR = 0.4
-# Strain at which the repetition of a step aims that a guard has refused.
+# The same for the repetition of a step that a guard has refused.
 AIM_AGAIN = 0.8
 # Bounds of the factor of such a step.
 LEAST_FACTOR = 0.1
@@ -109,13 +110,13 @@ class StepRule(Protocol[S]):
 
 
 class GuardedSteps:
-    """Steps of a branch of normal modes by [nnm], of such length that the most strained guard comes to ``AIM``.
+    """Steps of a branch of normal modes by [nnm], of such length that the largest change comes to ``AIM`` of its bound.
 
     Most guarded changes are proportional to a short step: angles and half-traces change at a rate along the branch, and
     a correction, which is of second order in the step, is divided by the step. The next step is therefore the last one
-    times ``AIM`` over its strain. It at most doubles, and is shorter than the last one where Newton's method needed
-    more than ``EASY`` steps. Changes that are not proportional to the step (``guards.ALL_OR_NOTHING``) have no strain
-    as long as they are within their bounds.
+    times ``AIM`` over the largest change in units of its bound. It at most doubles, and is shorter than the last one
+    where Newton's method needed more than ``EASY`` steps. Changes that are not proportional to the step
+    (``guards.ALL_OR_NOTHING``) do not matter as long as they are within their bounds.
 
     ``problem`` has the orbits, ``control`` the numbers of [nnm].
     """
@@ -141,7 +142,7 @@ class GuardedSteps:
         )
 
     def judge(self, before: Point, after: Point, geometry: Geometry) -> Verdict:
-        """Accept a step that strains no guard beyond its bound, to a point that moves."""
+        """Accept a step to a point that moves, if no change is beyond its bound."""
         if self.problem.acceleration(after) < CONSTANT:
             return Verdict(
                 accepted=False,
@@ -149,13 +150,13 @@ class GuardedSteps:
                 why="Newton's method ends at an equilibrium, which has no period",
                 remedy="nnm.largest_step",
             )
-        size, guard = strain(self.problem, self.control, before, after, geometry._asdict())
+        size, guard = largest_change(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
             # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
             effort = max(size / AIM, after.newton / EASY, 1 / MOST_GROWTH)
             return Verdict(accepted=True, step=min(after.step / effort, self.control.largest_step))
 
-        # The strain may not be proportional to the step: the least factor keeps one large strain from ending the
+        # The change may not be proportional to the step: the least factor keeps one large change from ending the
         # branch, and the largest one lets every refusal shorten the step, so that the attempts end.
         factor = min(max(AIM_AGAIN / size, LEAST_FACTOR), MOST_FACTOR)
         why, remedy = GUARDED[guard]

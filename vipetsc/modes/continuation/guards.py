@@ -4,6 +4,10 @@ The points of both arcs satisfy the equations to rounding, so that residuals do 
 close together, as in neighbouring tongues of internal resonances, differ in their half-traces c = (mu + 1/mu)/2 of the
 Floquet multipliers mu, in their contacts, or in their direction. A jump between arcs that differ in none of these by
 more than the bounds is not noticed.
+
+Bounds on half-traces and contacts also keep steps so short that few special points are missed. Along the in-phase
+branch of the paper's model with Hertz's law, up to 6 GJ, 83 of 316 grazing points and 47 of 197 branch points lie in
+pairs within one step without them, and are not found; folds and the branch itself are the same.
 """
 
 from collections.abc import Sequence
@@ -30,7 +34,7 @@ ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
 
 
 class OrbitProblem(PeriodicProblem[Point], Protocol):
-    """Equations whose solutions are orbits with contacts, as ``strain`` asks them."""
+    """Equations whose solutions are orbits with contacts, as ``largest_change`` asks them."""
 
     def departures(self, point: Point) -> Sequence[Departure]:
         """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
@@ -51,15 +55,17 @@ class OrbitProblem(PeriodicProblem[Point], Protocol):
         """
 
 
-class Strain(NamedTuple):
+class GuardedChange(NamedTuple):
     """Largest change in a step over the bound of its ``guard``; 1 is the bound."""
 
     size: float
     guard: str
 
 
-def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point, geometry: dict[str, float]) -> Strain:
-    """The largest strain of a step: of its changes from ``before`` to ``after``, each over its bound in ``control``.
+def largest_change(
+    problem: OrbitProblem, control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
+) -> GuardedChange:
+    """The largest change of a step, from ``before`` to ``after``, over its bound in ``control``.
 
     ``geometry`` has the fields of ``Geometry``: ``corrector`` and ``turn``. Which other changes are guarded
     ``problem.guards`` says. All ranks must call it: contacts may be looked for on all of them.
@@ -72,7 +78,7 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
     if "truncation" in problem.guards:
         changes["truncation"] = after.truncation / control.truncation
 
-    worst = Strain(-np.inf, "")
+    worst = GuardedChange(-np.inf, "")
     for guard, change in changes.items():
         # The truncation has been divided by its bound above, which is no key of [nnm.guards]. A bound of 0 switches a
         # guard off.
@@ -84,7 +90,7 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
         if guard in ALL_OR_NOTHING and size <= 1:
             size = 0.0
         if size > worst.size:
-            worst = Strain(size, guard)
+            worst = GuardedChange(size, guard)
     return worst
 
 

@@ -28,11 +28,11 @@ reversed has I - 2 D^T A, and its multipliers are squared. One c = 1 is trivial:
 stable; c = 1 is a fold of the energy or a branch point; c = -1 breaks the symmetry (quarter) or doubles the period
 (others); c = 0 doubles the period of a quarter's orbit.
 
-**Charts** scale the unknowns: ``relative`` (gaps over the clearance), ``logarithmic``, ``grazing`` (a root of w - D in
+**Charts** scale the unknowns: ``relative`` (gaps over the clearance), ``grazing`` (a root of w - D in
 place of w: an orbit that starts on its largest |w| depends on w - D through one).
 """
 
-from vipetsc.modes.shooting.charts import Chart, Grazing, Logarithmic, Relative
+from vipetsc.modes.shooting.charts import Chart, Grazing, Relative
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.shooting.maps import MAPS, ShootingMap

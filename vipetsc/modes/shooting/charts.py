@@ -3,16 +3,14 @@
 A chart belongs to a point of the branch, with the initial values x_0 and the period T_0. It encodes (x, T) as xi,
 decodes it, and gives d(x, T)/dxi (n + 1, n + 1); ``size`` = max |x_0| is the unit of initial values. Initial values are
 displacements in m where an arc starts at rest, velocities in m/s where it starts at the centre. The last unknown is
-T/T_0 (``logarithmic``: ln(T/T_0)), the others are
+T/T_0, the others are
 
     relative       x_i/size; in the place of a site's resonator w/scale, with w = c . x, where the arc starts at rest
     grazing        x_i/size; in the place of one site's resonator y, where y |y| = (sigma w - D)/D
-    logarithmic    x_i/x_lead; in the place of the largest one ln(x_lead/x_0,lead)
 
 w is the elongation of a contact, c its row with 1 at the resonator and -1 at the other mass, if there is one, and D its
 clearance in m on the side sigma. D is not 0: ``System`` refuses contacts that touch at rest, about which no motion is
-linear. ``logarithmic`` is there for users who want to compare charts, by the case key ``nnm.chart``; no other module
-needs it.
+linear.
 
 **Why grazing needs a chart.** An orbit that starts at rest on its largest sigma w, beyond D, is in contact for the time
 2 [2 (sigma w - D)/|w''|]^1/2. The impulse of a force that grows as (sigma w - D)^n then changes the orbit by the order
@@ -115,39 +113,6 @@ class Relative(DenseChart):
         return self._derivative
 
 
-class Logarithmic(DenseChart):
-    """Logarithms of the largest initial value and of the period; the other values over the largest one.
-
-    The chart cannot pass a zero of the value that was the largest at its point: the logarithm is NaN beyond.
-    """
-
-    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        self.size = float(np.abs(x).max())
-        self.period = period
-        self.lead = int(np.abs(x).argmax())
-        self.sign = float(np.sign(x[self.lead]))
-
-    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
-        xi = np.append(x / x[self.lead], np.log(period / self.period))
-        xi[self.lead] = np.log(x[self.lead] / (self.sign * self.size))
-        return xi
-
-    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
-        lead = self.sign * self.size * np.exp(xi[self.lead])
-        x = xi[:-1] * lead
-        x[self.lead] = lead
-        return x, float(self.period * np.exp(xi[-1]))
-
-    def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
-        x, period = self.decode(xi)
-        d = np.diag(np.append(np.full(len(x), x[self.lead]), period))
-        d[:-1, self.lead] = x
-        return d
-
-
 class Grazing(DenseChart):
     """Initial values over the largest one, with y for the contact that is nearest to its clearance.
 
@@ -193,11 +158,7 @@ class Grazing(DenseChart):
         return d
 
 
-CHARTS: dict[str, type[Relative | Logarithmic | Grazing]] = {
-    "relative": Relative,
-    "logarithmic": Logarithmic,
-    "grazing": Grazing,
-}
+CHARTS: dict[str, type[Relative | Grazing]] = {"relative": Relative, "grazing": Grazing}
 
 
 def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
