@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, set_words
-from vipetsc.dynamics.ts import integrator
 from vipetsc.io.netcdf import open_netcdf
 
 SWEEP = """
@@ -163,13 +162,11 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
         assert len(json.loads(file.attrs["failed"])) == 6
 
 
-def test_a_member_that_does_not_come_out_is_recorded(in_process, monkeypatch, case, tmp_path):
+def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path):
     """A member that stalls has its place and the reason in the index, and the other member is not affected."""
     out = tmp_path / "out"
-    # The run without contact takes a few steps from sample to sample; the other run never reaches the next sample.
-    monkeypatch.setattr(integrator, "MOST_TRIALS", 300)
     # A contact this stiff needs time steps below the rounding error of the time.
-    stiff = set_words("contacts.stiffness=1e30", "time.engine=ts")
+    stiff = set_words("contacts.stiffness=1e45", "time.engine=ts")
     two = set_words("sweep.drive.amplitude=[0.1, 20.0]", "sweep.contacts.sites=[1]")
 
     ended = in_process("sweep", case, "--out", out, *stiff, *two)
@@ -179,7 +176,7 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, monkeypatch, ca
     assert index["members"]["scaled"] == 1
     (stalled,) = index["failed"]
     assert stalled["place"] == [0, 1]
-    assert "steps did not reach t = " in stalled["reason"]
+    assert "stalled" in stalled["reason"]
 
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
