@@ -1,13 +1,12 @@
 """Entry point: ``python -m vipetsc VERB``, on one process or under ``mpirun -n N``; PETSc options follow ``--``."""
 
-import gc
 import logging
 import os
 import sys
 from importlib.util import find_spec
 
 from vipetsc.cli.streams import check_standard_streams
-from vipetsc.process import collect_seldom, end_on_request, quick_start
+from vipetsc.process import end_on_request
 
 # Libraries that must be built for the machine's MPI, so that setting up the package does not install them.
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"
@@ -17,7 +16,6 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one verb on all ranks; returns the exit code: 0 done, 2 bad input, 75 stopped on request, 1 failed."""
     # Before modules are loaded, which takes a second or more.
     end_on_request()
-    collect_seldom()
     check_standard_streams()
 
     # One thread per rank: further threads would compete with the other ranks for the cores.
@@ -40,14 +38,11 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     end = arguments.index("--") if "--" in arguments else len(arguments)
 
-    # Modules stay loaded until the process ends: searches for garbage leave their objects out.
-    gc.disable()
     import petsc4py
 
     # PETSc's handlers of signals would end the process at once; ours end a run at its next step, with a checkpoint.
-    with quick_start():
-        petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
-        from petsc4py import PETSc
+    petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
+    from petsc4py import PETSc
 
     try:
         from vipetsc.parallel import install_abort_hook
@@ -71,8 +66,6 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options:
         database.delValue(name)
 
-    gc.freeze()
-    gc.enable()
     return run_verb(arguments[:end], options)
 
 

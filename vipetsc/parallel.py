@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NamedTuple, NoReturn, Self, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -139,8 +139,6 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
         # A user's module may leave by ``sys.exit``, on one rank perhaps: the others must not wait for it.
         return _Attempt(value=None, error=RuntimeError(f"sys.exit({error.code!r}) was called"))
     except Exception as error:
-        if _comes_of_an_end(error):
-            raise EndedError from None
         return _Attempt(value=None, error=error)
 
 
@@ -159,14 +157,6 @@ def _sendable(attempt: _Attempt) -> _Attempt:
     if copied:
         return attempt
     return _Attempt(value=None, error=RuntimeError(f"{type(error).__name__}: {error}"))
-
-
-def _comes_of_an_end(error: BaseException) -> bool:
-    """Whether a library raised ``error`` while EndedError interrupted it."""
-    cause = error.__context__
-    while cause and not isinstance(cause, EndedError):
-        cause = cause.__context__
-    return cause is not None
 
 
 def _value_or_raise(attempt: _Attempt) -> Any:
@@ -221,17 +211,6 @@ class StudyError(RuntimeError):
     """A study that cannot be finished: the message says which of its runs failed, and why."""
 
 
-class EndedError(BaseException):
-    """Work in which nothing has to be saved was ended on request, by an exception that no handler of errors takes.
-
-    Other ranks may wait for the one that raises it: who catches it has to end them too.
-    """
-
-
-def _say_nothing(*error: Any) -> None:
-    """Hook for errors that are not reported."""
-
-
 class StopRequest:
     """A request to stop, by a signal: ``requested`` once this rank has got one.
 
@@ -240,11 +219,10 @@ class StopRequest:
     """
 
     requested = False
-    _ends_at_once = False
-    _GRACE = 2  # s in which EndedError has to get out of the work
+    _is_listening = False
 
     def agreed(self, comm: MPI.Comm) -> bool:
-        """Whether any rank of ``comm`` got a request; all must call it."""
+        """Return whether any rank of ``comm`` got a request; all must call it."""
         return bool(comm.allreduce(self.requested, MPI.LOR))
 
     def check(self, comm: MPI.Comm) -> None:
@@ -254,36 +232,15 @@ class StopRequest:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Let a request raise EndedError where the work is: within the block nothing has to be saved."""
-        # A verb that has nothing to save at all may hold such a block within its own.
-        outside = self._ends_at_once
-        self._ends_at_once = True
-        hooks = sys.excepthook, sys.unraisablehook
-        alarm = signal.getsignal(signal.SIGALRM)
-        try:
-            if self.requested:
-                raise EndedError
-            yield
-        except Exception:
-            # A library that is left halfway may raise an error of its own as it is left.
-            if self.requested:
-                raise EndedError from None
-            raise
-        finally:
-            self._ends_at_once = outside
-            if self.requested:
-                signal.alarm(0)
-                signal.signal(signal.SIGALRM, alarm)
-                sys.excepthook, sys.unraisablehook = hooks
+        """Let a request end the process within the block, in which nothing has to be saved: files are whole or absent.
 
-    def _leave(self) -> NoReturn:
-        """Raise EndedError where the work is; end the process if the exception does not get out of the work in time."""
-        # A destructor swallows the exception, and Python reports it to one of these hooks, or an error that the
-        # destructor itself raises (h5py's do). Neither tells the user anything after a request to stop.
-        sys.excepthook = sys.unraisablehook = _say_nothing
-        signal.signal(signal.SIGALRM, end_now)
-        signal.alarm(self._GRACE)
-        raise EndedError
+        A process that is not ``listening``, such as a user's script, keeps its own handlers of signals.
+        """
+        if not self._is_listening:
+            yield
+            return
+        with _handled_by(end_now):
+            yield
 
     @contextmanager
     def listening(self) -> Iterator[Self]:
@@ -291,24 +248,29 @@ class StopRequest:
 
         def receive(number: int, frame: FrameType | None) -> None:
             self.requested = True
-            # ``timeout`` sends its signal twice: the second, if it comes at once, is no wish to end the process.
-            signal.pthread_sigmask(signal.SIG_BLOCK, earlier)
-            signal.sigtimedwait(earlier, 0.1)
-            for number in earlier:
-                signal.signal(number, signal.SIG_DFL)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
+            # `timeout` sends its signal twice: the second, if it comes at once, is not a wish to end the process.
+            time.sleep(0.1)
+            for number in STOP_SIGNALS:
+                if signal.getsignal(number) == receive:
+                    signal.signal(number, signal.SIG_DFL)
 
-            if self._ends_at_once:
-                self._leave()
+        with _handled_by(receive):
+            self._is_listening = True
+            try:
+                yield self
+            finally:
+                self._is_listening = False
 
-        # All handlers are known before the first one is replaced: a signal may come between two replacements, and
-        # ``receive`` needs them. A signal that nohup has set to be ignored stays ignored.
-        handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-        earlier = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
-        for number in earlier:
-            signal.signal(number, receive)
-        try:
-            yield self
-        finally:
-            for number, handler in earlier.items():
-                signal.signal(number, handler)
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Have ``handler`` called for requests to stop within the block, but for signals that nohup has set aside."""
+    handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    earlier = {number: former for number, former in handlers.items() if former != signal.SIG_IGN}
+    for number in earlier:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, former in earlier.items():
+            signal.signal(number, former)

@@ -1,14 +1,10 @@
 """The process itself: its rank and requests to stop before MPI is started, its log, the time that it compiles."""
 
-import atexit
-import gc
 import logging
 import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -16,15 +12,6 @@ logger = logging.getLogger(__name__)
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 # What launchers tell a process of its rank: Open MPI's, those with PMI (MPICH, Intel MPI, Slurm's), Slurm's own.
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
-# Settings of Open MPI for a process that runs alone: no daemon is started for it, and no network is looked for.
-ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
-# Settings of Open MPI for ranks on one machine: their messages go through its memory, and no network is looked for,
-# which takes a fifth of a second (MPI starts in .08 s instead of .29 s).
-ONE_MACHINE = {"OMPI_MCA_pml": "ob1"}
-
-# Objects that may hold others, allocated between two searches for garbage. With Python's own 700 the searches take a
-# tenth of a run's time.
-ALLOCATIONS = 10_000
 
 
 def cache_folder() -> Path:
@@ -43,45 +30,6 @@ def launched_rank() -> int | None:
         if rank.isdigit():
             return int(rank)
     return None
-
-
-def all_on_this_machine() -> bool:
-    """Whether this process was launched by Open MPI as one of several, all of which are on this machine."""
-    size = os.environ.get("OMPI_COMM_WORLD_SIZE")
-    return size is not None and os.environ.get("OMPI_COMM_WORLD_LOCAL_SIZE") == size
-
-
-@contextmanager
-def quick_start() -> Iterator[None]:
-    """Let MPI start within the block without looking for a network, in .1 s instead of .5 s, if it needs none.
-
-    It needs none if this process is alone, or all ranks are on one machine. Variables that the environment already has
-    stay as they are.
-    """
-    wanted: dict[str, str] = {}
-    if launched_rank() is None:
-        wanted = ALONE
-    elif all_on_this_machine():
-        wanted = ONE_MACHINE
-    added = {name: value for name, value in wanted.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        # Not for processes that this one starts: one may be an mpirun, whose ranks need a network.
-        for name in added:
-            del os.environ[name]
-
-
-def collect_seldom() -> None:
-    """Look for cyclic garbage less often than Python does by itself.
-
-    Most objects are those of libraries, which stay; arrays and records are freed without a search. When the process
-    ends it looks for none: all memory is free then, and a search would take a twentieth of a run's time.
-    """
-    gc.set_threshold(ALLOCATIONS)
-    # Python's searches at the end leave out what is frozen.
-    atexit.register(gc.freeze)
 
 
 def end_on_request() -> None:

@@ -73,23 +73,3 @@ def test_figures_load_neither_kernels_nor_mpi():
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "matplotlib" in loaded
     assert not {"numba", "mpi4py", "petsc4py"} & {*loaded}
-
-
-# PETSc takes a name that begins with a dash for an option.
-SEARCHES = """
-import gc, sys
-from vipetsc.__main__ import main
-sys.argv[0] = "vipetsc"
-begun = []
-gc.callbacks.append(lambda phase, about: begun.append(phase))
-try:
-    main(["--version"])
-finally:
-    print(len(begun), gc.isenabled())
-"""
-
-
-def test_modules_are_loaded_without_a_search_for_garbage():
-    """Until the verb is called nothing looks for garbage; then Python does again."""
-    ended = subprocess.run([sys.executable, "-c", SEARCHES], capture_output=True, text=True, check=True)
-    assert ended.stdout.splitlines()[-1] == "0 True"

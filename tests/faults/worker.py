@@ -41,7 +41,6 @@ from tests.faults.scenarios import (
 )
 from vipetsc.cli.main import main as vipetsc
 from vipetsc.parallel import install_abort_hook, on_root
-from vipetsc.process import collect_seldom
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
 Task = dict[str, Any]
@@ -247,7 +246,6 @@ def tasks(comm: MPI.Comm) -> Iterator[Task]:
 
 def main() -> int:
     """Do tasks until there are no more."""
-    collect_seldom()
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
     install_abort_hook()

@@ -16,7 +16,7 @@ from vipetsc.cli.streams import report_unwritten
 from vipetsc.cli.verb import BAD_INPUT, FAILED, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
-from vipetsc.parallel import EndedError, StoppedError, StopRequest, StudyError, all_meet, on_root
+from vipetsc.parallel import StoppedError, StopRequest, StudyError, all_meet, on_root
 from vipetsc.register import PartError
 
 # s within which all ranks that were stopped must meet. If one of them was killed they never do, and the launcher kills
@@ -89,12 +89,6 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     except StudyError as error:
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return FAILED
-    except EndedError:
-        # Other ranks may be in a collective call, and would wait for this one for ever.
-        if MPI.COMM_WORLD.size > 1:
-            MPI.COMM_WORLD.Abort(STOPPED)
-        echo(MPI.COMM_WORLD, "vipetsc: stopped on request", sys.stderr)
-        return STOPPED
     except StoppedError as error:
         # A launcher also asks the other ranks to stop when one was killed. Then they do not all meet, and no message
         # claims that somebody asked for it.
