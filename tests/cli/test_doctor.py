@@ -71,12 +71,34 @@ def test_a_package_that_is_too_old(version_of, name, version, remedy):
 def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of):
     """One package is too old and one is missing: both are named in the last line, and the exit code is 2."""
     version_of("xarray", "2024.9.0")
-    version_of("cma", None)
+    version_of("tqdm", None)
     ended = in_process("doctor")
     assert ended.returncode == 2
     assert "2024.9.0; FAULT: too old" in ended.stdout
     assert "FAULT: missing" in ended.stdout
-    assert ended.stdout.endswith("the program cannot run here: cma, xarray on rank 0\n")
+    assert ended.stdout.endswith("the program cannot run here: tqdm, xarray on rank 0\n")
+
+
+@pytest.mark.parametrize(
+    ("package", "command"),
+    [
+        ("cma", ("optimise", ROOT / "vipetsc/examples/optimise-clearances.toml")),
+        ("pymoo", ("optimise", ROOT / "vipetsc/examples/optimise-gate.toml")),
+        ("jinja2", ("paper", "--quick")),
+        ("shtab", ("completion", "bash")),
+    ],
+)
+def test_a_package_that_one_verb_needs_is_no_fault(in_process, version_of, tmp_path, package, command):
+    """Without it that verb ends with one sentence, before it writes anything; ``doctor`` has a note."""
+    version_of(package, None)
+    assert check_package(NAMED[package]).note and not check_package(NAMED[package]).fault
+
+    out = ("--out", tmp_path / "out") if command[0] != "completion" else ()
+    ended = in_process(*command, *out)
+    assert ended.returncode == 2
+    assert f"pip install '{package}>=" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_package_that_was_built_for_another_numpy(tmp_path, monkeypatch):
@@ -159,8 +181,11 @@ def test_what_the_program_can_do_without_is_no_fault(monkeypatch):
 def test_the_oldest_versions_are_those_of_the_package():
     """The oldest versions that the doctor takes are the bounds of pyproject.toml, which lists them for pip."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = {line.split(",")[0] for line in project["dependencies"]}
-    assert {f"{package.name}>={package.oldest}" for package in PACKAGES} == wanted
+    extras = project["optional-dependencies"]
+    for verb in ("", "optimise", "paper", "completion"):
+        lines = extras[verb] if verb else project["dependencies"]
+        wanted = {line.split(",")[0] for line in lines}
+        assert {f"{package.name}>={package.oldest}" for package in PACKAGES if package.verb == verb} == wanted
 
 
 def test_a_library_that_does_not_load_is_named():

@@ -13,6 +13,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import CaseError
+from vipetsc.io.extras import OLDEST
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py"
 # Environment variables in which Open MPI, MPICH and their relatives write the number of processes.
@@ -25,13 +26,15 @@ REFERENCE_BLAS = "blas"  # the name of the folder in which Debian has it
 class Package(NamedTuple):
     """A Python package: its name for pip, the ``oldest`` version that works, the newest one that was ``tried``.
 
-    ``module`` is the name by which it is imported, if that is another.
+    ``module`` is the name by which it is imported, if that is another; ``verb`` the only verb that needs it,
+    if there is one.
     """
 
     name: str
     oldest: str
     tried: str
     module: str = ""
+    verb: str = ""
 
 
 # The oldest are those of pyproject.toml. All tests have passed with the newest.
@@ -41,17 +44,16 @@ PACKAGES = (
     Package("numpy", "1.24", "2.4"),
     Package("scipy", "1.10", "1.17"),
     Package("matplotlib", "3.6", "3.11"),
-    Package("jinja2", "3.1", "3.1"),
     Package("numba", "0.63", "0.68"),
     Package("pillow", "9", "13", module="PIL"),
     Package("pydantic", "2.9", "2.14"),
     Package("tqdm", "4.66", "4.70"),
     Package("tomli-w", "1.0", "1.2", module="tomli_w"),
     Package("xarray", "2024.10", "2026.9"),
-    Package("h5netcdf", "1.3", "1.8"),
-    Package("cma", "4.0", "4.5"),
-    Package("pymoo", "0.6.2", "0.6.2"),
-    Package("shtab", "1.7", "1.13"),
+    Package("cma", OLDEST["cma"], "4.5", verb="optimise"),
+    Package("pymoo", OLDEST["pymoo"], "0.6.2", verb="optimise"),
+    Package("jinja2", OLDEST["jinja2"], "3.1", verb="paper"),
+    Package("shtab", OLDEST["shtab"], "1.13", verb="completion"),
 )
 
 
@@ -86,7 +88,18 @@ def checks(comm: MPI.Comm) -> list[Check]:
 
 
 def check_package(package: Package) -> Check:
-    """Check that a package loads, and that its version is one that the program works with."""
+    """Check that a package loads, and that its version is one that the program works with.
+
+    What is wrong with a package that one verb alone needs is a note.
+    """
+    check = _check_package(package)
+    if package.verb and check.fault:
+        return check._replace(fault="", note=f"`{package.verb}` cannot run: {check.fault}")
+    return check
+
+
+def _check_package(package: Package) -> Check:
+    """Check a package as if every verb needed it."""
     if package.name in BUILT_FOR_MPI:
         remedy = "install it from the distribution, a module or conda, or by scripts/recipes/pip (chapter install)"
     else:

@@ -12,7 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from vipetsc.io.atomic import write_text
@@ -50,6 +49,9 @@ class ReportContents(NamedTuple):
 
 def write_report(path: Path, contents: ReportContents) -> None:
     """Write the page to ``path``, whole or not at all; pictures that have not changed are taken from the page there."""
+    # Imported here: no other verb needs it.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     # Data URIs of the pictures that are encoded already, by the hash of the picture's file.
     encoded: dict[str, str] = {}
     if path.exists():

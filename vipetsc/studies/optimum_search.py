@@ -19,6 +19,7 @@ import xarray as xr
 
 from vipetsc.case import LawCase
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.io.extras import require
 from vipetsc.io.folder import OPTIMUM
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
@@ -47,6 +48,7 @@ def run_search(
     it raises, is in ``Study.run``.
     """
     OptimiseCase.expect(plan, "run_search")
+    require("pymoo" if len(plan.options.objective) == 2 else "cma", "optimise")
     return STUDY.run(plan, folder, comm, **how)
 
 

@@ -9,6 +9,7 @@ from mpi4py import MPI
 from vipetsc.cli.arguments import argument, output_folder
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, FAILED, PlainVerb
+from vipetsc.io.extras import require
 from vipetsc.io.folder import PAPER
 from vipetsc.parallel import StopRequest, on_root
 
@@ -27,6 +28,7 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE
 
+    require("jinja2", "paper")
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
     for note in result.notes:
         echo(comm, f"vipetsc: {note}", sys.stderr)

@@ -12,6 +12,7 @@ from vipetsc.cli.arguments import argument
 from vipetsc.cli.chapters import chapter, contents, parts, plain, studies
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.extras import require
 from vipetsc.parallel import StopRequest, on_root
 
 
@@ -53,6 +54,7 @@ def schema_of(path: str | None) -> dict[str, Any]:
 
 def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Print a script by which the shell completes verbs, options and files."""
+    require("shtab", "completion")
     import shtab
 
     # Kinds of completion by the names and flags of arguments, the same for all verbs.
