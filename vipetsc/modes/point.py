@@ -6,10 +6,11 @@ import numpy as np
 
 from vipetsc.modes.problem import Solution
 
-# A motion counts as unstable if a Floquet multiplier has a larger modulus: if it grows by more than 1 % in a period.
-# Multipliers of stable motions, of modulus 1, come out with the errors of the methods. Files have the threshold beside
-# the numbers.
-UNSTABLE_BEYOND = 1.01
+# A motion counts as unstable if a perturbation grows faster than the first number times its frequency in rad/s: by more
+# than 1 % in a period, or a Floquet multiplier with a modulus beyond the second number. Multipliers of stable motions,
+# of modulus 1, come out with the errors of the methods. Files have the threshold beside the numbers.
+LEAST_GROWTH = 1.6e-3
+UNSTABLE_BEYOND = float(np.exp(2 * np.pi * LEAST_GROWTH))
 
 # Quantities of a point: name in the files, type, unit, description.
 QUANTITIES: dict[str, tuple[str, type, str, str]] = {

@@ -44,7 +44,7 @@ from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.balance.high_orders import KeptOrders, highest_in_contact, kept_orders
 from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one
 from vipetsc.modes.balance.shifted_compliance import Compliance
-from vipetsc.modes.point import UNSTABLE_BEYOND
+from vipetsc.modes.point import LEAST_GROWTH
 from vipetsc.modes.problem import NoMotionError
 
 # Growth rate over Om up to which a motion counts as stable: 0.06 % a period.
@@ -52,7 +52,7 @@ LEAST = 1e-4
 # The same for a finite system without damping, 1 % a period, as for all normal modes. D has poles at the exponents of
 # the linear modes, which lie at Re lambda = -decay Om or below. The line Re lambda = const on which D is followed keeps
 # this distance from them.
-LEAST_OF_FINITE = np.log(UNSTABLE_BEYOND) / (2 * np.pi)
+LEAST_OF_FINITE = LEAST_GROWTH
 # Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow. In
 # the tests of stability a tenth fewer determinants are taken with them than without.
 LINES = (0.1, 0.02)
