@@ -55,7 +55,7 @@ def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
         # Intervals are symmetric in the coordinates of the fit, which are logarithms of positive quantities.
         expected = [p.to_coordinate(value) for p, value in zip(plan.parameters, truth, strict=True)]
-        inside.append(np.abs(z - expected) < quantile(0.9) * uncertainty.errors)
+        inside.append(np.abs(z - expected) < quantile(0.9, windows.noise_freedom(z)) * uncertainty.errors)
         errors.append(z - expected)
     size = 100 * np.sqrt(np.mean(np.square(errors), axis=0))
     each = " ".join(f"{100 * value:.0f}" for value in np.mean(inside, axis=0))

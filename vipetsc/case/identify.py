@@ -38,7 +38,7 @@ DASHPOTS = ("dashpot", "grounding")
 MOST_MASSES = 200
 """Masses of a lattice whose initial state is estimated, at most.
 
-Each has two unknowns, by which the motion is differentiated: 400 columns of 400 numbers, 1.3 MB a stage of a step.
+Each has two unknowns, and a derivative by an unknown takes two runs: 800 runs for each step of a fit.
 """
 
 
