@@ -92,10 +92,9 @@ masses: ``step_choice`` compares the two.
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
 of them count, and how far. ``groups``: contact DoFs and their groups. ``step_choice``: the length of a step.
 ``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
-tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep. ``kinks``:
-where a contact opens or closes without a change of modes. ``advance``: substeps up to a change of modes. ``forces``:
-changes up to the step's end. ``engine``: steps up to the sample. ``tangent`` and ``tangent_kernels``: variations.
-``orbit_tape``: contacts of an orbit.
+tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
+``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
+sample. ``tangent`` and ``tangent_kernels``: variations. ``orbit_tape``: contacts of an orbit.
 
 References
 ----------

@@ -6,7 +6,8 @@ substep so that it ends there, since the force law inside a substep must be smoo
 a shorter one. ``advance_cluster`` returns at each change, where its caller ``forces.follow_contacts`` switches the
 site, and at the end of the step. While no site is closed, no drive is on and there is no nonlinear spring, the motion
 is a polynomial and the cluster goes to its first onset at once (sec. 2). Contacts that touch or are pressed at rest,
-of mode ``PERMANENT``, change no mode; substeps end where they open or close, too (``kinks``).
+of mode ``PERMANENT``, change no mode; substeps end where they open or close, too, on a *kink* of
+their force, but without a landing: a kink that lies a little inside the end hardly changes the force's integral.
 
 Positions and lengths are in units of the step H: a substep's ``length``, a cluster's ``position``. The ``position`` of
 a change is a fraction of the substep that was searched. 2 stands for none, since no position exceeds 1.
@@ -27,7 +28,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import ModeChange, extremes, first_change, stays_landed, switching
-from vipetsc.contact.law import CLOSED, begins_linearly, contact_force, gap_of, side_of
+from vipetsc.contact.law import CLOSED, PERMANENT, begins_linearly, contact_force, gap_of, side_of
 from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
@@ -37,7 +38,6 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.kinks import first_kink
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, select_active, write_on_tape
 from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shift
@@ -177,6 +177,22 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     return True
 
 
+@kernel
+def _first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
+    """Position, as a fraction of a substep tried, of the first kink; 2 if none or another change comes first."""
+    has_permanent = False
+    for i in trial.closed:
+        has_permanent |= abs(cluster.contacts[i].mode) == PERMANENT
+    if not has_permanent:
+        return 2.0
+    seconds = length * cluster.interval
+    contacts = cluster.contacts
+    first = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein, True)
+    if first.position <= 1.0 and abs(contacts[first.site].mode) == PERMANENT:
+        return first.position
+    return 2.0
+
+
 @inlined
 def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     """Repeat a substep just tried so that it ends where a permanent contact first opens or closes inside it.
@@ -187,7 +203,7 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     # The shorter substep has a slightly other motion, in which the kink may lie a little before its end: once or twice
     # is enough. A kink that remains inside after all attempts is left to the control of the error.
     for _ in range(MOST_ATTEMPTS):
-        fraction = first_kink(cluster, trial, substep.length)
+        fraction = _first_kink(cluster, trial, substep.length)
         if fraction > 1.0 or fraction * substep.length < SHORTEST:
             return substep
         substep = Substep(substep.kind, fraction * substep.length)
@@ -195,7 +211,7 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
             state.rejected += 1
             state.length = CUT * substep.length
             return Substep(substep.kind, -1.0)
-    if first_kink(cluster, trial, substep.length) <= 1.0:
+    if _first_kink(cluster, trial, substep.length) <= 1.0:
         state.missed += 1
     return substep
 

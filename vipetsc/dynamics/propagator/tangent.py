@@ -205,7 +205,7 @@ class TangentPropagator(Propagator):
             raise StalledError("a contact that dissipates is closed at the beginning")
 
         # Contacts that are pressed at rest keep the mode PERMANENT, closed or open: their force has a kink where they
-        # open and close, and substeps end there (``kinks``).
+        # open and close, and substeps end there (``advance``).
         sites["mode"] = np.where(is_pressed, sites["mode"], np.where(closed, side * CLOSED, FREE))
         # An open contact gets its velocity at its onset. Until then it is not read; 1 is what ``create_contacts`` sets.
         sites["approach"] = np.where(closed | is_pressed, side * speed, 1.0)

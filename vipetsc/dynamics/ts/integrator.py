@@ -53,6 +53,8 @@ FREE_STEP = 0.05
 STEP_PER_TIME = 0.25
 # A suggestion of so many times the step taken says that the step was cut short. Not sharp: from 2 on two steps change.
 CUT_SHORT = 4.0
+# The result of a search that is left out.
+NO_CHANGE = ModeChange(position=2.0, site=-1, function=0)
 # An outcome of a landing in addition to those of the search: its site rests.
 RESTS = -1
 
@@ -201,7 +203,7 @@ class Integrator(Engine):
         if count > 1:
             end = self.time + h
         self.observe(self.tracker.end, end)
-        change = ModeChange(2.0, 0, 0)
+        change = NO_CHANGE
         if not self._is_blind:
             with log.SEARCH:
                 change = self._first_change(h)
