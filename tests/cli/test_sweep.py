@@ -128,22 +128,6 @@ def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
         assert not (tmp_path / "bad").exists()
 
 
-def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
-    """A sweep of an earlier version is neither continued nor analysed; --force replaces it."""
-    out = tmp_path / "out"
-    changes = set_words("sweep.drive.amplitude=[0.3]", "sweep.contacts.sites=[1]")
-    assert in_process("sweep", case, "--out", out, *changes).returncode == 0
-    # Earlier versions kept runs without contact in this folder.
-    (out / "linear").mkdir()
-    for words in (("sweep", case, "--out", out, *changes), ("analyse", out)):
-        ended = in_process(*words)
-        assert ended.returncode == 2
-        assert "contains a sweep of an earlier version" in ended.stderr
-
-    assert in_process("sweep", case, "--out", out, *changes, "--force").returncode == 0
-    assert not (out / "linear").exists()
-
-
 @pytest.mark.mpirun
 def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
     """Members with a site outside the lattice are named and NaN in the ensemble; others are computed; the code is 1."""

@@ -115,7 +115,7 @@ def test_a_run_that_lacks_a_variable_is_refused(run, tmp_path, name):
 
 
 def test_other_files_are_refused(tmp_path, folder):
-    """A missing file, a file of another kind and results of an earlier version are refused with the reason."""
+    """A missing file and a file of another kind are refused with the reason."""
     with pytest.raises(OSError):
         open_run(tmp_path / "absent.h5")
 
@@ -126,11 +126,6 @@ def test_other_files_are_refused(tmp_path, folder):
         file["time"] = 1.0
     with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it lacks status, case"):
         open_ensemble(tmp_path)
-
-    # Sweeps once kept their contact-free runs in a folder of this name.
-    (folder / "linear").mkdir()
-    with pytest.raises(ValueError, match="contains a sweep of an earlier version"):
-        open_ensemble(folder)
 
 
 @pytest.mark.filterwarnings("error")

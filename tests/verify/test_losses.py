@@ -10,6 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
+from vipetsc.modes.response.free_motions import resonance
 
 from tests.models import TWO_MASS_CELL
 from tests.rigs import TWO_MASSES
@@ -23,7 +24,6 @@ from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.response.free_motions import resonance
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import sample_orbit

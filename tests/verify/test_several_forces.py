@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vipetsc.modes.response.swept import _sweep
 
 from tests.conftest import with_sections
 from tests.rigs import OUTPUT, TWO_MASSES, after_a_period
@@ -16,7 +17,6 @@ from vipetsc.modes.response.condensation import driven_points
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
-from vipetsc.modes.response.swept import _sweep
 
 FORCE = {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1}
 # A negative amplitude acts in antiphase.

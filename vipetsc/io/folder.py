@@ -33,7 +33,6 @@ from vipetsc.parallel import on_root
 from vipetsc.process import say
 from vipetsc.sources import source_key
 
-FORMAT_VERSION = 1
 MOST_NAMED = 6  # keys of another case that a message names: more do not help to tell which case it is
 # The file in NAME.old by which it is known as a folder of earlier results, and not one of the user's.
 REPLACED = ".replaced"
@@ -291,7 +290,6 @@ def origin() -> dict[str, Any]:
     given = " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items()))
 
     return {
-        "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
         "revision": revision(),
         "source": source_key(),

@@ -116,12 +116,9 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
 
     A dimension is named after the first key of its axis; further keys of a zipped axis are coordinates over it. The
     variable ``number`` counts the members from 0, the attribute ``folder`` is the path of the sweep's. Raises OSError
-    if ``ensemble.h5`` cannot be read, ValueError if it is no ensemble, or the sweep is of an earlier version.
+    if ``ensemble.h5`` cannot be read, ValueError if it is no ensemble.
     """
     folder = Path(folder)
-    reason = outdated(folder)
-    if reason:
-        raise ValueError(reason)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
         # All values at once: they are small, and the file is closed here.
         data = file.assign_attrs(folder=str(folder)).load()
@@ -148,14 +145,6 @@ def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
             if path in first:
                 means[name] = first[path].assign_attrs(ensemble[name].attrs)
     return first.assign(means)
-
-
-def outdated(folder: Path) -> str:
-    """Message that the sweep in ``folder`` is of an earlier version, which made a folder for every member; or empty."""
-    if not (folder / "linear").is_dir():
-        return ""
-    remedy = "repeat the sweep with --force, or in another folder with --out"
-    return f"{folder}: contains a sweep of an earlier version, with a folder for each member; {remedy}"
 
 
 def select(data: Selectable, **wanted: Any) -> Selectable:

@@ -24,7 +24,7 @@ from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import open_ensemble, outdated
+from vipetsc.io.read import open_ensemble
 from vipetsc.modes.branches.follow import claim_branches
 from vipetsc.modes.branches.follower import Follower
 from vipetsc.modes.system import System
@@ -164,8 +164,6 @@ class PaperStep:
         if not (folder / "case.toml").exists():
             return MISSING
         if not self._is_case_of(folder):
-            return STALE
-        if outdated(folder):
             return STALE
         if all(map(self._is_complete, self.results(root))):
             return DONE

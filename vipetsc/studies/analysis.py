@@ -33,7 +33,6 @@ from vipetsc.studies.modal_measures import MODAL, modal_energies
 from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
-FORMAT_VERSION = 3
 # Intervals, at most, between the samples that are transformed by wavelets. In two runs of 300 cells with 4421 samples
 # mean entropies from 500 differ by 0.004 bit at most from those of all samples, from 125 by up to 0.015. 500 take 0.2 s
 # of CPU, and all samples nine times as many transforms.
@@ -113,7 +112,6 @@ def analyse(
         case = Case.of(run)
     options = options or case.analysis or AnalysisTable.model_validate({})
     about = {
-        "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
         "source": source_key(),
         "case": run.attrs["case"],

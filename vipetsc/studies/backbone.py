@@ -29,7 +29,6 @@ from vipetsc.sources import source_key
 from vipetsc.spectra import power_law
 from vipetsc.studies.linear_run import factor, first_site_cell, is_proportional, read_linear
 
-FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
 VIBRO_IMPACT = 3  # number of the region III
 LEAST_FITTED = 3  # points of a fit; which fits are called power laws `vipetsc.spectra.doubt` decides
@@ -219,7 +218,6 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
             related[name] = relation.assign_attrs(number=number)
 
     about: dict[str, Any] = origin() | {
-        "format_version": FORMAT_VERSION,
         "case": ensemble.attrs["case"],
         "left_out": left_out,
         "sources": _sources(folder, branches),

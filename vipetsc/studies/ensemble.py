@@ -23,7 +23,6 @@ from vipetsc.studies.linear_run import FITTED, LINEAR, MEASURES, MEMBER, MEMBERS
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
-FORMAT_VERSION = 3
 # Members of a curve, and points from its peak on, for which a power law is fitted: two lie on one of any kind.
 LEAST_FITTED = 3
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
@@ -210,7 +209,7 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
 
     positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]
-    about = origin() | {"format_version": FORMAT_VERSION}
+    about = origin()
     # Sorted, since the file must not depend on the order in which members were simulated.
     about |= {name: sorted(values) for name, values in results.used.items()}
     about |= {

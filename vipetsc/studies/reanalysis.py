@@ -17,7 +17,7 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.read import open_run, outdated
+from vipetsc.io.read import open_run
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.spectra.measures import is_measure
@@ -97,9 +97,6 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
     """The runs in ``path`` that can be measured, all checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
     sweep = (folder / "index.json").exists()
-    reason = outdated(folder)
-    if reason:
-        raise FolderError(reason)
     if not sweep and not (folder / "run.h5").exists():
         raise FolderError(f"{path}: contains no run.h5; give the folder of a finished run or sweep")
 

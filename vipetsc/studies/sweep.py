@@ -22,12 +22,12 @@ import numpy as np
 from vipetsc.case import Case, CaseError, Problem, Sweep
 from vipetsc.case.html import html_table
 from vipetsc.io.atomic import discard, write_text
-from vipetsc.io.folder import SWEEP, FolderError, claimed
-from vipetsc.io.read import open_ensemble, outdated
+from vipetsc.io.folder import SWEEP, claimed
+from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.progress import say
 from vipetsc.sources import source_key
-from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
+from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import MEMBERS, LinearRun, first_site_cell, linear_name
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.study import is_whole
@@ -117,10 +117,6 @@ def run_sweep(
     if folder is None:
         return _in_memory(plan, comm, stop, progress)
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
-        reason = on_root(comm, lambda: outdated(claim.folder))
-        if reason:
-            raise FolderError(reason)
-
         result = _make_all(plan, claim.folder, comm, stop or StopRequest(), progress)
         if not result.resumable:
             claim.publish()
@@ -311,7 +307,6 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
 
     count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
     index = {
-        "format_version": FORMAT_VERSION,
         "source": source_key(),
         "sweep": plan.name,
         "members": count,

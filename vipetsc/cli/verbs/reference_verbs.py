@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import argument
-from vipetsc.cli.chapters import chapter, contents, parts, plain, studies
+from vipetsc.cli.chapters import chapter, contents, parts, studies
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.extras import require
@@ -17,17 +17,17 @@ from vipetsc.parallel import StopRequest, on_root
 
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print a chapter of the manual as plain text, or a list of them; raises CaseError for an unknown topic."""
+    """Print a chapter of the manual in Markdown, or a list of them; raises CaseError for an unknown topic."""
     if options.topic is None:
         echo(comm, on_root(comm, contents))
-        echo(comm, "vipetsc manual TOPIC prints one")
+        echo(comm, "vipetsc manual TOPIC prints one in Markdown; in a clone, scripts/manual makes pages for a browser")
         return DONE
 
     names = on_root(comm, lambda: [*itertools.chain(*parts().values()), *studies()])
     if options.topic not in names:
         listed = ", ".join(sorted(names))
         raise CaseError([Problem("TOPIC", options.topic, f"no such chapter; the chapters are {listed}")], "manual")
-    echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
+    echo(comm, on_root(comm, lambda: chapter(options.topic)))
     return DONE
 
 

@@ -11,7 +11,6 @@ from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import SWEEP, FolderError
-from vipetsc.io.read import outdated
 from vipetsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -85,8 +84,6 @@ def relate_to_branches(folders: Sequence[Path]) -> None:
 
     # All folders are checked before a file is written into one of them.
     for folder in folders:
-        if reason := outdated(folder):
-            raise FolderError(reason)
         if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
             raise FolderError(f"{folder}: contains neither a finished sweep nor branches")
     relate_folders(folders)
