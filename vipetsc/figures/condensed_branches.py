@@ -149,7 +149,7 @@ def _draw_over_cells(axes: Axes, branch: xr.Dataset) -> None:
 def _draw_over_masses(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the displacement of every mass at phase 0, over the largest of all."""
     displacement = np.abs(branch["states/displacement"].values)[:, 0]
-    _draw_shapes(axes, branch["states/dof"].values, displacement, branch)
+    _draw_shapes(axes, branch["states/mass"].values, displacement, branch)
     axes.set(xlabel="mass", ylabel="displacement / maximum", ylim=(SMALLEST, 3))
     axes.legend(fontsize=5.5)
 
