@@ -420,7 +420,7 @@ def test_samples_of_bands_are_those_of_the_bands():
 @pytest.mark.parametrize("numbers", [0, 1, 2, 3])
 @pytest.mark.parametrize("words", [0, 1, 2])
 def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path):
-    """Every page is saved as a picture and as numbers, and names of pages contain every key."""
+    """Every page is saved in both formats, and names of pages contain every key."""
     axes = [AMPLITUDES, CLEARANCES, THREE][:numbers] + [LAWS, SITES][:words]
     if not axes:
         return
@@ -430,7 +430,7 @@ def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path
     for stem, axis in product(stems, axes):
         assert all(path in stem for path in axis)
     figure = next(measure_pages(ensemble, "bands/share")).draw()
-    for suffix in ("png", "json"):
+    for suffix in ("png", "pdf"):
         assert save(figure, tmp_path / f"page.{suffix}").stat().st_size > 100
 
 

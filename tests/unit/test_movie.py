@@ -197,7 +197,7 @@ def test_a_gif_holds_every_frame_for_its_time(clear, stage):
             image.seek(k)
             lasts += image.info["duration"]
             frame = np.asarray(image.convert("RGB"), int)
-            # A GIF has 255 colours: the mean deviation is below one step of 256.
+            # A frame of a GIF has 256 colours: the mean deviation is below one step of 256.
             assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k
     # Durations are in ms, and a GIF counts in units of 10 ms.
     assert lasts == round(1000 * count / 3, -1)
@@ -224,7 +224,8 @@ def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monke
 
     frames = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 180, 320, 4)
     assert len(frames) == len(stage.content.time)
-    assert np.array_equal(frames[3], stage.frame(3))
+    # Drawn as a whole, edges of lines may differ from those of a frame on top of the background.
+    assert np.abs(frames[3].astype(int) - stage.frame(3)).mean() < 0.2
 
     before = path.stat()
     program.write_text('#!/bin/sh\nfor last; do :; done\necho half > "$last"\necho no such codec >&2\nexit 1\n')

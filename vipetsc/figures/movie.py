@@ -1,23 +1,25 @@
-"""Movies of one run: frames over a background that is drawn once, written by Pillow (GIF) and ffmpeg (MP4)."""
+"""Movies of one run: frames over a background that is drawn once, written by Pillow (GIF) or ffmpeg (MP4)."""
 
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 import xarray as xr
+from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from PIL import Image
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
+from vipetsc.figures.layout import lay_out
 from vipetsc.figures.movie_frames import WIDTH, MovieFrames
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
@@ -25,11 +27,8 @@ from vipetsc.lattice import UnitCell, bloch
 SHAPE = 9 / 16  # height over width, that of screens
 INCHES = 8.0  # width of the page for which the sizes of type are chosen
 DECADES = 4  # decades of energy that are shown: each then has half an inch of the panel
-# Opacity of an impact's light below which it is not drawn: it could not be seen, and would change pixels that a GIF has
-# to store.
-FAINTEST = 0.05
+FAINTEST = 0.05  # opacity of an impact's light below which it is not drawn: it could not be seen
 LARGEST = 60.0  # area in square points of the dot of the wave with the most energy
-UNCHANGED = 255  # the last colour of the 256 of a GIF, for pixels that stay as they are from frame to frame
 REMEDY = "an MP4 needs ffmpeg: apt-get install --no-install-recommends ffmpeg, or pip install imageio-ffmpeg"
 
 
@@ -62,6 +61,7 @@ class MovieFigure:
         height = round(width * SHAPE / 2) * 2
         figure = style.new_figure(INCHES, height * INCHES / width)
         figure.set_dpi(width / INCHES)
+        self.figure = figure
         ratios = {"width_ratios": (1.6, 1), "height_ratios": (1.4, 1)}
         axes = figure.subplot_mosaic([["wave", "waves"], ["energy", "waves"]], **ratios)
 
@@ -72,8 +72,7 @@ class MovieFigure:
 
         # Laid out and drawn once without what moves: a frame is this picture with the moving artists on top.
         self._canvas = FigureCanvasAgg(figure)
-        figure.get_layout_engine().execute(figure)
-        figure.set_layout_engine("none")
+        lay_out(figure)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
@@ -148,8 +147,8 @@ class MovieFigure:
         axes.set(xlim=self.content.time[[0, -1]], ylim=(0, 1.08 * top), xlabel="Time (s)", ylabel="Energy (J)")
         axes.legend(loc="lower left", ncols=6, bbox_to_anchor=(0, 1.0))
 
-    def frame(self, k: int) -> np.ndarray:
-        """Return frame ``k`` as (row, column, RGBA) bytes, valid until the next one is drawn."""
+    def show(self, k: int) -> None:
+        """Let the moving artists show frame ``k``."""
         content = self.content
         now = content.time[k]
         for line, values in zip(self._wave, content.wave[k], strict=True):
@@ -171,6 +170,9 @@ class MovieFigure:
             energy_now = np.interp(now, curve.time, curve.energy)
             line.set_data(np.append(curve.time[past], now), np.append(curve.energy[past], energy_now))
 
+    def frame(self, k: int) -> np.ndarray:
+        """Return frame ``k`` as (row, column, RGBA) bytes, valid until the next one is drawn."""
+        self.show(k)
         self._canvas.restore_region(self._background)
         for axes, artist in self._moving:
             axes.draw_artist(artist)
@@ -205,77 +207,36 @@ def write_movie(movie: MovieFigure, rate: float, paths: Sequence[Path]) -> list[
 
 
 def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
-    """Write a GIF that repeats, with one palette for all frames.
+    """Write a GIF that repeats.
 
-    Pixels that do not change from one frame to the next are transparent, which makes the file several times smaller.
+    Pillow takes one frame after the other; matplotlib's PillowWriter keeps all of them in memory, 2 MB each.
     """
     count = len(movie.content.time)
-    palette = _palette(movie)
-
-    def images() -> Iterator[Image.Image]:
-        # No pixel has this index, so that all pixels of the first frame are stored.
-        before: Any = -1
-        for k in range(count):
-            frame = Image.fromarray(movie.frame(k)[..., :3])
-            index = np.asarray(frame.quantize(palette=palette, dither=Image.Dither.NONE))
-            image = Image.fromarray(np.where(index == before, UNCHANGED, index).astype(np.uint8))
-            image.putpalette(palette.getpalette())
-            before = index
-            yield image
-
     # The format counts hundredths of a second. The ends of the frames are rounded, not their lengths, so that errors do
     # not add up.
     ends = np.rint(np.arange(count + 1) * 100 / rate)
     durations = [10 * int(length) for length in np.diff(ends)]
-    following = images()
-    first = next(following)
-    first.save(
-        path,
-        "GIF",
-        save_all=True,
-        append_images=following,
-        duration=durations,
-        loop=0,
-        transparency=UNCHANGED,
-        disposal=1,
-        optimize=False,
-    )
-
-
-def _palette(movie: MovieFigure) -> Image.Image:
-    """Return an image with the colours of four frames, one fewer than a GIF may have."""
-    count = len(movie.content.time)
-    chosen = np.linspace(0, count - 1, 4).astype(int)
-    frames = np.concatenate([movie.frame(k)[..., :3].copy() for k in chosen])
-    palette = Image.fromarray(frames).quantize(UNCHANGED, dither=Image.Dither.NONE)
-    # White comes out as a grey near 252: what is nearly white becomes white.
-    colours = np.reshape(palette.getpalette(), (-1, 3))
-    colours[colours.min(axis=1) > 247] = 255
-    palette.putpalette(colours.ravel().tolist())
-    return palette
+    images = (Image.fromarray(movie.frame(k)[..., :3].copy()) for k in range(count))
+    first = next(images)
+    first.save(path, "GIF", save_all=True, append_images=images, duration=durations, loop=0)
 
 
 def _write_mp4(movie: MovieFigure, rate: float, path: Path) -> None:
-    """Write an MP4 that browsers play, by ffmpeg, which reads the frames from its standard input."""
+    """Write an MP4 that browsers play, by matplotlib's writer, which sends the frames to ffmpeg."""
     command = ffmpeg()
     if command is None:
         raise FileNotFoundError(REMEDY)
-    height, width = movie.frame(0).shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
-    target = ["-an", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
-
-    with ExitStack() as stack:
-        # Messages of ffmpeg go to a file: a pipe that nobody reads would fill up and stop it.
-        messages = stack.enter_context(tempfile.TemporaryFile())
-        call = [command, "-y", "-loglevel", "error", *source, *target]
-        process = stack.enter_context(subprocess.Popen(call, stdin=subprocess.PIPE, stderr=messages))
-        assert process.stdin is not None
-        # If ffmpeg ends early, its messages say why.
-        with suppress(BrokenPipeError):
+    # The name of the file does not end with the format's.
+    arguments = ["-an", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"]
+    writer = FFMpegWriter(fps=rate, extra_args=arguments)
+    try:
+        with ExitStack() as stack:
+            stack.enter_context(mpl.rc_context({"animation.ffmpeg_path": command}))
+            stack.enter_context(writer.saving(movie.figure, str(path), movie.figure.dpi))
             for k in range(len(movie.content.time)):
-                process.stdin.write(movie.frame(k).data)
-            process.stdin.close()
-        if process.wait():
-            messages.seek(0)
-            reason = messages.read().decode(errors="replace").strip()[-300:]
-            raise OSError(f"{command}: {reason}")
+                movie.show(k)
+                writer.grab_frame()
+    # The writer's last call tells why ffmpeg has ended, perhaps while it was sent a frame.
+    except subprocess.CalledProcessError as error:
+        reason = str(error.stderr).strip()[-300:]
+        raise OSError(f"{command}: {reason}") from None
