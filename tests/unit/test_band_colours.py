@@ -89,7 +89,7 @@ def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
     """Energies as large as the work and as small as the axes show lie below the legends, all along the axes."""
     with style.rc_style():
         figure = prediction(level)
-        style.save(figure, tmp_path / "prediction.json")
+        style.save(figure, tmp_path / "prediction.png")
     boxes = [(axes, axes.get_legend().get_window_extent()) for axes in figure.get_axes() if axes.get_legend()]
     assert len(boxes) == 3
     for axes, box in boxes:

@@ -531,5 +531,5 @@ def test_pages_can_be_read(tmp_path):
     ):
         for drawing in measure_pages(ensemble_of(*axes), "ibtet"):
             figure = drawing.draw()
-            save(figure, tmp_path / "page.json")
+            save(figure, tmp_path / "page.png")
             assert complaints(figure) == []
