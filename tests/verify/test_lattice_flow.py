@@ -362,5 +362,5 @@ def test_contacts_that_touch_at_rest_are_refused():
 def test_a_lattice_shorter_than_the_reach_of_a_step_is_refused():
     chain = Chain(four_band("calibrated"), 2, "fixed", (1,), (CLEARANCE,))
     flow = LatticeFlow(chain, [Stops.both(four_band_contact(), CLEARANCE)], MPI.COMM_SELF)
-    with pytest.raises(FlowError, match="2 cells are fewer"):
+    with pytest.raises(FlowError, match="the lattice has 2 cells, fewer"):
         flow.arc(np.zeros((2 * DOFS, 2)), PERIOD)

@@ -251,7 +251,7 @@ def test_tolerance_keeps_its_promise():
 @pytest.mark.parametrize(
     ("sections", "reason"),
     [
-        ({"lattice": {"cells": 2}, "contacts": {"sites": [1, 2]}}, "2 cells are fewer"),
+        ({"lattice": {"cells": 2}, "contacts": {"sites": [1, 2]}}, "the lattice has 2 cells, fewer"),
         ({"lattice": {"cells": 40}, "contacts": {"sites": list(range(3, 39))}}, "36 sites between cells 3 and 38"),
         ({"drive": {"frequency": 1e6}}, "is too long for 1.1667e+06 rad/s, of the drive or the lattice"),
     ],
