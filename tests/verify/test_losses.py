@@ -10,7 +10,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
-from vipetsc.modes.response.free_motions import resonance
 
 from tests.models import TWO_MASS_CELL
 from tests.rigs import TWO_MASSES
@@ -24,6 +23,8 @@ from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.problem import unit
+from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import sample_orbit
@@ -278,8 +279,18 @@ def test_the_force_holds_a_steady_state_in_quadrature(damping):
     nfrc = {"source": "force", "over": "amplitude", "range": [1e-3, 1.0], "harmonics": 63}
     forced = NfrcCase.from_table(TWO_MASSES | {"lattice": lattice, "drive": drive, "nfrc": nfrc})
     states = SteadyStates(forced, 1.0, 2 * np.pi / motion.period)
-    # The free motion is the guess, at its own frequency.
-    xi = resonance(states, method.motions.balance(motion.order).unpack(motion.x))
+    # The free motion, a quarter of a period later, is the guess, at its own frequency; its phase is kept, and the
+    # amplitude of the force is sought.
+    free = method.motions.balance(motion.order).unpack(motion.x)[:, : states.balance.order + 1]
+    orders = np.arange(states.balance.order + 1)
+    behind = np.zeros((len(free), len(orders)), complex)
+    behind[:, : free.shape[1]] = free
+    behind *= np.exp(-0.5j * np.pi * orders)
+    row = np.append(unit(states.balance.pack(-1j * orders * behind)), 0.0)
+    guess = np.append(states.balance.pack(behind) / states.clearance, 1.0)
+    attempt = SteadyFrame(states, guess, row).solve(guess, row, float(row @ guess))
+    assert attempt.converged
+    xi = attempt.xi * np.sign(attempt.xi[-1])
 
     # The branch's force is of first order in the damping, so that its error is proportional to the damping.
     assert xi[-1] * states.parameter.scale == pytest.approx(motion.force, rel=damping)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vipetsc.modes.response.swept import _sweep
 
 from tests.conftest import with_sections
 from tests.rigs import OUTPUT, TWO_MASSES, after_a_period
@@ -96,20 +95,6 @@ def test_states_with_contact_repeat_themselves_in_time(drives):
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
     # The error is that of the harmonics that are left out.
     assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()
-
-
-def test_sweeps_in_time_that_look_for_isolated_curves_have_all_drives():
-    """Sweeps in time that look for isolated curves have a chirp for each drive, at its place and with its amplitude."""
-    run = _sweep(states_of(rig(LEFT, BEYOND)), 4, 1)
-    assert run.drive.end == "left"
-    assert run.drive.amplitude == 0.1
-    [other] = run.drive.more
-    assert (other.cell, other.amplitude, other.waveform) == (2, pytest.approx(-0.6), "chirp")
-    assert (other.frequency, other.bandwidth, other.duration) == (
-        run.drive.frequency,
-        run.drive.bandwidth,
-        run.drive.duration,
-    )
 
 
 @pytest.mark.parametrize(
