@@ -1,44 +1,53 @@
-"""Compiled kernels, stored between runs until their sources change: ``njit`` and ``cfunc`` as in numba."""
+"""Numba's decorators as the package uses them: with its cache, which is cleared when a source of the package changes.
 
+Numba's cache checks only the file of a function: one that calls a changed function of another file would keep the old
+code. Each folder of the cache therefore has a note of the sources from which its code was compiled. Where one of these
+has changed, the code is removed and compiled anew: nothing old piles up. Numba chooses the folders: beside the sources,
+in the user's cache where these cannot be written, or in NUMBA_CACHE_DIR.
+"""
+
+import hashlib
+import logging
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
-from llvmlite.binding import parse_assembly
-from numba.core import event
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.runtime import rtsys
 
-from vipetsc.kernel import EntryCompiler, Kernel
-from vipetsc.kernel_cache import ByContent, can_keep, kernel_cache, remove_oldest
-from vipetsc.process import compiling, launched_rank, say
+from vipetsc.process import launched_rank, say
 
+logger = logging.getLogger(__name__)
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-PARENTS: set[Path] = set()  # folders in which kernels are stored
+PACKAGE = Path(__file__).parent
+NOTE = "vipetsc-sources.txt"  # in each folder of the cache
+# Parts of the package with kernels, from the top down: each uses kernels and constants of those below it.
+ROOMS = ("modes", "dynamics", "contact", "spectra", "lattice")
+SHARED = ("compiled.py", "records.py", "register.py")
 
 
 @overload
-def njit(function: Function, /) -> Function: ...
+def kernel(function: Function, /) -> Function: ...
 @overload
-def njit(*signature: str, **options: Any) -> Callable[[Function], Function]: ...
-def njit(*signature: Any, **options: Any) -> Any:
-    """``numba.njit`` with a cache; without a signature, a ``Kernel`` that is compiled at the first call."""
-    if signature and callable(signature[0]):
-        return njit()(signature[0])
-    disjoint = options.pop("disjoint", False)
+def kernel(**options: Any) -> Callable[[Function], Function]: ...
+def kernel(function: Any = None, /, **options: Any) -> Any:
+    """Compile a function as ``numba.njit`` does, at its first call; a division by zero gives inf or NaN.
+
+    The code is kept between runs where files can be written.
+    """
     # No C code calls these functions: the wrapper that it would need is not compiled.
-    compile_entry = _decorator(numba.njit, *signature, no_cfunc_wrapper=True, pipeline_class=EntryCompiler, **options)
-    if signature:
-        return compile_entry
-    return lambda function: Kernel(function, compile_entry, options, disjoint)
+    decorate = _kept(numba.njit, error_model="numpy", no_cfunc_wrapper=True, **options)
+    if function is None:
+        return decorate
+    return decorate(function)
 
 
-def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.cfunc`` with a cache: a function that C code can call, at its ``address``."""
-    return _decorator(numba.cfunc, signature, **options)
+def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function as ``numba.cfunc`` does: C code calls it at its ``address``. The code is kept between runs."""
+    return _kept(numba.cfunc, signature)
 
 
 def users_function(function: Callable[..., Any]) -> Any:
@@ -57,114 +66,77 @@ def c_address(function: Callable[..., Any], signature: str) -> int:
 _CALLBACKS: list[Any] = []  # C functions in use: an address alone does not keep Python from freeing the function
 
 
-def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator: compiles functions by numba's ``compiler``, and keeps their code in the folder ``kernel_cache``.
-
-    That folder lies within NUMBA_CACHE_DIR, if the user has set it.
-    """
+def _kept(decorator: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator of functions by numba's ``decorator``, with its cache where that can be written."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        # Numba takes its folder from the configuration, which is changed for this function alone: functions of other
-        # packages keep their own cache.
-        config: Any = numba.config
-        chosen = config.CACHE_DIR
-        locators = config.CACHE_LOCATOR_CLASSES
-        file = Path(function.__code__.co_filename)
-        folder = kernel_cache(Path(__file__).parent, file, chosen)
-        PARENTS.add(folder.parent)
-        config.CACHE_DIR = str(folder)
-        config.CACHE_LOCATOR_CLASSES = f"{ByContent.__module__}.{ByContent.__name__}"
-
-        # Callbacks and kernels with a signature are compiled here, others at their first call.
-        if signature:
-            compiling.start()
-        keeps = can_keep(folder.parent)
+        # Numba chooses the folder when it decorates a function, and raises RuntimeError where it finds none. A function
+        # with a signature is compiled at once, but then the folder must be up to date.
         try:
-            compiled = compiler(*signature, cache=keeps, **options)(function)
-            if keeps and not signature:
-                compiled._cache = _KeptCode(function)
-            return compiled
-        finally:
-            if signature:
-                compiling.stop()
-            config.CACHE_DIR = chosen
-            config.CACHE_LOCATOR_CLASSES = locators
+            lazy = numba.njit(cache=True, **options)(function)
+        except RuntimeError:
+            _warn()
+            return decorator(*signature, **options)(function)
+        room = Path(function.__code__.co_filename).relative_to(PACKAGE).parts[0]
+        clear_if_changed(Path(lazy.stats.cache_path), room)
+        if decorator is numba.njit and not signature:
+            return lazy
+        return decorator(*signature, cache=True, **options)(function)
 
     return decorate
 
 
-class _MachineCode(CompileResultCacheImpl):
-    """What is stored of a function that Python calls: its machine code, without what numba stores for its callers."""
-
-    def reduce(self, cres: Any) -> Any:
-        """Numba's tuple for a function, without the code of LLVM, and with the environments that are used.
-
-        From the code of LLVM other kernels could link the function, and numba would read it at each start; kernels link
-        each other as ``Kernel`` says instead. Numba also stores an environment for every function that was linked into
-        this one, and would import the modules of all of them at each start. Few functions ever read theirs.
-        """
-        (name, kind, (machine_code, _)), description, *parts, environments = super().reduce(cres)
-        # Numba reads from the code of LLVM which functions there are. Python calls only the wrapper.
-        entry = parse_assembly(f'define void @"{description.llvm_cpython_wrapper_name}"() {{ ret void }}')
-
-        # Each environment is named where it is declared, and where it is read.
-        code = cres.library.get_llvm_str()
-        used = tuple(environment for environment in environments if code.count(environment.env_name) > 1)
-        return (name, kind, (machine_code, entry.as_bitcode())), description, *parts, used
+@cache
+def _warn() -> None:
+    """Warn once, on one rank, that nothing is kept."""
+    if not launched_rank():
+        logger.warning("vipetsc: compiling kernels at every start: no cache can be written; set NUMBA_CACHE_DIR")
 
 
-class _KeptCode(FunctionCache):
-    """Machine code of a function that is compiled at its first call."""
+@cache
+def sources(room: str) -> str:
+    """A hash of the names, sizes and times of all files from which the kernels of a ``room`` are compiled.
 
-    _impl_class = _MachineCode
+    These are its own and those of the rooms below it, among them tables of numbers: compiled code contains constants.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    folders = [PACKAGE]
+    if room in ROOMS:
+        folders += [PACKAGE / name for name in ROOMS[ROOMS.index(room) :]]
+    for folder in folders:
+        for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+            if entry.is_dir() and folder != PACKAGE and entry.name != "__pycache__":
+                folders.append(Path(entry.path))
+            elif entry.name in SHARED or (folder != PACKAGE and entry.name.endswith((".py", ".csv"))):
+                status = entry.stat()
+                digest.update(f"{entry.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The code for a signature, or None; numba would first prepare to compile, which takes longer than to load."""
-        # All that finished code needs: the functions by which it allocates.
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Store the code for a signature."""
-        super().save_overload(sig, data)
-        remove_oldest(Path(self.cache_path).parent)
+@cache
+def clear_if_changed(folder: Path, room: str) -> None:
+    """Remove the code in a ``folder`` of the cache that was compiled from other sources of a ``room``; once a process.
 
-
-class CompilerListener(event.Listener):
-    """Measures the time in which numba compiles functions that are not in the cache, and reports it once."""
-
-    def on_start(self, event: Any) -> None:
-        """Start the clock; functions that this one calls are compiled before it ends."""
-        compiling.start()
-        function = event.data["dispatcher"].py_func
-        # The time that is announced is that of this package's functions; numba compiles those of others too.
-        if function.__module__.split(".")[0] == __package__:
+    So is an empty file, which numba could not read: a machine that lost its power leaves such files.
+    """
+    note = folder / NOTE
+    # Other processes may do the same at the same time, and a folder of another user cannot be written.
+    with suppress(OSError):
+        is_current = note.exists() and note.read_text() == sources(room)
+        for code in folder.glob("*.nb[ci]"):
+            if not is_current or code.stat().st_size == 0:
+                code.unlink(missing_ok=True)
+        if not is_current:
+            note.write_text(sources(room))
             _announce()
-
-    def on_end(self, event: Any) -> None:
-        """Stop the clock."""
-        compiling.stop()
 
 
 @cache
 def _announce() -> None:
-    """Report once, on one rank, why the first run of a version takes some 20 s longer than the next."""
-    # Where kernels cannot be kept, a warning has said that they are compiled at every start.
-    if not launched_rank() and all(can_keep(parent) for parent in PARENTS):
-        say("vipetsc: compiling kernels (once, about 20 s)")
+    """Report once, on one rank, why the first run of a version takes longer than the next."""
+    if not launched_rank():
+        say("vipetsc: compiling kernels (once, about a minute)")
 
 
-event.register("numba:compile", CompilerListener())
-
-
-# For functions that make views of arrays, but no arrays. Without ``_nrt`` numba counts no references to arrays, which
-# would take longer than a short sum: each array of a tuple is counted at each access.
-kernel = njit(error_model="numpy", _nrt=False)
-# For loops over arrays of which none overlaps one that is written to. LLVM cannot see that, and would store each sum
-# before it reads the next number; if it is told so, it keeps sums in registers. Sums keep their order and their bits.
-disjoint = njit(error_model="numpy", _nrt=False, disjoint=True)
 # For short functions that numba puts in place of their calls, with the constants that are passed there.
-inlined = njit(error_model="numpy", _nrt=False, inline="always")
-# For functions that make arrays; functions of the other kinds may call them.
-allocating = njit(error_model="numpy", _nrt=True)
+inlined = kernel(inline="always")

@@ -1,10 +1,9 @@
-"""The process itself: its rank and requests to stop before MPI is started, its log, the time that it compiles."""
+"""The process itself: its rank and requests to stop before MPI is started, its log."""
 
 import logging
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 from types import FrameType
 
@@ -64,37 +63,3 @@ def say(text: str) -> None:
     elif logger.isEnabledFor(logging.WARNING):
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
-
-
-class CompileClock:
-    """Clock of the compiler: the ``seconds`` for which this process has compiled kernels so far.
-
-    Progress leaves this time out of its rates: kernels are compiled once, at their first calls.
-    """
-
-    def __init__(self) -> None:
-        self._depth = 0
-        self._begin = 0.0
-        self._seconds = 0.0
-
-    @property
-    def seconds(self) -> float:
-        """Time in s until now."""
-        if self._depth == 0:
-            return self._seconds
-        return self._seconds + time.monotonic() - self._begin
-
-    def start(self) -> None:
-        """Begin to compile a kernel; one that it calls may begin meanwhile."""
-        if self._depth == 0:
-            self._begin = time.monotonic()
-        self._depth += 1
-
-    def stop(self) -> None:
-        """End the compilation of the kernel that was begun last."""
-        if self._depth == 1:
-            self._seconds = self.seconds
-        self._depth -= 1
-
-
-compiling = CompileClock()

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from vipetsc.process import compiling, has_log, say
+from vipetsc.process import has_log, say
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -20,7 +20,7 @@ LAYOUT = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remai
 class Progress:
     """Progress of a run, on rank 0: a bar on a terminal or in a notebook, otherwise a line every five seconds.
 
-    Rates and times left are those of the work: the time in which kernels are compiled does not count. In a script
+    Rates and times left count from the first report on, before which kernels are loaded or compiled. In a script
     without a log the end is a line, too, so that work of a few seconds says something.
     """
 
@@ -28,9 +28,9 @@ class Progress:
         self._total = total
         self._unit = unit
         # Monotonic: a clock that is set back would silence the lines.
-        self._last = time.monotonic()
-        self._compiled = compiling.seconds
-        self._begin = self._last - self._compiled
+        self._start = time.monotonic()
+        self._last = self._start
+        self._begin: float | None = None
         self._first = 0.0
         self._done = 0.0
         self._show = show and comm.rank == 0
@@ -59,15 +59,16 @@ class Progress:
         """Report that ``done`` of the total is reached."""
         now = time.monotonic()
         self._done = done
+        if self._begin is None:
+            self._begin = now
+            self._first = done
         if self._bar is not None:
-            self._leave_out_compiling()
             self._bar.update(done - self._bar.n)
         elif self._show and now - self._last >= LINE_EVERY:
-            left = float("inf")
-            worked = self._worked()
-            if worked > 0 and done > self._first:
-                left = (self._total - done) * worked / (done - self._first)
-            say(f"{self._position()}, {left:.0f} s left")
+            left = ""
+            if done > self._first:
+                left = f", {(self._total - done) * (now - self._begin) / (done - self._first):.0f} s left"
+            say(f"{self._position()}{left}")
             self._last = now
 
     def close(self) -> None:
@@ -75,18 +76,7 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
         elif self._show and not has_log():
-            say(f"{self._position()} in {self._worked():.1f} s")
-
-    def _worked(self) -> float:
-        """Seconds since the beginning in which no kernel was compiled."""
-        return time.monotonic() - compiling.seconds - self._begin
-
-    def _leave_out_compiling(self) -> None:
-        """Move the times from which the bar counts, its start and its last print, by the time compiled since."""
-        compiled = compiling.seconds
-        self._bar.start_t += compiled - self._compiled
-        self._bar.last_print_t += compiled - self._compiled
-        self._compiled = compiled
+            say(f"{self._position()} in {time.monotonic() - self._start:.1f} s")
 
     def _position(self) -> str:
         """How much of the total is done."""

@@ -202,23 +202,17 @@ def test_a_library_that_does_not_load_is_named():
 
 
 def test_doctor_compiles_kernels_where_it_is_asked_to(in_process, monkeypatch):
-    """With --compile the last line has the time of compilation, or says that there was nothing to compile.
+    """With --compile the kernels are called; without it nothing is compiled."""
+    # The compilation takes minutes: a function that notes its calls replaces it.
+    calls = []
+    monkeypatch.setattr(first_calls, "compile_kernels", calls.append)
+    assert "kernels" not in in_process("doctor").stdout
+    assert calls == []
 
-    Without --compile nothing is compiled.
-    """
-    # The compilation takes minutes: a function that only returns its duration in s replaces it.
-    took = [83.0]
-    monkeypatch.setattr(first_calls, "compile_kernels", lambda comm: took[0])
     ended = in_process("doctor", "--compile")
     assert ended.returncode == 0
-    assert ended.stdout.splitlines()[-1] == "kernels of runs, modes and measures: compiled in 83 s"
-
-    took = [0.1]
-    assert (
-        in_process("doctor", "--compile").stdout.splitlines()[-1]
-        == "kernels of runs, modes and measures: already compiled"
-    )
-    assert "kernels" not in in_process("doctor").stdout
+    assert ended.stdout.splitlines()[-1].startswith("kernels of runs, modes and measures: compiled")
+    assert len(calls) == 1
 
 
 BOTH_ENGINES = """

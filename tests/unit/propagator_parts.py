@@ -17,6 +17,7 @@ from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_tape, create_trial
+from vipetsc.records import Record
 
 # The mass on a stop: its mass in kg, its velocity at the onset in m/s, and the stop's (k/m)^1/2 in rad/s.
 MASS = 0.02
@@ -43,7 +44,7 @@ def chain_parts(ends: str, interval: float, tolerance: float, sites: tuple[int, 
     return ChainParts(model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout))
 
 
-def mass_on_stop(damping: float = 0.0) -> Cluster:
+def mass_on_stop(damping: float = 0.0) -> Record:
     """Return a mass on a bilinear stop at w = 1 m: w - 1 = SPEED sin(RATE t)/RATE unless it is damped."""
     interval = 1e-4
     contact = small_case(contacts={"law": "bilinear"}).model().contact
@@ -54,7 +55,7 @@ def mass_on_stop(damping: float = 0.0) -> Cluster:
     contacts["damping"] = damping
     contacts["floor"] = 0.0
 
-    return Cluster(
+    cluster = Cluster(
         contacts=contacts,
         springs=np.zeros(0, SPRING_DOF),
         drives=create_drives((), []),
@@ -76,9 +77,10 @@ def mass_on_stop(damping: float = 0.0) -> Cluster:
         trial=create_trial(1, 1),
         tape=create_tape(0, 0),
     )
+    return Record(cluster)
 
 
-def mass_on_cubic_spring(cubic: float) -> Cluster:
+def mass_on_cubic_spring(cubic: float) -> Record:
     """Return the mass of ``mass_on_stop`` on a spring with the force ``cubic`` z^3 in N alone, and no stop."""
     cluster = mass_on_stop()
     springs = np.zeros(1, SPRING_DOF)
@@ -93,7 +95,7 @@ def mass_on_cubic_spring(cubic: float) -> Cluster:
     )
 
 
-def pressed_mass(gap: float, side: int = 1) -> Cluster:
+def pressed_mass(gap: float, side: int = 1) -> Record:
     """Return the mass of ``mass_on_stop`` at a permanent contact, whose stop is at w = ``gap`` in m on one ``side``."""
     cluster = mass_on_stop()
     cluster.contacts["mode"] = side * PERMANENT

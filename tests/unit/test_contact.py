@@ -21,8 +21,10 @@ from vipetsc.contact.law import (
     impact_time,
 )
 from vipetsc.contact.tracker import TRACKED, ImpactTracker
+from vipetsc.dynamics.lattice_record import empty_record
 from vipetsc.dynamics.ts.right_hand_side import CONTEXT, find_change
 from vipetsc.lattice import Contact
+from vipetsc.records import Record
 
 STIFFNESS = 3e5
 CLEARANCE = 2e-4
@@ -45,8 +47,8 @@ def closed_sites(contact: Contact, count: int, approach: float, mass: float = 1.
 def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, seconds: float) -> changes.ModeChange:
     """Return the first change of sites as an integrator finds it: by the address of a lattice, here of sites alone."""
     context = np.zeros(1, CONTEXT)
-    context["address"]["contacts"] = contacts.ctypes.data
-    context["length"]["contacts"] = contacts.size
+    lattice = Record(empty_record()._replace(contacts=contacts))
+    context["lattice"] = lattice.address
     place = np.full(2, -7)
     position = find_change(context.ctypes.data, start, end, seconds, place)
     return changes.ModeChange(position, *place)

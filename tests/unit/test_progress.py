@@ -1,4 +1,4 @@
-"""Progress in scripts and notebooks, without a log and a terminal, and the time of compiling that it leaves out."""
+"""Progress in scripts and notebooks, without a log and a terminal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from mpi4py import MPI
 import pytest
 
 from vipetsc import process
-from vipetsc.process import CompileClock, say
+from vipetsc import progress as progress_module
+from vipetsc.process import say
 from vipetsc.progress import Progress
 
 pytestmark = pytest.mark.parallel(1)
@@ -31,7 +32,7 @@ def written(monkeypatch, capsys) -> Callable[[], str]:
 def test_a_script_has_lines_and_an_end(written, monkeypatch):
     """Without a log, lines go to stderr every five seconds and at the end."""
     now = [0.0]
-    monkeypatch.setattr(process.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: now[0])
     progress = Progress(MPI.COMM_SELF, 20.0, "s")
     for second in range(1, 13):
         now[0] = float(second)
@@ -73,49 +74,19 @@ class Clock:
 
     def __init__(self, monkeypatch) -> None:
         self.now = 100.0
-        monkeypatch.setattr(process.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(progress_module.time, "monotonic", lambda: self.now)
 
 
-def test_the_compiler_is_timed_once_where_kernels_call_others(monkeypatch):
-    """The time of a kernel that is compiled within another is counted once, and the clock can be read meanwhile."""
-    clock = Clock(monkeypatch)
-    compiling = CompileClock()
-    compiling.start()
-    clock.now += 1.0
-    compiling.start()
-    clock.now += 2.0
-    assert compiling.seconds == 3.0
-    compiling.stop()
-    clock.now += 4.0
-    compiling.stop()
-    clock.now += 8.0
-    assert compiling.seconds == 7.0
-
-
-def test_the_time_left_is_that_of_the_work(written, monkeypatch):
-    """A minute in which kernels are compiled counts neither in the rate nor in the time at the end."""
+def test_the_time_left_counts_from_the_first_report(written, monkeypatch):
+    """A minute in which kernels are compiled does not count in the rate."""
     clock = Clock(monkeypatch)
     progress = Progress(MPI.COMM_SELF, 20.0, "s")
-    process.compiling.start()
     clock.now += 60.0
-    process.compiling.stop()
-    clock.now += 2.0
     progress.update(1.0)
+    clock.now += 8.0
+    progress.update(5.0)
     progress.close()
-    assert written().splitlines() == ["  5 %  1 of 20 s, 38 s left", "  5 %  1 of 20 s in 2.0 s"]
-
-
-def test_the_bar_leaves_it_out_as_well(written, monkeypatch):
-    """The clock of a bar leaves out the time of compiling, so that its rate is that of the work."""
-    monkeypatch.setitem(sys.modules, "ipykernel", object())
-    compiled = [0.0]
-    monkeypatch.setattr(CompileClock, "seconds", property(lambda clock: compiled[0]))
-    progress = Progress(MPI.COMM_SELF, 2.0, "runs")
-    begin = progress._bar.start_t
-    compiled[0] = 60.0
-    progress.update(1.0)
-    assert progress._bar.start_t == begin + 60.0
-    progress.close()
+    assert written().splitlines() == ["  5 %  1 of 20 s", " 25 %  5 of 20 s, 30 s left", " 25 %  5 of 20 s in 68.0 s"]
 
 
 def test_the_bar_of_a_resumed_run_begins_where_that_was_stopped(written, monkeypatch):

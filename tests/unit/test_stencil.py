@@ -11,8 +11,7 @@ from tests.unit.propagator_parts import chain_parts
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.vectors import LANES
+from vipetsc.dynamics.propagator.stencil import CHUNK, HaloRegions, apply_propagator, create_stencil, exchange
 
 
 def stencil_matrix(layout: Layout, series: StepSeries, halo: HaloRegions) -> np.ndarray:
@@ -56,7 +55,7 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
 
 # Numbers of cells for one and a half vectors of cells, for a last vector that overlaps the one before it, and for
 # single cells at both borders.
-@pytest.mark.parametrize("cells", [24, LANES + 12, 3 * LANES + 17])
+@pytest.mark.parametrize("cells", [24, CHUNK + 12])
 @pytest.mark.parametrize("name", ["diatomic", "three-mass", "four-band"])
 def test_every_cell_is_the_same_sum_to_the_last_bit(name, cells):
     """Every cell of a ring gets the sum of the interior stencil in the same order, in vectors of cells or alone."""

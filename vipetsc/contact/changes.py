@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import allocating, kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -253,7 +253,7 @@ def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, 
     return side_of(contacts[i].mode) * force
 
 
-@allocating
+@kernel
 def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     return _extremes(contacts, i, start, end, h, np.empty((4, 6)))
@@ -306,7 +306,7 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
     return Extremes(indentation=deepest - gap_of(contacts[i], side), force=largest, smallest_force=smallest)
 
 
-@njit(error_model="numpy")
+@kernel
 def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
     """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
 

@@ -167,8 +167,7 @@ def resting_side(site: Any) -> int:
 @kernel
 def _registered(function: int, law: Any, x: float) -> float:
     """The value of a registered law's ``function``, an address, at the indentation x in m."""
-    # ``call_address`` is an intrinsic of the compiler, which hands it its first argument itself: mypy counts one more.
-    return call_address(function, x, law.stiffness, law.first, law.second, law.third, law.fourth)  # type: ignore[call-arg]
+    return call_address(function, x, law.stiffness, law.first, law.second, law.third, law.fourth)
 
 
 @kernel

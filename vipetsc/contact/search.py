@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import allocating, kernel
+from vipetsc.compiled import kernel
 
 # An interval of this length, as a fraction of the step, that may still hold a root counts as one: it holds two roots
 # near each other, or the polynomial comes as near to zero as its rounding. It is a thousand roundings of a position.
@@ -106,7 +106,7 @@ def _count_changes(c: np.ndarray) -> int:
     return changes
 
 
-@allocating
+@kernel
 def first_upcrossing(b: np.ndarray) -> float:
     """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 
@@ -163,7 +163,7 @@ def _search(b: np.ndarray, stack: np.ndarray, room: np.ndarray) -> float:
     return 2.0
 
 
-@allocating
+@kernel
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 

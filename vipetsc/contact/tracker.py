@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import allocating, kernel
+from vipetsc.compiled import kernel
 from vipetsc.contact.changes import (
     LANDED_G,
     LANDED_W,
@@ -78,7 +78,7 @@ def in_episode(mode: int) -> bool:
     return mode != FREE and abs(mode) != RESTING
 
 
-@allocating
+@kernel
 def with_room(tracks: Tracks) -> Tracks:
     """``tracks`` with room in the log for an episode of every site."""
     used = tracks.closed[0]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.lattice.drive import PIECE, Drive, Pieces
 
 # Fraction of a time, and of a step, within which a piece that begins has begun.
@@ -152,7 +152,7 @@ def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
     return 0.5 * force * force / stiffness - force * u
 
 
-@njit(error_model="numpy")
+@kernel
 def drive_forces(drives: Drives, times: np.ndarray) -> np.ndarray:
     """Forces (drive, t) in N of all drives at the ``times`` (t,) in s."""
     forces = np.zeros((drives.rows.size, times.size))

@@ -15,7 +15,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
@@ -139,7 +139,7 @@ def _contact_energy(site: Any, w: float) -> float:
     return energy
 
 
-@njit(error_model="numpy")
+@kernel
 def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray) -> None:
     """Put kinetic, spring, contact energy and losses of contacts and dashpots into ``sums`` (5, 2): see ``_add``."""
     shape = lattice.shape
@@ -165,7 +165,7 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray
         _add(sums, _DAMPING, y[shape.damping : shape.damping + shape.cells], unit)
 
 
-@njit(error_model="numpy")
+@kernel
 def add_powers(y: np.ndarray, lattice: LatticeRecord, seconds: float, unit: float, sums: np.ndarray) -> None:
     """Add what the dashpots would dissipate in so many ``seconds`` at their present power, to ``sums`` (5, 2)."""
     room = np.empty(min(CHUNK, lattice.shape.cells))

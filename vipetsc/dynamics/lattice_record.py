@@ -1,16 +1,19 @@
 """A rank's part of the lattice for compiled kernels: sizes, and tables of masses, springs, sites and drives."""
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, get_type_hints
 
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.contact.law import SITE
+from vipetsc.dynamics.drives import DRIVE, Drives, create_drives
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.site_dofs import create_site_dofs, site_records
+from vipetsc.dynamics.site_dofs import SITE_DOFS, create_site_dofs, site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
 from vipetsc.lattice import Chain
+from vipetsc.lattice.drive import PIECE
+from vipetsc.records import Record, record_type
 
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
@@ -79,10 +82,7 @@ class LatticeRecord(NamedTuple):
     damping: np.ndarray
 
 
-COEFFICIENTS = LatticeRecord._fields[-4:]
-
-
-def create_record(model: Model, layout: Layout) -> LatticeRecord:
+def create_record(model: Model, layout: Layout) -> Record:
     """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
     chain = model.chain
     cell = chain.cell
@@ -99,7 +99,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
     inverse_masses, grounding, stiffness, damping = _coefficients(chain, layout)
     nonlinear, laws = _nonlinear_couplings(chain, layout)
-    return LatticeRecord(
+    lattice = LatticeRecord(
         shape=shape,
         masses=np.array(masses, MASS),
         couplings=np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
@@ -114,6 +114,31 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         stiffness=stiffness,
         damping=damping,
     )
+    return Record(lattice)
+
+
+def empty_record() -> LatticeRecord:
+    """A record of no cells."""
+    none = np.zeros(0)
+    return LatticeRecord(
+        shape=Shape(**{name: kind() for name, kind in get_type_hints(Shape).items()}),
+        masses=np.zeros(0, MASS),
+        couplings=np.zeros(0, COUPLING),
+        springs=np.zeros(0, SPRING),
+        site_dofs=np.zeros(0, SITE_DOFS),
+        contacts=np.zeros(0, SITE),
+        drives=Drives(np.zeros(0, DRIVE), np.zeros(0, PIECE)),
+        nonlinear=np.zeros(0, NONLINEAR),
+        spring_laws=np.zeros(0, SPRING_LAW),
+        inverse_masses=none,
+        grounding=none,
+        stiffness=none,
+        damping=none,
+    )
+
+
+LATTICE = record_type(empty_record())
+"""The type of all lattices in compiled code, which PETSc's callbacks must know before there is a lattice."""
 
 
 def _create_shape(chain: Chain, layout: Layout) -> Shape:
@@ -175,7 +200,7 @@ def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.n
 
 
 def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays ``COEFFICIENTS`` of a rank's cells."""
+    """The last four arrays of ``LatticeRecord`` of a rank's cells."""
     if chain.linearised().is_uniform() and not layout.damped:
         none = np.zeros(0)
         return none, none, none, none

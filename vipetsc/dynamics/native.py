@@ -1,60 +1,57 @@
 """Functions of PETSc for compiled code, which has no petsc4py; handles and pointers are int64."""
 
-import ctypes
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
-from llvmlite import binding
-from numba.core.types import Array, ExternalFunction, int32, int64
+import numba
+from numba import types
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array, populate_array
 
+from vipetsc.compiled import inlined
 from vipetsc.dynamics.petsc_library import petsc_library
 
 # PETSc's values of the InsertMode and of the ScatterMode with which cells are exchanged.
 INSERT_VALUES = 1
 FORWARD = 0
 
-external: Any = ExternalFunction
+function: Any = types.ExternalFunction
+word = types.int64
+error = types.int32
 # f(Vec, PetscScalar **), and f(Vec, PetscInt *) for the size.
-get_read, restore_read, get_write, restore_write, local_size = _vectors = [
-    external(f"Vec{name}", int32(int64, int64))
-    for name in ("GetArrayRead", "RestoreArrayRead", "GetArrayWrite", "RestoreArrayWrite", "GetLocalSize")
-]
+get_read = function("VecGetArrayRead", error(word, word))
+restore_read = function("VecRestoreArrayRead", error(word, word))
+get_write = function("VecGetArrayWrite", error(word, word))
+restore_write = function("VecRestoreArrayWrite", error(word, word))
+local_size = function("VecGetLocalSize", error(word, word))
 # f(Vec, InsertMode, ScatterMode).
-ghosts_begin, ghosts_end = _ghosts = [
-    external(f"VecGhostUpdate{part}", int32(int64, int32, int32)) for part in ("Begin", "End")
-]
+ghosts_begin = function("VecGhostUpdateBegin", error(word, types.int32, types.int32))
+ghosts_end = function("VecGhostUpdateEnd", error(word, types.int32, types.int32))
 # f(VecScatter, Vec, Vec, InsertMode, ScatterMode).
-scatter_begin, scatter_end = _scatters = [
-    external(f"VecScatter{part}", int32(int64, int64, int64, int32, int32)) for part in ("Begin", "End")
-]
+scatter_begin = function("VecScatterBegin", error(word, word, word, types.int32, types.int32))
+scatter_end = function("VecScatterEnd", error(word, word, word, types.int32, types.int32))
 
 
-@cache
 def bind_symbols() -> None:
     """Let compiled code be linked to these functions, as it must even where it calls none of them.
 
     Raises AttributeError where PETSc hides its symbols.
     """
-    for function in (*_vectors, *_ghosts, *_scatters):
-        address = ctypes.cast(getattr(petsc_library(), function.symbol), ctypes.c_void_p).value
-        binding.add_symbol(function.symbol, address)
+    library = petsc_library()
+    for name in ("VecGetArrayRead", "VecGhostUpdateBegin", "VecScatterBegin"):
+        getattr(library, name)
 
 
-def _array_at(typing_context: Any, address: Any, length: Any, dtype: Any) -> tuple[Any, Callable]:
-    """The array (length,) of a ``dtype`` at an int64 address; numba's carray is compiled anew for each dtype."""
-    kind = Array(dtype.dtype, 1, "C")
+@intrinsic
+def _pointer(typing_context: Any, address: Any, dtype: Any) -> Any:
+    """The int64 ``address`` as a pointer to elements of a ``dtype``."""
+    kind = types.CPointer(dtype.dtype)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        size = context.get_constant(int64, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
-        array = make_array(kind)(context, builder)
-        data = builder.inttoptr(arguments[0], array.data.type)
-        populate_array(array, data=data, shape=[arguments[1]], strides=[size], itemsize=size, meminfo=None)
-        return array._getvalue()
+        return builder.inttoptr(arguments[0], context.get_value_type(kind))
 
-    return kind(int64, int64, dtype), generate
+    return kind(types.int64, dtype), generate
 
 
-array_at: Any = intrinsic(_array_at)
+@inlined
+def array_at(address: int, length: int, dtype: Any) -> Any:
+    """The array (length,) of a ``dtype`` at an int64 address."""
+    return numba.carray(_pointer(address, dtype), (length,))  # type: ignore[call-arg]

@@ -20,6 +20,6 @@ def refused_scalars(scalar: Any = PETSc.ScalarType) -> str | None:
 
 
 def petsc_library() -> ctypes.CDLL:
-    """The PETSc library to which petsc4py is linked."""
+    """The PETSc library to which petsc4py is linked; compiled code, too, finds its functions once this was called."""
     # The handle of the extension module also finds PETSc's symbols; a library found by name might be another PETSc.
-    return ctypes.CDLL(PETSc.__file__)
+    return ctypes.CDLL(PETSc.__file__, mode=ctypes.RTLD_GLOBAL)

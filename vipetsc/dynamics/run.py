@@ -32,14 +32,10 @@ from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
-from vipetsc.process import compiling
 
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Propagator, Integrator)}
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
-# Seconds of the compiler's clock from which on a run reports them. The clock also runs while a stored kernel is loaded,
-# which takes less.
-NOTICED = 1.0
 # How a run ends.
 COMPLETE = "complete"
 STOPPED = "stopped"
@@ -54,11 +50,10 @@ class Failure(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """Readings in s, when a run begins, of the wall's clock, of this process's CPU time, of the compiler's clock."""
+    """Readings in s, when a run begins, of the wall's clock, and of this process's CPU time."""
 
     wall: float
     cpu: float
-    compiled: float
 
 
 def simulate(
@@ -169,7 +164,7 @@ class Simulation:
         output.begin(self.case.to_toml())
         checkpoints = output.last_state()
 
-        begin = Begin(wall=time.perf_counter(), cpu=time.process_time(), compiled=compiling.seconds)
+        begin = Begin(wall=time.perf_counter(), cpu=time.process_time())
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
             kind = ENGINES[self.engine.name]
@@ -341,9 +336,6 @@ class Run:
         wall = time.perf_counter() - begin.wall
         cpu = comm.allreduce(time.process_time() - begin.cpu)
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
-        compiled = compiling.seconds - begin.compiled
-        if compiled > NOTICED:
-            statistics["compile_seconds"] = round(compiled, 3)
 
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 states counts

@@ -7,7 +7,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
 from vipetsc.dynamics.drives import wall_energy
 from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, add_loss, add_powers, measure
@@ -48,7 +48,7 @@ class Samples(NamedTuple):
         return -(-(self.number + samples) // self.stride) + -self.number // self.stride
 
 
-@njit(error_model="numpy")
+@kernel
 def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
     """Store the rank's part ``y`` (component,) of the state, ghosts up to date, as sample ``k``; whether it is finite.
 

@@ -6,10 +6,9 @@ passes the kernels of users' forms to its assemblers likewise.
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
@@ -17,7 +16,8 @@ from vipetsc.compiled import c_address, kernel, users_function
 from vipetsc.register import MOST_PARAMETERS, LawPart
 
 # Of x, the stiffness k and four parameters: one for all laws, so that a kernel calls any of them.
-SIGNATURE = "float64(float64, float64, float64, float64, float64, float64)"
+SIGNATURE = types.float64(*[types.float64] * 6)
+_FUNCTION = types.ExternalFunctionPointer(SIGNATURE, get_pointer=None)
 
 
 class CompiledLaw(NamedTuple):
@@ -66,21 +66,24 @@ def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: n
 
 
 @intrinsic
-def call_address(typing_context, address, x, k, a, b, c, d):  # type: ignore[no-untyped-def]
-    """Call the C function of ``SIGNATURE`` at an ``address``."""
-    signature = types.float64(types.int64, *[types.float64] * 6)
+def _function_at(typing_context, address):  # type: ignore[no-untyped-def]
+    """The C function of ``SIGNATURE`` at an ``address``, for compiled code to call."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        double = ir.DoubleType()
-        function = ir.FunctionType(double, [double] * 6)
-        pointer = builder.inttoptr(arguments[0], function.as_pointer())
-        return builder.call(pointer, arguments[1:])
+        return builder.inttoptr(arguments[0], context.get_value_type(_FUNCTION))
 
-    return signature, generate
+    return _FUNCTION(types.int64), generate
+
+
+@kernel
+def call_address(address: int, x: float, k: float, a: float, b: float, c: float, d: float) -> float:
+    """Call the C function of ``SIGNATURE`` at an ``address``."""
+    function: Any = _function_at(address)  # type: ignore[call-arg]
+    return function(x, k, a, b, c, d)
 
 
 @kernel
 def _fill(address: int, numbers: np.ndarray, x: np.ndarray, values: np.ndarray) -> None:
     """Set ``values`` to those of the function at an ``address``; ``numbers`` are k and the parameters."""
     for i in range(x.size):
-        values[i] = call_address(address, x[i], numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])  # type: ignore[call-arg]
+        values[i] = call_address(address, x[i], numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])

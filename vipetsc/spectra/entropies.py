@@ -25,7 +25,7 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
 # The number of wavenumbers at which wavelets are taken, and their centre wavenumber. The paper states neither. An
@@ -255,7 +255,7 @@ def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray)
                     filtered[k] = product
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
     """Add the sums of Eq. (a) over the nodes of ``x`` (t, kappa, cell), of S and of S log2 S, to arrays (t, cell).
 
@@ -290,7 +290,7 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
                 s_log_s[t, c] += power[c] * (e + 1.4426950408889634 * (2.0 * u + u * z * r))
 
 
-@njit
+@kernel
 def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> None:
     """Write H of Eq. (a) to ``local`` (t, cell), at least 0, from the sums ``weight`` and ``s_log_s`` (t, cell).
 

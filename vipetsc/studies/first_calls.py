@@ -14,7 +14,6 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.dynamics.run import simulate
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import on_every_rank
-from vipetsc.process import compiling
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.identification import run_identification
 
@@ -58,8 +57,8 @@ IDENTIFIED: dict[str, Any] = {
 }
 
 
-def compile_kernels(comm: MPI.Comm) -> float:
-    """Compile the kernels of runs, branches and fits that are not kept yet; returns the seconds of the slowest rank.
+def compile_kernels(comm: MPI.Comm) -> None:
+    """Compile the kernels of runs, branches and fits that are not kept yet.
 
     The calls are divided over the ranks. Two ranks that need a kernel at the same time compile it twice: those of the
     propagator's steps, which take longer than all others, are needed by runs and by breathers, and one rank has both.
@@ -69,15 +68,13 @@ def compile_kernels(comm: MPI.Comm) -> float:
         [partial(run, "propagator"), partial(follow, BREATHER)],
         [partial(follow, CELL), partial(run, "ts"), identify, find_fonts],
     ]
-    before = compiling.seconds
 
-    def call_own() -> float:
+    def call_own() -> None:
         for part in parts[comm.rank :: comm.size]:
             for call in part:
                 call()
-        return compiling.seconds - before
 
-    return max(comm.allgather(on_every_rank(comm, call_own)))
+    on_every_rank(comm, call_own)
 
 
 def run(engine: str) -> None:

@@ -215,8 +215,6 @@ def run_table(result: "Result", faster: str = "") -> str:
     if note := numbers.get("engine_note"):
         engine = f"{numbers['engine']}: {note}"
     time = f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"
-    if compiled := numbers.get("compile_seconds"):
-        time += f"; {compiled:.1f} s of this for compiling kernels, once"
 
     rows = [
         ("energy", energy),

@@ -43,11 +43,12 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import allocating, disjoint, kernel
+from vipetsc.compiled import kernel
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
+from vipetsc.records import Record
 
 # The tables' clearances are the sites' times 1 less this. A site whose bound sum |a_k| on |w| is below the clearance is
 # not searched at all. ``first_onset`` takes an approach to 1e-10 of the clearance for an onset, and the sum is rounded:
@@ -108,7 +109,7 @@ def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: La
     return Groups(groups.numbers[np.repeat(selected, sizes)], np.append(0, np.cumsum(sizes[selected])))
 
 
-def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> DofTables:
+def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> Record:
     """Create the tables of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
     numbers = groups.numbers
     all_dofs = contact_dofs(model)
@@ -140,7 +141,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
     leftmost_cells = dofs["cell"] - series.reach
-    return DofTables(
+    tables = DofTables(
         column=halo.add(leftmost_cells, series.width),
         owned=_owned_cells(leftmost_cells, series.width, layout),
         table=table,
@@ -153,6 +154,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
         first=groups.first,
         ledger=ledger,
     )
+    return Record(tables)
 
 
 def _owned_cells(leftmost: np.ndarray, count: int, layout: Layout) -> np.ndarray:
@@ -183,7 +185,7 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
     return rows
 
 
-def create_responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
+def create_responses(groups: Groups, tables: Record, model: Model, series: StepSeries) -> np.ndarray:
     """Create the motion (dof, source, term) of each DoF after a unit impulse on each DoF of its cluster.
 
     It is the coefficients g_p in m/N of H times the displacement, by powers s^p: term m is that of p = 2 m + 1, or with
@@ -269,7 +271,7 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     return may_touch
 
 
-@disjoint
+@kernel
 def _add_powers(row: np.ndarray, u: float, v: float, series: np.ndarray) -> None:
     """Add ``row`` (term,) times ``u`` to the even coefficients of a ``series``, and times ``v`` to the odd ones."""
     for m in range(row.size):
@@ -277,7 +279,7 @@ def _add_powers(row: np.ndarray, u: float, v: float, series: np.ndarray) -> None
         series[2 * m + 1] += v * row[m]
 
 
-@allocating
+@kernel
 def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion as ``expand_free_motion`` does, in a lattice with dashpots."""
     _, rows, width, terms = dofs.rows.shape

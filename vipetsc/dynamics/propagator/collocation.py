@@ -46,7 +46,7 @@ Whether a function is a ``kernel`` or ``inlined``, put in place of its calls, ma
 import numpy as np
 from scipy.special import binom
 
-from vipetsc.compiled import disjoint, inlined, kernel
+from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
@@ -201,7 +201,7 @@ def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
             sums.reaches[target, source] = node_responses(cluster, substep, active[target], active[source], to_w, to_v)
 
 
-@disjoint
+@kernel
 def _add_responses(to_w: np.ndarray, to_v: np.ndarray, forces: np.ndarray, w: np.ndarray, v: np.ndarray) -> None:
     """Add to ``w`` and ``v`` (node,) what the ``forces`` (node k,) add by their responses (node k, node)."""
     for k in range(NODES):

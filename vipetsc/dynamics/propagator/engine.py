@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.drives import Drives
 from vipetsc.dynamics.engine import Engine, FillResult
@@ -28,6 +28,7 @@ from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.substeps import Cluster
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.parallel import StopRequest, on_every_rank
+from vipetsc.records import PartRecords, Record
 
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
 """Steps done and the last one to do. Of a failure: 2 n if the state after n steps is not finite, 2 n + 1 if a cluster
@@ -83,9 +84,16 @@ def _is_driven(dofs: DofTables, c: int, drives: Drives, begin: float) -> bool:
     return driven
 
 
-@njit(error_model="numpy")
+@kernel
 def take_steps(
-    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
+    states: States,
+    stencil: Stencil,
+    halo: Halo,
+    dofs: DofTables,
+    clusters: Cluster,
+    each: PartRecords,
+    tracks: Tracks,
+    samples: Samples,
 ) -> tuple[int, np.ndarray]:
     """Go on to the last step and take the ``samples`` on the way; returns PETSc's error code and the log of ``tracks``.
 
@@ -95,6 +103,7 @@ def take_steps(
     rows = halo.columns.shape[0]
     owned = states.owned
     progress = states.progress[0]
+    sites = tracks.sites
     error = 0
     while error == 0:
         steps = progress.steps
@@ -131,16 +140,18 @@ def take_steps(
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
             if not may_touch and not _is_driven(dofs, c, clusters.drives, begin):
                 continue
-            followed, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
+            cluster = each[c]
+            first = dofs.first[c]
+            own_tracks = Tracks(sites[first : first + cluster.contacts.size], tracks.log, tracks.closed)
+            followed, tracks = follow_contacts(cluster, own_tracks, begin)
             if not followed:
                 # The others are followed all the same: ranks that do not feel this one follow theirs, too.
                 if progress.failed == NEVER:
                     progress.failed = 2 * steps + 1
                     progress.cluster = c
-                    progress.time = begin + clusters.state[c].position * clusters.interval
+                    progress.time = begin + cluster.state[0].position * clusters.interval
                 continue
-            first = dofs.first[c]
-            apply_impulses(dofs, first, clusters.moments[first : dofs.first[c + 1]], next_cells)
+            apply_impulses(dofs, first, cluster.moments, next_cells)
 
         # Among others a rank that failed must keep their pace. One alone stays at the step that failed, for its state
         # to be shown, and takes no sample there again: its clusters have gone through that step, as far as they can.
@@ -175,14 +186,16 @@ class Propagator(Engine):
         self._components = np.zeros((2, layout.size + layout.ghost_rows * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
         self._halo = self._regions.bind_columns(self._states)
-        self._record = States(
-            components=self._components,
-            owned=layout.owned,
-            ghosts=len(ghosts),
-            ghost_rows=layout.ghost_rows,
-            parts=round(model.sample_interval / series.interval),
-            sample_interval=model.sample_interval,
-            progress=np.zeros(1, PROGRESS),
+        self._record = Record(
+            States(
+                components=self._components,
+                owned=layout.owned,
+                ghosts=len(ghosts),
+                ghost_rows=layout.ghost_rows,
+                parts=round(model.sample_interval / series.interval),
+                sample_interval=model.sample_interval,
+                progress=np.zeros(1, PROGRESS),
+            )
         )
         self._saved: Saved | None = None
         self.state = self._states[0]
@@ -237,7 +250,14 @@ class Propagator(Engine):
         tracks = forces.tracker.tracks
         with PROPAGATOR:
             error, log = take_steps(
-                self._record, self._stencil, self._halo, forces.dofs, forces.clusters, tracks, samples
+                self._record,
+                self._stencil,
+                self._halo,
+                forces.dofs,
+                forces.clusters,
+                forces.each,
+                tracks,
+                Record(samples),
             )
         if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")

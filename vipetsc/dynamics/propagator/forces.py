@@ -16,7 +16,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import allocating, kernel
+from vipetsc.compiled import kernel
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import clipped_energy, impact_time
 from vipetsc.contact.tracker import (
@@ -32,7 +32,7 @@ from vipetsc.contact.tracker import (
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, RESTS, advance_cluster
-from vipetsc.dynamics.propagator.clusters import DofTables, create_dof_tables, create_responses, groups_within_reach
+from vipetsc.dynamics.propagator.clusters import create_dof_tables, create_responses, groups_within_reach
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -45,10 +45,10 @@ from vipetsc.dynamics.propagator.substeps import (
     Cluster,
     create_tape,
     create_trial,
-    select_cluster,
 )
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
+from vipetsc.records import PartRecords, Record
 
 # A contact's first substep as a fraction of its duration at a tolerance of 1e-6; it goes with the error as others do.
 # On the built-in case half as much saves 5 % of all substeps with Hertz's law and costs 6 % with the bilinear one;
@@ -111,56 +111,31 @@ def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
 
 
 @kernel
-def _begin_step(clusters: Cluster, dofs: DofTables, c: int, begin: float) -> None:
-    """Set cluster ``c`` to the beginning of a step, ``begin`` in s: nothing has acted in it yet."""
-    cluster = select_cluster(clusters, dofs, c)
+def follow_contacts(cluster: Cluster, tracks: Tracks, begin: float) -> tuple[bool, Tracks]:
+    """Advance a cluster through the step that begins at ``begin`` in s, from one switching to the next.
+
+    Returns whether that was possible, and the ``tracks`` of its sites with as much room in the log as was needed.
+    """
     state = cluster.state[0]
     state.begin = begin
     state.position = 0.0
     cluster.moments[:] = 0.0
 
-
-@kernel
-def _advance_and_switch(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, may_rest: bool) -> tuple[int, int]:
-    """Advance cluster ``c`` to its next change and switch its sites there; returns what ``advance_cluster`` does.
-
-    The log of ``tracks`` must have room.
-    """
-    cluster = select_cluster(clusters, dofs, c)
-    outcome, site = advance_cluster(cluster, may_rest)
-    if outcome not in (CHANGED, RESTS):
-        return outcome, site
-
-    first = dofs.first[c]
-    sites = tracks.sites[first : first + cluster.contacts.size]
-    own_tracks = Tracks(sites, tracks.log, tracks.closed)
-    state = cluster.state[0]
-    now = state.begin + state.position * cluster.interval
-    if outcome == CHANGED:
-        _switch(cluster, own_tracks, now)
-    else:
-        _update_open_episodes(cluster.contacts, cluster.history, own_tracks)
-        rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)
-    return outcome, site
-
-
-# It may allocate, and such a function counts references to each array that it looks at: those of a cluster are left to
-# kernels.
-@allocating
-def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, begin: float) -> tuple[bool, Tracks]:
-    """Advance cluster ``c`` through the step that begins at ``begin`` in s, from one switching to the next.
-
-    Returns whether that was possible, and ``tracks`` with as much room as was needed.
-    """
-    _begin_step(clusters, dofs, c, begin)
     # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests. Numba would
     # compile the call twice for a variable that begins as False, once for the constant.
     landings_nowhere = 0
     for _ in range(MOST_CHANGES):
-        tracks = with_room(tracks)
-        outcome, site = _advance_and_switch(clusters, dofs, c, tracks, landings_nowhere > 0)
+        outcome, site = advance_cluster(cluster, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
+
+        tracks = with_room(tracks)
+        now = state.begin + state.position * cluster.interval
+        if outcome == CHANGED:
+            _switch(cluster, tracks, now)
+        else:
+            _update_open_episodes(cluster.contacts, cluster.history, tracks)
+            rest_site(cluster.contacts, tracks, site, cluster.site_motion, cluster.energy, now)
         landings_nowhere += outcome == CHANGED and site >= 0
     return False, tracks
 
@@ -181,7 +156,7 @@ class Forces:
         self._numbers = groups.numbers
         self._cells = all_dofs["cell"][groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
-        self.clusters = _create_clusters(groups, self.dofs, model, series)
+        self.use(_create_clusters(groups, self.dofs, model, series))
         self.tracker = ImpactTracker(self.clusters.contacts, _site_numbers(groups, model).tolist())
 
         leaders = all_dofs["cell"][groups.numbers[groups.first[:-1]]]
@@ -190,6 +165,27 @@ class Forces:
         self._is_logged = np.repeat(self.logs, np.diff(groups.first))
         self._logs_number = np.zeros(len(all_dofs), bool)
         self._logs_number[groups.numbers[self._is_logged]] = True
+
+    def use(self, clusters: Record) -> None:
+        """Make ``clusters`` those of the rank; ``each`` is the record of one of them, by its number."""
+        self.clusters = clusters
+        first = self.dofs.first[:-1]
+        stop = self.dofs.first[1:]
+        last_site = first + self.dofs.sites
+        members = (first, stop)
+        bounds: dict[str, Any] = dict.fromkeys(("response", "taylor", "moments", "energy", "history"), members)
+        bounds |= {
+            "contacts": (first, last_site),
+            "site_motion": (first, last_site),
+            "springs": (last_site, last_site + self.dofs.springs),
+            "drives": {"rows": members},
+        }
+        number = np.arange(len(first))
+        bounds["state"] = (number, number + 1)
+        # A tape without rows has none for each cluster either, and nothing is written on it.
+        if clusters.tape.rows.shape[1] > 0:
+            bounds["tape"] = dict.fromkeys(clusters.tape._fields, (number, number + 1))
+        self.each = PartRecords(self.clusters, len(first), bounds)
 
     def begin(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
@@ -278,7 +274,7 @@ def _site_numbers(groups: Groups, model: Model) -> np.ndarray:
     return np.where(groups.numbers < len(model.chain.sites), np.maximum(groups.numbers, -1), -1)
 
 
-def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: StepSeries) -> Cluster:
+def _create_clusters(groups: Groups, dofs: Record, model: Model, series: StepSeries) -> Record:
     """Create the record of all clusters at rest, one for each of ``groups``."""
     count = len(groups.numbers)
     terms = series.terms
@@ -294,7 +290,7 @@ def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: Step
     # The error of a substep grows with the power ORDER of its length.
     tolerance = (model.rtol / FIRST_TOLERANCE) ** (1 / ORDER)
     drives = np.where(groups.numbers < 0, -1 - groups.numbers, -1)
-    return Cluster(
+    clusters = Cluster(
         contacts=site_records(model, _site_numbers(groups, model)),
         springs=springs,
         drives=create_drives(model.drives, drives.tolist()),
@@ -314,3 +310,4 @@ def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: Step
         trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
         tape=create_tape(0, 0),
     )
+    return Record(clusters)

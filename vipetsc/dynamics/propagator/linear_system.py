@@ -6,7 +6,7 @@ arrays. The systems of ``tangent_kernels`` have eight unknowns for each closed s
 
 import numpy as np
 
-from vipetsc.compiled import disjoint, kernel
+from vipetsc.compiled import kernel
 
 
 @kernel
@@ -38,7 +38,7 @@ def solve_in_place(matrix: np.ndarray, right: np.ndarray) -> None:
             right[k, j] /= matrix[k, k]
 
 
-@disjoint
+@kernel
 def _swap(first: np.ndarray, second: np.ndarray) -> None:
     """Exchange the numbers of two rows."""
     for j in range(first.size):
@@ -47,7 +47,7 @@ def _swap(first: np.ndarray, second: np.ndarray) -> None:
         second[j] = number
 
 
-@disjoint
+@kernel
 def _subtract_multiple(row: np.ndarray, other: np.ndarray, factor: float) -> None:
     """Subtract a multiple of the ``other`` row from a ``row``."""
     for j in range(row.size):

@@ -21,7 +21,12 @@ from vipetsc.compiled import kernel
 from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.vectors import LANES, add_product, prefetch, store, zeros
+from vipetsc.records import Record
+
+# Fewest consecutive cells for which the stencil is used, and cells that it runs over at a time: their sums stay in the
+# processor's first cache.
+SHORTEST = 8
+CHUNK = 512
 
 
 class HaloRegions:
@@ -44,7 +49,7 @@ class HaloRegions:
         self._count += count * firsts.size
         return columns
 
-    def bind_columns(self, states: Sequence[PETSc.Vec]) -> "Halo":
+    def bind_columns(self, states: Sequence[PETSc.Vec]) -> Record:
         """The columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
         layout = self._layout
         cells = np.concatenate(self._ranges)
@@ -67,7 +72,7 @@ class HaloRegions:
             vector = self._vector.handle
         native.bind_symbols()
         handles = np.array([state.handle for state in states], np.int64)
-        return Halo(columns=columns, cells=cells, scatter=scatter, vector=vector, states=handles)
+        return Record(Halo(columns=columns, cells=cells, scatter=scatter, vector=vector, states=handles))
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
@@ -129,7 +134,7 @@ class Stencil(NamedTuple):
     total: np.ndarray
 
 
-def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Stencil:
+def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Record:
     """Create P(H) on the cells of ``layout``; adds to ``halo`` the cells that rows of borders, ends and others read."""
     reach = series.reach
 
@@ -142,8 +147,8 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     inner = np.arange(first, max(first, last))
     is_own = (inner >= layout.start + reach) & (inner < layout.stop - reach)
     interior = ranges_of(series.is_interior(inner) & is_own, first)
-    # Vectors of cells need so many; shorter ranges are left to the dense rows.
-    interior = interior[interior @ [-1, 1] >= LANES]
+    # Shorter ranges are left to the dense rows, which take less time for them.
+    interior = interior[interior @ [-1, 1] >= SHORTEST]
 
     # Consecutive dense cells have one part of the halo in common.
     is_dense = np.ones(len(inner), bool)
@@ -165,7 +170,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     borders, table = _dense_rows(series, inner[is_dense], tuple(ends))
     cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
     sparse = sparse_rows(series.interior(), layout, reach)
-    return Stencil(
+    stencil = Stencil(
         interior=interior - layout.start,
         blocks=sparse.blocks,
         starts=sparse.starts,
@@ -175,6 +180,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
         border_cells=np.column_stack([np.concatenate(columns), cells - layout.start, table]),
         total=np.zeros(borders.shape[3]),
     )
+    return Record(stencil)
 
 
 class SparseRows(NamedTuple):
@@ -257,6 +263,37 @@ def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarr
 
 
 @kernel
+def _add_terms(x: np.ndarray, places: np.ndarray, values: np.ndarray, begin: int, total: np.ndarray) -> None:
+    """Put the sum of ``values`` (term,) times ``x`` at ``places`` (term,) + ``begin`` into ``total`` (cell,).
+
+    Cell i has its ``x`` i places further. Terms are added in their order.
+    """
+    # Indices without a sign: numba counts negative ones from the end, and would ask for the sign in each loop.
+    cells = np.uint64(total.size)
+    total[:] = 0.0
+    # Four terms at a time: a sum is read from the cache and written to it once for all four.
+    t = 0
+    while t + 4 <= places.size:
+        p0 = np.uint64(places[t] + begin)
+        p1 = np.uint64(places[t + 1] + begin)
+        p2 = np.uint64(places[t + 2] + begin)
+        p3 = np.uint64(places[t + 3] + begin)
+        v0 = values[t]
+        v1 = values[t + 1]
+        v2 = values[t + 2]
+        v3 = values[t + 3]
+        for i in range(cells):
+            total[i] = total[i] + v0 * x[p0 + i] + v1 * x[p1 + i] + v2 * x[p2 + i] + v3 * x[p3 + i]
+        t += 4
+    while t < places.size:
+        p0 = np.uint64(places[t] + begin)
+        v0 = values[t]
+        for i in range(cells):
+            total[i] += v0 * x[p0 + i]
+        t += 1
+
+
+@kernel
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
     """Put P(H) times the lattice's ``state``, whose halo is ``columns``, into ``out`` (2 dof, owned cell)."""
     # On flat arrays, in which row r of cell i is at r cells + i.
@@ -268,27 +305,13 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
 
     # So many neighbouring cells at once: all have the same rows of P.
     for first, stop in stencil.interior:
-        for a in range(first, stop, LANES):
-            # The last vector overlaps the one before.
-            i = min(a, stop - LANES)
+        for begin in range(first, stop, CHUNK):
+            size = min(CHUNK, stop - begin)
             for b in range(to.shape[0]):
-                # The rows of the block are among those that it reads: two vectors ahead they are fetched from memory.
+                terms = slice(stencil.starts[b], stencil.starts[b + 1])
                 for k in range(4):
-                    prefetch(x, to[b, k] + i + 2 * LANES)
-                # Names, not an array: the sums stay in registers.
-                sum0 = zeros()
-                sum1 = zeros()
-                sum2 = zeros()
-                sum3 = zeros()
-                for t in range(stencil.starts[b], stencil.starts[b + 1]):
-                    sum0 = add_product(sum0, values[t, 0], x, places[t] + i)
-                    sum1 = add_product(sum1, values[t, 1], x, places[t] + i)
-                    sum2 = add_product(sum2, values[t, 2], x, places[t] + i)
-                    sum3 = add_product(sum3, values[t, 3], x, places[t] + i)
-                store(sum0, y, to[b, 0] + i)
-                store(sum1, y, to[b, 1] + i)
-                store(sum2, y, to[b, 2] + i)
-                store(sum3, y, to[b, 3] + i)
+                    total = y[to[b, k] + begin :][:size]
+                    _add_terms(x, places[terms], values[terms, k], begin, total)
 
     for column, cell, table in stencil.border_cells:
         multiply_dense(stencil.borders[table], columns, column, stencil.total)

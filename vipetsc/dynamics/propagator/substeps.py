@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import inlined, kernel
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.drives import Drives, drive_end
-from vipetsc.dynamics.propagator.clusters import DofTables
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.taylor import ROUNDING
 from vipetsc.dynamics.spring_law import SPRING_LAW
@@ -183,45 +182,6 @@ def create_tape(clusters: int, rows: int) -> Tape:
         rows=np.zeros((clusters, rows), TAPE_ROW),
         motion=np.zeros((clusters, rows, 2, NODES)),
         used=np.zeros(clusters, np.int64),
-    )
-
-
-# Put in place of their calls, these two serve kernels as well as functions that count references to arrays.
-@inlined
-def _select_tape(tape: Tape, c: int) -> Tape:
-    """The tape of cluster ``c``."""
-    # Nothing is written on a tape without rows, so that no view of it is needed.
-    if tape.rows.shape[1] == 0:
-        return tape
-    return Tape(rows=tape.rows[c : c + 1], motion=tape.motion[c : c + 1], used=tape.used[c : c + 1])
-
-
-@inlined
-def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
-    """Cluster ``c`` of all: the same constants and workspace, views of its part of the other arrays."""
-    first = dofs.first[c]
-    stop = dofs.first[c + 1]
-    last_site = first + dofs.sites[c]
-    last_spring = last_site + dofs.springs[c]
-    return Cluster(
-        contacts=clusters.contacts[first:last_site],
-        springs=clusters.springs[last_site:last_spring],
-        drives=Drives(clusters.drives.rows[first:stop], clusters.drives.pieces),
-        response=clusters.response[first:stop],
-        nodes=clusters.nodes,
-        interval=clusters.interval,
-        omega_max_h=clusters.omega_max_h,
-        rtol=clusters.rtol,
-        atol=clusters.atol,
-        first_substep=clusters.first_substep,
-        taylor=clusters.taylor[first:stop],
-        site_motion=clusters.site_motion[first:last_site],
-        moments=clusters.moments[first:stop],
-        energy=clusters.energy[first:stop],
-        history=clusters.history[first:stop],
-        state=clusters.state[c : c + 1],
-        trial=clusters.trial,
-        tape=_select_tape(clusters.tape, c),
     )
 
 

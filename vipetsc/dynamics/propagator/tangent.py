@@ -145,7 +145,7 @@ class TangentPropagator(Propagator):
         # A drive of no duration never acts. Its DoF stays in its cluster, which is then solved only in steps in which a
         # site may touch, as all others are.
         clusters.drives.rows["duration"] = 0.0
-        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), tape_rows))
+        self._forces.use(clusters._replace(tape=create_tape(len(clusters.state), tape_rows)))
         self._tape = OrbitTape(self._forces, self.series.interval)
         self._is_placed = False
         self._has_begun = False
@@ -300,7 +300,7 @@ class TangentPropagator(Propagator):
             stop = np.append(first, len(rows))[1:]
             for step, a, b in zip(steps.astype(int), first, stop, strict=True):
                 places[step, c] = number
-                linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[number])
+                linearise(self._forces.each, c, rows[a:b], motion[a:b], matrices[number])
                 number += 1
         clusters.energy[:] = energy
         return _Linearisation(places, matrices)

@@ -23,15 +23,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import CLIPPED, PERMANENT, elastic_force_and_slope, gap_of, side_of
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
 from vipetsc.dynamics.propagator.linear_system import solve_in_place
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
 from vipetsc.dynamics.propagator.taylor import copy, evaluate, shift
+from vipetsc.records import PartRecords
 
 
 class Variations(NamedTuple):
@@ -85,7 +86,7 @@ def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> Non
         x[j, first + row.site] = change
 
 
-@njit(error_model="numpy")
+@kernel
 def _force_variations(
     cluster: Cluster, rows: np.ndarray, motion: np.ndarray, substep: Substep, x: np.ndarray
 ) -> np.ndarray:
@@ -160,7 +161,7 @@ def _end_of_substep(rows: np.ndarray, begin: int) -> int:
 
 
 # Not a ``kernel``: it returns views to a function that counts references to them.
-@njit(error_model="numpy")
+@kernel
 def _select_closed(cluster: Cluster, rows: np.ndarray) -> Trial:
     """The workspace for variations in a substep whose closed sites are those of ``rows``.
 
@@ -183,7 +184,7 @@ def _select_closed(cluster: Cluster, rows: np.ndarray) -> Trial:
     )
 
 
-@njit(error_model="numpy")
+@kernel
 def _shift_all(x: np.ndarray, count: int, terms: int, s: float) -> None:
     """Shift the series (``count``, ``terms``) of free motion in each row of ``x`` to ``s`` later."""
     for j in range(x.shape[0]):
@@ -191,17 +192,15 @@ def _shift_all(x: np.ndarray, count: int, terms: int, s: float) -> None:
         shift(series, s, series)
 
 
-@njit(error_model="numpy")
-def linearise(
-    clusters: Cluster, dofs: DofTables, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray
-) -> None:
+@kernel
+def linearise(each: PartRecords, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray) -> None:
     """Put the matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion`` into ``out``.
 
     J maps the series of the free motion (dof, coefficient) and the variations of w'_minus (site,) at the step's
     beginning to the moments of the forces and the variations of w'_minus at its end. The cluster's Taylor coefficients,
     moments, energies and position, and the workspace of a trial, are overwritten.
     """
-    cluster = select_cluster(clusters, dofs, c)
+    cluster = each[c]
     count, terms = cluster.taylor.shape
     size = count * terms
     columns = size + cluster.contacts.size
@@ -250,7 +249,7 @@ def linearise(
             out[i, j] = x[j, i]
 
 
-@njit(error_model="numpy")
+@kernel
 def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, number: int, cells: np.ndarray) -> None:
     """Add to ``cells`` (2 dof, cell) what the forces of variation ``j`` in cluster ``c`` leave there.
 
@@ -283,7 +282,7 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
         approach[i] = after[size + i]
 
 
-@njit(error_model="numpy")
+@kernel
 def _move_variation(
     variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int, step: int, j: int
 ) -> int:
@@ -305,7 +304,7 @@ def _move_variation(
     return error
 
 
-@njit(error_model="numpy")
+@kernel
 def move_variations(variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int) -> int:
     """Move all variations through the orbit's steps; returns PETSc's error code. Collective."""
     for step in range(variations.places.shape[0]):

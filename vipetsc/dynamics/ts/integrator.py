@@ -27,6 +27,7 @@ from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.dynamics.ts.time_stepper import TimeStepper
 from vipetsc.lattice.drive import Pieces
 from vipetsc.parallel import StopRequest, smallest
+from vipetsc.records import Record
 
 # Measured on the built-in case up to 0.3 s, with Hertz's law (3,800 steps, 510 rejected) and the bilinear one (3,470,
 # 80): of these numbers none changes the error there, 1e-8 of the largest displacement.
@@ -139,6 +140,7 @@ class Integrator(Engine):
 
     def fill(self, samples: Samples) -> FillResult:
         """Go on through ``samples`` and take them; a sample at which it stops is not taken."""
+        record = Record(samples)
         for k in range(len(samples.work)):
             sys.audit("vipetsc.step")
             try:
@@ -147,7 +149,7 @@ class Integrator(Engine):
                 return FillResult(k, stalled=str(error))
             if not goes_on:
                 return FillResult(k, stopped=True)
-            take_sample(self._components, k, samples, self.lattice.contacts, self._own_rows)
+            take_sample(self._components, k, record, self.lattice.contacts, self._own_rows)
         return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:

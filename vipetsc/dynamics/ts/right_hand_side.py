@@ -7,23 +7,21 @@ ledger integrates fill the components behind the velocities (the equations are i
 
 import ctypes
 from functools import cache
-from typing import Any, get_type_hints
+from typing import Any
 
 from petsc4py import PETSc
 
 import numpy as np
-from numba.core.ccallback import CFunc
 
-from vipetsc.compiled import cfunc, inlined, kernel, njit
+from vipetsc.compiled import cfunc, kernel
 from vipetsc.contact.changes import first_change
-from vipetsc.contact.law import FREE, SITE, contact_force
+from vipetsc.contact.law import FREE, contact_force
 from vipetsc.dynamics import native
-from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
-from vipetsc.dynamics.lattice_record import COEFFICIENTS, COUPLING, MASS, NONLINEAR, SPRING, LatticeRecord, Shape
+from vipetsc.dynamics.drives import drive_force
+from vipetsc.dynamics.lattice_record import LATTICE, LatticeRecord
 from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
-from vipetsc.dynamics.site_dofs import SITE_DOFS, relative_motion
-from vipetsc.dynamics.spring_law import SPRING_LAW
+from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import (
     damping_powers,
     inverse_mass,
@@ -31,7 +29,7 @@ from vipetsc.dynamics.springs import (
     spring_acceleration,
     spring_accelerations,
 )
-from vipetsc.lattice.drive import PIECE
+from vipetsc.records import Record, record_at
 
 
 @kernel
@@ -128,17 +126,6 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         damping_powers(y, lattice, 0, f[shape.damping : shape.damping + n])
 
 
-_TABLES = (
-    *("masses", "couplings", "springs", "site_dofs", "contacts", "rows", "pieces", "nonlinear", "spring_laws"),
-    *COEFFICIENTS,
-)
-
-
-def _c_struct(record: type) -> np.dtype:
-    """The fields of a record of numbers, in their order."""
-    return np.dtype(list(get_type_hints(record).items()), align=True)
-
-
 ONSET = np.dtype([("time", np.float64), ("duration", np.float64)])
 """A step after the onset of a contact at ``time``, whose length is ``duration``, both in s; 0 in other steps.
 
@@ -149,54 +136,32 @@ CONTEXT = np.dtype(
     [
         ("array", np.int64),  # receives the address of a vector's array; first, so that its address is the context's
         ("onset", ONSET),
-        ("shape", _c_struct(Shape)),
-        ("address", np.dtype([(name, np.int64) for name in _TABLES])),
-        ("length", np.dtype([(name, np.int64) for name in _TABLES])),
+        ("lattice", np.int64),
     ],
     align=True,
 )
-"""A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables; and an ``ONSET``."""
+"""What PETSc hands to the callback: the address of a ``LATTICE``, and an ``ONSET``."""
 
 
-@inlined
-def _lattice_at(address: int) -> LatticeRecord:
-    """The lattice of the ``CONTEXT`` at an ``address``."""
-    context: Any = array_at(address, 1, CONTEXT)[0]
-    at = context.address
-    size = context.length
-    return LatticeRecord(
-        shape=context.shape,
-        masses=array_at(at.masses, size.masses, MASS),
-        couplings=array_at(at.couplings, size.couplings, COUPLING),
-        springs=array_at(at.springs, size.springs, SPRING),
-        site_dofs=array_at(at.site_dofs, size.site_dofs, SITE_DOFS),
-        contacts=array_at(at.contacts, size.contacts, SITE),
-        drives=Drives(array_at(at.rows, size.rows, DRIVE), array_at(at.pieces, size.pieces, PIECE)),
-        nonlinear=array_at(at.nonlinear, size.nonlinear, NONLINEAR),
-        spring_laws=array_at(at.spring_laws, size.spring_laws, SPRING_LAW),
-        inverse_masses=array_at(at.inverse_masses, size.inverse_masses, np.float64),
-        grounding=array_at(at.grounding, size.grounding, np.float64),
-        stiffness=array_at(at.stiffness, size.stiffness, np.float64),
-        damping=array_at(at.damping, size.damping, np.float64),
-    )
-
-
-@njit(error_model="numpy")
+@kernel
 def observe_at(t: float, y: np.ndarray, address: int, motion: np.ndarray) -> None:
     """``observe`` in the lattice of the ``CONTEXT`` at an ``address``.
 
     Python passes one number instead of a dozen arrays, which takes a fraction of the time.
     """
-    observe(t, y, _lattice_at(address), motion)
+    context: Any = array_at(address, 1, CONTEXT)[0]
+    observe(t, y, record_at(context.lattice, LATTICE), motion)
 
 
-@njit(error_model="numpy")
+@kernel
 def find_change(address: int, start: np.ndarray, end: np.ndarray, h: float, place: np.ndarray) -> float:
     """The position of ``first_change`` in a step of the sites of the ``CONTEXT`` at an ``address``.
 
     Kinks count. ``place`` (2,) gets the site and the function: to make a ``ModeChange`` takes longer than the search.
     """
-    change = first_change(_lattice_at(address).contacts, start, end, h, np.empty((2, 6)), kinks=True)
+    context: Any = array_at(address, 1, CONTEXT)[0]
+    lattice = record_at(context.lattice, LATTICE)
+    change = first_change(lattice.contacts, start, end, h, np.empty((2, 6)), kinks=True)
     place[0] = change.site
     place[1] = change.function
     return change.position
@@ -208,7 +173,8 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     ``ts``, ``u`` and ``f`` are handles, ``address`` is that of a ``CONTEXT``. Returns PETSc's error code.
     """
     context: Any = array_at(address, 1, CONTEXT)[0]
-    shape = context.shape
+    lattice = record_at(context.lattice, LATTICE)
+    shape = lattice.shape
     error = 0
     if shape.exchange:
         insert = native.INSERT_VALUES
@@ -222,7 +188,6 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     if error != 0:
         return error
 
-    lattice = _lattice_at(address)
     y = array_at(state, shape.ghosted, np.float64)
     rate = array_at(context.array, shape.owned, np.float64)
     onset = context.onset
@@ -244,7 +209,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
 
 
 @cache
-def compile_callback() -> CFunc:
+def compile_callback() -> Any:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
     ``context`` is the address of a ``CONTEXT`` record. All runs of a process have the same one, which lives on: to load
@@ -254,7 +219,7 @@ def compile_callback() -> CFunc:
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
 
 
-def register(ts: PETSc.TS, lattice: LatticeRecord) -> np.ndarray:
+def register(ts: PETSc.TS, lattice: Record) -> np.ndarray:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``.
 
     Returns its context, one record (1,) of dtype ``CONTEXT``, in which ``onset`` may be set before a step. Raises
@@ -262,10 +227,7 @@ def register(ts: PETSc.TS, lattice: LatticeRecord) -> np.ndarray:
     """
     callback = compile_callback()
     context = np.zeros(1, CONTEXT)
-    tables = lattice._asdict() | lattice.drives._asdict()
-    context["shape"] = lattice.shape
-    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
-    context["length"] = tuple(tables[name].size for name in _TABLES)
+    context["lattice"] = lattice.address
     # PETSc holds bare pointers: all that they point to must live as long as ts.
     ts.setAttr("callback", (context, lattice))
     error = petsc_library().TSSetRHSFunction(

@@ -6,54 +6,65 @@ bits. Factors that are zero, a third of those of 8vr, are left out.
 
 import ctypes
 from functools import cache
+from typing import Any
 
 from petsc4py import PETSc
 
 import numpy as np
-from numba.core.ccallback import CFunc
 
-from vipetsc.compiled import cfunc, njit
+from vipetsc.compiled import cfunc, kernel
 from vipetsc.dynamics import native
 from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
-from vipetsc.dynamics.vectors import LANES, add, add_product, prefetch, store, zeros
 
 # PETSc's number of the operation, in the order of its _VecOps.
 MAXPY = 14
-# Components to fetch ahead: so many vectors at once are more than the processor foresees.
-AHEAD = 6 * LANES
+# Components that are summed at once: those of y stay in the processor's first cache while all vectors are added.
+CHUNK = 1024
 
 
-@njit(error_model="numpy")
+@kernel
 def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> None:
     """Add to ``y`` (n,) the sum of ``factors`` (j,) times the vectors (n,) at ``addresses`` (j or more,)."""
-    n = y.size
     count = factors.size
-    whole = n - n % LANES
-    for i in range(0, whole, LANES):
-        total = add_product(zeros(), 1.0, y, i)
+    vectors = np.empty(4, np.int64)
+    for begin in range(0, y.size, CHUNK):
+        part = y[begin : begin + CHUNK]
+        size = part.size
         first = 0
         # PETSc takes the vectors by fours, those that are left over first.
         for stop in range((count - 1) % 4 + 1, count + 1, 4):
-            part = zeros()
+            used = 0
             for j in range(first, stop):
                 if factors[j] != 0.0:
-                    x = array_at(addresses[j], n, np.float64)
-                    prefetch(x, i + AHEAD)
-                    part = add_product(part, factors[j], x, i)
-            total = add(total, part)
+                    vectors[used] = j
+                    used += 1
             first = stop
-        store(total, y, i)
+            if used == 0:
+                continue
 
-    for i in range(whole, n):
-        first = 0
-        for stop in range((count - 1) % 4 + 1, count + 1, 4):
-            term = 0.0
-            for j in range(first, stop):
-                if factors[j] != 0.0:
-                    term += factors[j] * array_at(addresses[j], n, np.float64)[i]
-            y[i] += term
-            first = stop
+            a = factors[vectors[0]]
+            x0 = array_at(addresses[vectors[0]] + 8 * begin, size, np.float64)
+            if used == 1:
+                for i in range(size):
+                    part[i] += 0.0 + a * x0[i]
+                continue
+            b = factors[vectors[1]]
+            x1 = array_at(addresses[vectors[1]] + 8 * begin, size, np.float64)
+            if used == 2:
+                for i in range(size):
+                    part[i] += 0.0 + a * x0[i] + b * x1[i]
+                continue
+            c = factors[vectors[2]]
+            x2 = array_at(addresses[vectors[2]] + 8 * begin, size, np.float64)
+            if used == 3:
+                for i in range(size):
+                    part[i] += 0.0 + a * x0[i] + b * x1[i] + c * x2[i]
+                continue
+            d = factors[vectors[3]]
+            x3 = array_at(addresses[vectors[3]] + 8 * begin, size, np.float64)
+            for i in range(size):
+                part[i] += 0.0 + a * x0[i] + b * x1[i] + c * x2[i] + d * x3[i]
 
 
 def _callback(y: int, count: int, factors: int, vectors: int) -> int:
@@ -82,7 +93,7 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
 
 
 @cache
-def _compile() -> CFunc:
+def _compile() -> Any:
     """``PetscErrorCode f(Vec y, PetscInt count, const PetscScalar *factors, Vec *vectors)``; it lives on."""
     native.bind_symbols()
     return cfunc(f"i4(i8, i{np.dtype(PETSc.IntType).itemsize}, i8, i8)")(_callback)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 from petsc4py import PETSc
 
 from vipetsc.case import Model
-from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.options import set_from_options
 from vipetsc.dynamics.ts.right_hand_side import register
+from vipetsc.records import Record
 
 # Work and losses do not decide the step.
 NO_TOLERANCE = 1e30
@@ -31,7 +31,7 @@ class TimeStepper:
     side's ``CONTEXT``, which lives as long as ``ts``.
     """
 
-    def __init__(self, model: Model, layout: Layout, state: PETSc.Vec, lattice: LatticeRecord) -> None:
+    def __init__(self, model: Model, layout: Layout, state: PETSc.Vec, lattice: Record) -> None:
         tolerances = state.duplicate()
         half = layout.dofs * layout.owned
         tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vipetsc.compiled import allocating
+from vipetsc.compiled import kernel
 from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
 
 # With K harmonics, and 24 K samples or more, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range at
@@ -20,7 +20,7 @@ from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing
 OVERSHOOT = 0.1
 
 
-@allocating
+@kernel
 def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
     """Write the phases where a motion passes ``offset`` into ``out``, in order, and return their number.
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import inlined, kernel, njit
+from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import ELASTIC, elastic_force_and_slope, elastic_records
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope, spring_laws
 from vipetsc.modes.shooting.arc_limits import ArcLimits
@@ -173,7 +173,7 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
             side[c] = -1
 
 
-@njit
+@kernel
 def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
     """The record of a flow's steps, which begins at the state in column 0 of ``y`` (2n, 1 + m)."""
     contacts = system.contacts.size

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
@@ -146,7 +146,7 @@ def _extremum(c: Coefficients, position: float) -> float:
     return _bisect(c, low, low + 0.25, sign)
 
 
-@njit
+@kernel
 def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
     """Position at which ``sign`` times the slope (5,) on [low, 1] turns positive, or 2; cuts the slope there."""
     turn = first_upcrossing_after_start(sign * slope, 0.0)
@@ -161,7 +161,7 @@ def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
     return low + turn * (1.0 - low)
 
 
-@njit(_nrt=True)  # makes arrays, also where it is called from kernels
+@kernel
 def first_rise(c: Coefficients) -> tuple[float, int]:
     """Position in the step at which a gap that starts at or below zero first rises through it, and the outcome."""
     # Above the interpolant's error, which is that of the next power of the position.
