@@ -26,7 +26,9 @@ def test_the_ledger_has_the_dashpots(engine, tmp_path):
     curves = {line.get_label(): np.asarray(line.get_ydata()) for line in upper.lines}
     assert curves["dissipated in dashpots"][-1] > 0.01 * curves["work of the drive"][-1]
     residual = np.asarray(lower.lines[0].get_ydata())
-    assert 1e-18 < residual.max() < 1e-8
+    assert residual.max() < 1e-8
+    # The propagator takes what dashpots dissipate from the balance, which then has no residual.
+    assert (residual.max() > 1e-18) == (engine == "ts")
 
     # The legend, of four rows here, stands above the work by half the height of a row at least.
     box = upper.get_legend().get_window_extent()
