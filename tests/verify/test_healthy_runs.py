@@ -112,6 +112,26 @@ def test_a_pair_at_rest_within_the_tolerance_of_its_stop_goes_on(beyond):
     engine.destroy()
 
 
+def test_a_pair_at_rest_on_its_stop_that_is_pulled_into_it_begins_a_contact():
+    """The switching function rises from zero with zero rate: a change at the start at which nothing switches yet."""
+    case = small_case(lattice={"cells": 60}, contacts={"sites": [30], "clearance": 1e-3, "restitution": 1.0})
+    model = case.model()
+    layout = Layout(model, MPI.COMM_SELF)
+    engine = Integrator(model, layout)
+    cells = np.zeros((60, 2 * layout.dofs))
+    cell = model.chain.cell
+    cells[29, cell.resonator] = 1e-3
+    # All other masses pull the host away from its resonator.
+    others = [mass for mass in range(layout.dofs) if mass not in (cell.host, cell.resonator)]
+    cells[28:31, others] = -0.05
+    engine.begin(cells, np.array([[1e-3, 0.0]]), 0.0)
+    assert engine.tracker.start[0, 1] == 0.0
+    assert engine.tracker.start[0, 2] > 0.0
+    assert engine.advance(model.sample_interval)
+    assert engine.counts["switches"] == 1
+    engine.destroy()
+
+
 class Misses(Integrator):
     """An engine whose first landing ends beside the change."""
 
