@@ -12,6 +12,7 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+import pydantic
 import pytest
 
 import vipetsc as package
@@ -153,6 +154,27 @@ def test_an_installed_package_registers_a_law(site, tmp_path):
     record = {"module": "users-stops", "version": "1.2", "sha256": hashlib.sha256(source).hexdigest()}
     assert case["plugins"]["parts"] == {"law": {"hardening": record}}
     assert case["contacts"]["law"] == "hardening"
+
+
+@needs_the_wheel
+@pytest.mark.parametrize("script", ["setup", "recipes/pip"])
+def test_the_folder_above_a_clone_does_not_hide_the_package(script, tmp_path):
+    """With the package installed as ``script`` does it, ``python -m vipetsc`` works beside a clone named vipetsc."""
+    clone = tmp_path / "vipetsc"
+    shutil.copytree(ROOT / "vipetsc", clone / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy2(ROOT / name, clone)
+    # pip records nothing of the package in this environment, but in one of its own.
+    python = tmp_path / "venv/bin/python"
+    call(sys.executable, "-m", "venv", "--without-pip", "--system-site-packages", tmp_path / "venv", cwd=tmp_path)
+    settings = re.search(r"(--config-settings \S+)", (ROOT / "scripts" / script).read_text(encoding="utf-8"))[1]
+    options = ["--no-deps", "--no-build-isolation", *settings.split(), "--editable", clone]
+    call(*PIP, "--python", python, "install", *options, cwd=tmp_path)
+
+    # The libraries are those of this environment.
+    libraries = Path(pydantic.__file__).parents[1]
+    answer = call(python, "-m", "vipetsc", "--version", cwd=tmp_path, site=libraries).stdout
+    assert answer == f"vipetsc {package.__version__}\n"
 
 
 @needs_the_wheel
