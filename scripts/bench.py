@@ -2,8 +2,8 @@
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
 velocities every 2e-4 s, on one core. Further parts measure whole programs compared with an earlier version, members of
-a sweep, the CPU time of the paper (from the folder that ``paper`` left), scaling over cells and ranks, which a model
-extends to many ranks, and set-up and files of large lattices. Writes ``latest.json`` and pictures. The full bench takes
+a sweep, the CPU time of the paper (from the folder that ``paper`` left), scaling over cells and ranks, and set-up and
+files of large lattices. Writes ``latest.json`` and pictures. The full bench takes
 about half an hour, ``--quick`` five minutes; ``--large`` adds the whole program on a million cells (minutes).
 """
 
@@ -28,7 +28,6 @@ petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
 
-from bench_chapter import CHAPTER, write_chapter
 from bench_members import member_seconds, paper_budget
 from bench_ours import own_solvers, right_hand_side_us
 from bench_peers import parameters, peers
@@ -81,7 +80,6 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder that `paper` left")
     parser.add_argument("--baseline", default=BASELINE, metavar="COMMIT", help="the earlier version of programs")
     parser.add_argument("--table", action="store_true", help="print the tables of the last results, no more")
-    parser.add_argument("--write", action="store_true", help="write tables and picture of the results into the manual")
 
     options = parser.parse_args(arguments)
     if options.rounds is not None and options.rounds < 1:
@@ -164,12 +162,6 @@ def print_rows(found: dict) -> None:
     print(f"measured in {found['minutes']:.1f} min\n")
 
 
-def write_manual(found: dict, folder: Path) -> None:
-    """Write tables and picture of ``found`` into the manual's chapter, and say for which tables it has no place."""
-    for titles in write_chapter(markdown(found), draw(found, folder)):
-        print(f"bench: {CHAPTER.name} has no table with the titles {titles!r}", file=sys.stderr)
-
-
 def main(arguments: list[str]) -> int:
     """Measure, store, draw and print; returns the exit code."""
     options = options_from(arguments)
@@ -180,8 +172,6 @@ def main(arguments: list[str]) -> int:
             return 2
         found = json.loads(latest.read_text(encoding="utf-8"))
         print(markdown(found), end="")
-        if options.write:
-            write_manual(found, options.out)
         return 0
 
     # A case that the peers cannot solve is refused before anything is measured.
@@ -199,8 +189,6 @@ def main(arguments: list[str]) -> int:
     print(markdown(found))
     for path in draw(found, options.out):
         print(path)
-    if options.write:
-        write_manual(found, options.out)
     return 0
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 CASES = ROOT / "vipetsc" / "paper" / "cases"  # the same for both versions
-# The earlier version: the targets below are ratios to its times.
+# The earlier version.
 BASELINE = "b03848f"
 # The slowest program, a first run of the earlier version, compiles for a minute; ten leave room for a slow machine.
 PATIENCE = 600  # seconds that one call may take
@@ -41,50 +41,36 @@ class Program:
     """A call of ``python -m vipetsc``: its ``words``, the number of ``ranks``, and whether it ``compiles`` kernels.
 
     ``{folder}`` in a word is the folder of the version that is measured, ``{cases}`` that of the paper's cases.
-    ``--force`` lets a round replace the results of another. ``target`` is the largest ratio of times that is aimed at,
-    None without a goal: a ratio of CPU times if ``by_cpu``, else of wall times.
+    ``--force`` lets a round replace the results of another.
     """
 
     words: str
     ranks: int = 1
     compiles: bool = False
-    target: float | None = None
-    by_cpu: bool = False
 
 
 PROGRAMS = {
     "help": Program("--help"),
-    # A target is written as the seconds aimed at over the seconds of the earlier version.
-    "validate": Program("validate", target=0.7 / 1.6),
+    "validate": Program("validate"),
     "run without pictures, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/plain"
     ),
     # This call draws the results of the row before.
-    "plot": Program("plot {folder}/plain", target=2.2 / 4.9),
-    "run with pictures, propagator": Program(
-        "run --set time.engine=propagator --force --out {folder}/propagator", target=3.0 / 8.4
-    ),
-    "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
-    # This target is a CPU time, because the wall time depends on the number of cores, on which members run at once.
-    "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
+    "plot": Program("plot {folder}/plain"),
+    "run with pictures, propagator": Program("run --set time.engine=propagator --force --out {folder}/propagator"),
+    "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2),
+    "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six"),
     # The largest steps of the paper at fewer amplitudes and wavenumbers: every third member is scaled, as there.
     "members of the step interband": Program(
         "sweep {cases}/interband.toml --set output.figures=false --set sweep.drive.amplitude=[1.0,100.0,1e4]"
-        " --force --out {folder}/interband",
-        target=110 / 183,
-        by_cpu=True,
+        " --force --out {folder}/interband"
     ),
     "members of the step scattering": Program(
         "sweep {cases}/scattering.toml --set output.figures=false --set sweep.drive.amplitude=[0.1,1.5,20.0]"
-        ' --set sweep.drive.wavenumber=["3pi/9","6pi/9"] --force --out {folder}/scattering',
-        target=80 / 133,
-        by_cpu=True,
+        ' --set sweep.drive.wavenumber=["3pi/9","6pi/9"] --force --out {folder}/scattering'
     ),
     "first run, with compilation, propagator": Program(
-        "run --set time.engine=propagator --set output.figures=false --force --out {folder}/first",
-        compiles=True,
-        target=25 / 58,
-        by_cpu=True,
+        "run --set time.engine=propagator --set output.figures=false --force --out {folder}/first", compiles=True
     ),
 }
 

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_model import model_tables
 from bench_precision import ERRORS, at_equal_error
 from bench_programs import programs_table
-from bench_targets import table as target_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -45,7 +43,7 @@ def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """All tables for which ``found`` has numbers, as Markdown: CPU time at equal error, programs, scaling, goals."""
+    """All tables for which ``found`` has numbers, as Markdown: CPU time at equal error, programs, scaling."""
     parts = {
         "provenance": _origin_table,
         "rows": _precision_table,
@@ -59,8 +57,7 @@ def markdown(found: dict[str, Any]) -> str:
     }
     # A bench of some parts has no tables of the others.
     sections = [part(found) for key, part in parts.items() if found.get(key)]
-    sections += [model_tables(found.get("scaling", [])), target_table(found)]
-    return "\n\n".join(filter(None, sections)) + "\n"
+    return "\n\n".join(sections) + "\n"
 
 
 def _origin_table(found: dict[str, Any]) -> str:

@@ -13,7 +13,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import petsc4py
 
@@ -35,31 +34,8 @@ COMM = MPI.COMM_WORLD
 # The phases of a run, as its audit events name them. "read" is the time before the first of them.
 PHASES = ("claim", "set-up", "step", "checkpoint", "flush", "assemble", "conclude", "clean", "swap")
 
-# Events of PETSc's log: the first two are PETSc's own, the others are registered by this package.
-EVENTS = ("VecScatterBegin", "TSStep", "Propagator", "ContactSearch", "Landing", "Recorder")
-
-
-class CountingComm(MPI.Intracomm):
-    """A communicator that counts the reductions by mpi4py over it, which PETSc's log does not have."""
-
-    reductions: int
-    __module__ = "mpi4py.MPI"  # what petsc4py asks of a communicator
-
-    def __new__(cls, comm: MPI.Intracomm) -> CountingComm:
-        """Return a communicator with the group of ``comm`` that has counted no reduction yet."""
-        counting = super().__new__(cls, comm)
-        counting.reductions = 0
-        return counting
-
-    def allreduce(self, *arguments: Any, **named: Any) -> Any:
-        """Reduce Python objects, and count it."""
-        self.reductions += 1
-        return super().allreduce(*arguments, **named)
-
-    def Allreduce(self, *arguments: Any, **named: Any) -> None:
-        """Reduce arrays, and count it."""
-        self.reductions += 1
-        super().Allreduce(*arguments, **named)
+# Events of PETSc's log: the first is PETSc's own, the others are registered by this package.
+EVENTS = ("TSStep", "Propagator", "ContactSearch", "Landing", "Recorder")
 
 
 @numba.njit
@@ -96,12 +72,11 @@ def peak() -> float:
 def time_intervals(engine: str, cells: int, intervals: int) -> dict:
     """Measure an ``engine`` on a lattice of ``cells`` over so many sample ``intervals``, in the midst of a short burst.
 
-    Returns milliseconds a sample interval, memory, bandwidth, and what ``counted`` counts.
+    Returns milliseconds a sample interval, also those of ``EVENTS``, memory and bandwidth.
     """
     # A burst of three cycles ends soon; the window of nine cells keeps what is recorded small at every length.
     case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
-    comm = CountingComm(COMM)
-    run = EngineRun(case, comm)
+    run = EngineRun(case, COMM)
     model = run.model
     # The time is measured from a third of the burst on: in a lattice at rest ts takes its longest steps.
     first = round(model.drive.duration / 3 / model.sample_interval)
@@ -116,7 +91,7 @@ def time_intervals(engine: str, cells: int, intervals: int) -> dict:
 
     # The peak is read before the triad, whose arrays may be larger than all else.
     memory = peak()
-    traffic = counted(run, comm, first + intervals, min(intervals, 50))
+    by_event = spent(run, first + intervals, min(intervals, 50))
     gigabytes = bandwidth()
     state_bytes = 2 * 8 * model.chain.cell.dofs * cells
     return {
@@ -126,33 +101,25 @@ def time_intervals(engine: str, cells: int, intervals: int) -> dict:
         "triad_gb_per_second": gigabytes,
         # Every method reads and writes the state at least once an interval.
         "fraction_of_bandwidth_limit": 2 * state_bytes / (1e9 * gigabytes) / wall,
-    } | traffic
+    } | by_event
 
 
-def counted(run: EngineRun, comm: CountingComm, done: int, intervals: int) -> dict[str, float]:
-    """Messages and bytes that a rank sends to one neighbour, and reductions, in a sample interval; over ``intervals``.
+def spent(run: EngineRun, done: int, intervals: int) -> dict[str, float]:
+    """The time of each of ``EVENTS`` on this rank in ms a sample interval, over ``intervals``.
 
-    ``run`` has reached the sample ``done``. Messages are those of the scatters in PETSc's log, reductions those of
-    its steps and those over ``comm``. The time of each of ``EVENTS`` on this rank is in ms.
+    ``run`` has reached the sample ``done``.
     """
     # The log begins after the steps that were timed, which it would slow down.
     PETSc.Log.begin()
 
     def logged() -> np.ndarray:
-        events = [PETSc.Log.Event(name).getPerfInfo() for name in EVENTS]
-        # PETSc counts from the start of the log: two readings are subtracted below.
-        scatter, step = events[:2]
-        traffic = scatter["numMessages"], scatter["messageLength"], step["numReductions"] + comm.reductions
-        return np.array([*traffic, *(1e3 * event["time"] for event in events)])
+        return np.array([1e3 * PETSc.Log.Event(name).getPerfInfo()["time"] for name in EVENTS])
 
+    # PETSc counts from the start of the log.
     before = logged()
     run.advance(done, done + intervals)
-    # PETSc counts a message where it is sent and where it is received. Each of two ranks has one neighbour.
-    messages, length, reductions, *spent = ((logged() - before) / intervals).tolist()
-    found = {"messages": messages / 2, "message_bytes": length / 2, "reductions": reductions}
-    for name, milliseconds in zip(EVENTS, spent, strict=True):
-        found[f"{name}_ms"] = milliseconds
-    return found
+    milliseconds = (logged() - before) / intervals
+    return {f"{name}_ms": float(value) for name, value in zip(EVENTS, milliseconds, strict=True)}
 
 
 def build(cells: int, sites: int) -> dict:
