@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 import vipetsc
-from vipetsc.cli.chapters import WRITTEN, chapter, parts
+from vipetsc.cli.chapters import KEYS, chapter, parts
 
 PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"
@@ -80,8 +80,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     start = (ROOT / "README.md").read_text(encoding="utf-8")
     # In a table of contents the title tells the page's purpose, which the package's name would not.
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
-    for name in WRITTEN:
-        put(folder / f"{name}.md", chapter(name), CHAPTERS)
+    put(folder / f"{KEYS}.md", chapter(KEYS), CHAPTERS)
     for name in (path.stem for path in CHAPTERS.glob("*.md") if path.stem != "index"):
         text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
         if name == GALLERY.name:

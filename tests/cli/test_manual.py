@@ -12,7 +12,7 @@ import pytest
 
 import vipetsc
 from tests.cli.browser import NEEDED, SCREENS, browsing
-from vipetsc.cli.chapters import WRITTEN, parts
+from vipetsc.cli.chapters import KEYS, parts
 
 ROOT = Path(vipetsc.__file__).parents[1]
 CHAPTERS = {path.stem for path in (ROOT / "vipetsc/manual").glob("*.md")}
@@ -43,7 +43,7 @@ def pages(tmp_path_factory) -> Path:
 
 def test_every_chapter_has_a_page_and_the_interface_its_signatures(pages):
     """Every chapter has a page, and the page of a package has its functions with their docstrings."""
-    assert {*CHAPTERS, *WRITTEN, "start", "vipetsc.contact"} <= {path.stem for path in pages.glob("*.html")}
+    assert {*CHAPTERS, KEYS, "start", "vipetsc.contact"} <= {path.stem for path in pages.glob("*.html")}
     page = (pages / "vipetsc.contact.html").read_text(encoding="utf-8")
     assert 'id="vipetsc.contact.law.contact_force"' in page
     assert "Force on the host in N and dissipated power in W of site" in page
@@ -70,7 +70,18 @@ return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() =>
 def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
     """Pages are no wider than the window; their pictures, links and scripts work, and all files are local."""
     session = browser.open(pages / "index.html", width, height)
-    for name in ("index", "start", "theory", "measures", "files", *WRITTEN, "glossary", "paper", "vipetsc.contact"):
+    for name in (
+        "index",
+        "start",
+        "theory",
+        "measures",
+        "files",
+        KEYS,
+        "features",
+        "glossary",
+        "paper",
+        "vipetsc.contact",
+    ):
         browser.show(session, pages / f"{name}.html")
         found = browser.measure(session)
         assert found["page"] <= width, name
@@ -120,7 +131,7 @@ def test_the_manual_has_four_parts_and_every_chapter_is_in_one(pages):
     assert captions == ["Tutorials", "How to", "Theory", "Reference"]
     listed = [name for names in parts().values() for name in names]
     assert len(listed) == len(set(listed))
-    assert set(listed) == CHAPTERS - {"index"} | WRITTEN.keys()
+    assert set(listed) == CHAPTERS - {"index"} | {KEYS}
 
 
 def test_terms_lead_to_the_glossary(pages):

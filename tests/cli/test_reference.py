@@ -18,7 +18,7 @@ from vipetsc.case import keys
 from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.verb_cases import SECTIONS, load_every
-from vipetsc.cli.chapters import WRITTEN
+from vipetsc.cli.chapters import KEYS
 from vipetsc.cli.verbs.reference_verbs import schema_of
 from vipetsc.cli.verbs.verb_list import VERBS
 
@@ -167,7 +167,7 @@ def test_the_manual_at_the_prompt(in_process):
     """Chapters are listed and printed in Markdown; an unknown chapter is refused."""
     listed = in_process("manual").stdout
     index = (ROOT / "vipetsc/manual/index.md").read_text(encoding="utf-8")
-    names = {*WRITTEN, *re.findall(r"\]\(([\w-]+)\.md\)", index)}
+    names = {KEYS, *re.findall(r"\]\(([\w-]+)\.md\)", index)}
     assert set(re.findall(r"^  ([\w-]+) ", listed, flags=re.M)) == names
 
     for topic in ("trust", "gallery/designed"):

@@ -4,5 +4,5 @@
 results run, ``verbs/`` a module for each verb or family of verbs, and the list of all verbs. ``arguments`` are those
 that several verbs accept. ``drawing`` draws the pictures of a folder. ``messages`` prints, ``streams`` decides the exit
 code if printing fails, ``tables`` and ``case_rows`` make rows of text. ``chapters`` finds
-the manual's, ``feature_table`` writes one of its chapters; ``installation`` has the checks of the verb ``doctor``.
+the manual's; ``installation`` has the checks of the verb ``doctor``.
 """

@@ -2,19 +2,20 @@
 
 import itertools
 import re
-from importlib import import_module
 from importlib.resources import files
 
-# Chapters that no file holds, and the modules that write them.
-WRITTEN = {"case-keys": "vipetsc.case.keys", "features": "vipetsc.cli.feature_table"}
+from vipetsc.case import keys
+
+# The chapter that no file holds: it is made from the schema of case files.
+KEYS = "case-keys"
 
 
 def parts() -> dict[str, list[str]]:
     """Names of the manual's chapters by the title of their part, as the headings and tables of its index list them."""
     sections = re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", chapter("index"), flags=re.M | re.S)
     listed = {title: re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", text, flags=re.M) for title, text in sections}
-    # No file holds these chapters, and no index links to them.
-    listed["Reference"] += WRITTEN
+    # The index has no link to the chapter without a file.
+    listed["Reference"].append(KEYS)
     return {title: names for title, names in listed.items() if names}
 
 
@@ -24,16 +25,14 @@ def studies() -> list[str]:
 
 
 def chapter(name: str) -> str:
-    """The Markdown of the chapter ``name``, from its file or from the module that writes it."""
-    if name in WRITTEN:
-        return str(import_module(WRITTEN[name]).chapter())
+    """The Markdown of the chapter ``name``, from its file or from the schema."""
+    if name == KEYS:
+        return keys.chapter()
     return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def title(name: str) -> str:
     """The title of the chapter ``name``."""
-    if name in WRITTEN:
-        return str(import_module(WRITTEN[name]).TITLE)
     return chapter(name).partition("\n")[0].removeprefix("# ")
 
 

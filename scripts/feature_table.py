@@ -1,4 +1,6 @@
-"""The chapter of the manual with a table of which verb accepts which feature of a case.
+"""Write the chapter of the manual with a table of which verb accepts which feature of a case: ``manual/features.md``.
+
+    python scripts/feature_table.py
 
 Every entry follows from a check of a small case. A verb accepts a feature if its case with this feature is valid, and
 if the checks that come after reading it (of an engine, of linear modes) accept it too. Otherwise the entry is the
@@ -9,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase, Sweep
@@ -18,7 +21,8 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 
-TITLE = "Verbs and features"
+ROOT = Path(__file__).parents[1]
+CHAPTER = ROOT / "vipetsc" / "manual" / "features.md"
 YES = "yes"
 UNREAD = "-"  # the verb reads no section that has the feature
 
@@ -342,7 +346,7 @@ def chapter() -> str:
 
 def _introduction() -> Iterator[str]:
     yield from (
-        f"# {TITLE}",
+        "# Verbs and features",
         "",
         "Each answer is that of the program to a small case with one feature: **yes**, or the number of the message",
         f"that refuses it, below the table; `{UNREAD}` where the verb reads no section that has the feature. A message",
@@ -369,3 +373,7 @@ def _reasons(reasons: Sequence[str]) -> Iterator[str]:
     """The numbered ``reasons``."""
     for number, reason in enumerate(reasons, 1):
         yield f"{number}. {reason}"
+
+
+if __name__ == "__main__":
+    CHAPTER.write_text(chapter(), encoding="utf-8")
