@@ -1,4 +1,4 @@
-"""Draws the pictures of the chapters *theory* and *read-pictures* and of the notebooks again, as small files.
+"""Draws the pictures of the built-in run, of two sweeps and of the notebooks again, as small files.
 
     python scripts/manual_pictures.py [--folder FOLDER]
 
@@ -52,6 +52,7 @@ DRAWN = {
     "spacetime": "four-band/figures/spacetime.png",
     "impacts": "four-band/figures/impacts.png",
     "ledger": "four-band/figures/ledger.png",
+    "modal": "four-band/figures/modal_energies.png",
     "phase": "four-band/figures/phase.png",
     "sweep-curve": "curve/figures/upper_share_at_end-over-drive.amplitude.png",
     "sweep-map": "map/figures/upper_share_at_end-over-drive.amplitude-contacts.restitution.png",
@@ -209,6 +210,9 @@ def main(arguments: list[str] | None = None) -> int:
             subprocess.run([sys.executable, "-m", "vipetsc", verb, "--quiet", *settings], cwd=folder, check=True)
         for name, path in DRAWN.items():
             save_small(Image.open(folder / path), PICTURES / f"{name}.png", WIDTH, MOST)
+        # In the size in which it is drawn: a test compares the README's picture with that of a run.
+        dispersion = Image.open(folder / "four-band/figures/dispersion.png").convert("RGB")
+        dispersion.save(PICTURES / "four-band.png", optimize=True)
         with open_run(folder / "four-band/run.h5") as run:
             save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png", WIDTH, MOST)
             save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png", WIDTH, MOST)

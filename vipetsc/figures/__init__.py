@@ -2,6 +2,6 @@
 
 ``registry`` has every figure by name and draws what folders hold; ``style`` has sizes, colours and the loop over
 pictures on all ranks, ``panels`` the panels that several figures have, ``sweep_members`` the data of pictures of
-sweeps. The other modules are families of figures, or tools that make drawing fast; docstrings name the figures of the
+sweeps. The other modules are families of figures, or tools that several of them use; docstrings name the figures of the
 paper (see ``frequency_energy``).
 """

@@ -1,1 +1,1 @@
-"""Studies: measures of a run, and evaluations of many runs."""
+"""Studies: measures of a run, and evaluations of many runs, in the frame of ``study``."""
