@@ -39,7 +39,7 @@ cycles = 3
 [time]
 end = 0.04
 rtol = 1e-8
-sample_interval = 1e-4              # members begin from a checkpoint of their linear run
+sample_interval = 1e-4
 [output]
 stride = 2
 [sweep.contacts]
