@@ -42,7 +42,7 @@ class EngineRun:
         self.output.begin(case.to_toml())
         self.layout = Layout(self.model, comm)
         self.engine = ENGINES[engine.name](self.model, self.layout)
-        meter = EnergyMeter(self.model, self.layout)
+        meter = EnergyMeter(self.model, self.layout, self.engine.lattice)
         setup = Setup(case, self.model, self.layout, meter, self.engine, self.output)
         self._run = Run(setup, (Guard, Ledger))
 
@@ -74,7 +74,7 @@ class EngineRun:
         seconds = time.process_time() - begin
         if ending != "complete":
             raise RuntimeError(sentence)
-        self._run.finish(ending, sentence, Begin(wall=0.0, cpu=0.0, compiled=0.0), {})
+        self._run.finish(ending, sentence, Begin(wall=0.0, cpu=0.0), {})
         assert self.output.dataset is not None
         return self.output.dataset.velocity.values, seconds
 

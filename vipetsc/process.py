@@ -4,22 +4,12 @@ import logging
 import os
 import signal
 import sys
-from pathlib import Path
 from types import FrameType
 
 logger = logging.getLogger(__name__)
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 # What launchers tell a process of its rank: Open MPI's, those with PMI (MPICH, Intel MPI, Slurm's), Slurm's own.
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
-
-
-def cache_folder() -> Path:
-    """The folder of the user's cache, which need not exist: ``vipetsc`` in ``$XDG_CACHE_HOME``, or in ``~/.cache``."""
-    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not parent.is_absolute():
-        # The standard has such a path ignored.
-        parent = Path(os.path.expanduser("~/.cache"))
-    return parent / "vipetsc"
 
 
 def launched_rank() -> int | None:
