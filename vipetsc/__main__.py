@@ -1,11 +1,11 @@
 """Entry point: ``python -m vipetsc VERB``, on one process or under ``mpirun -n N``; PETSc options follow ``--``."""
 
+import io
 import logging
 import os
 import sys
 from importlib.util import find_spec
 
-from vipetsc.cli.streams import check_standard_streams
 from vipetsc.process import end_on_request
 
 # Libraries that must be built for the machine's MPI, so that setting up the package does not install them.
@@ -16,7 +16,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one verb on all ranks; returns the exit code: 0 done, 2 bad input, 75 stopped on request, 1 failed."""
     # Before modules are loaded, which takes a second or more.
     end_on_request()
-    check_standard_streams()
+    _open_closed_streams()
 
     # One thread per rank: further threads would compete with the other ranks for the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -67,6 +67,17 @@ def main(arguments: list[str] | None = None) -> int:
         database.delValue(name)
 
     return run_verb(arguments[:end], options)
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that the caller has closed, so that no file of results gets the number of one of them."""
+    for name, mode in ("stdin", "r"), ("stdout", "w"), ("stderr", "w"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
+
+    # Characters that the terminal's encoding lacks are printed as escapes, as on stderr.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 if __name__ == "__main__":

@@ -23,12 +23,11 @@ from vipetsc.case.changes import put as put
 from vipetsc.case.changes import with_overrides as with_overrides
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
-from vipetsc.case.plain import TOO_DEEP, is_deeper, plain_table, wrong_keys
+from vipetsc.case.plain import plain_table, wrong_keys
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
 from vipetsc.case.section import described, is_within
 from vipetsc.case.shapes import MARK
-from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
 from vipetsc.wording import nearest
@@ -78,9 +77,6 @@ class CaseFile(Section):
         if unnamed:
             ways = f"{kind}.load takes the name of a file, {kind}.from_table a table"
             raise TypeError(f"{kind} takes its sections by name, as in {kind}(lattice={{...}}); {ways}")
-        too_deep = [Problem(name, None, TOO_DEEP) for name, value in sections.items() if is_deeper(value)]
-        if too_deep:
-            raise CaseError(too_deep)
         super().__init__(**self.fields_of(plain_table(sections)))
 
     @classmethod
@@ -164,11 +160,7 @@ class CaseFile(Section):
             raise TypeError(f"{cls.__name__}.from_table takes a table of sections by name, a dict, not {table!r}")
         if isinstance(overrides, str) or not isinstance(overrides, Iterable):
             raise TypeError(f"overrides are a list of texts, as ['lattice.cells=60'], not {overrides!r}")
-        problems: list[Problem] = []
-        if is_deeper(table):
-            problems.append(Problem("case", None, TOO_DEEP))
-        else:
-            problems += wrong_keys(table)
+        problems = list(wrong_keys(table))
         if problems:
             raise CaseError(problems, source)
 
@@ -298,22 +290,22 @@ def read_toml(path: str | Path) -> Table:
         # utf-8-sig: editors on Windows begin files with a byte order mark, which TOML does not allow.
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise CaseError([Problem(readable(path), None, f"{error.strerror}; a case file (TOML) is needed")]) from None
+        raise CaseError([Problem(str(path), None, f"{error.strerror}; a case file (TOML) is needed")]) from None
     except ValueError as error:
-        raise CaseError([Problem(readable(path), None, f"not a TOML file ({error})")]) from None
-    table = {"name": readable(path.stem)} | parsed(text, readable(path))
-    return with_located(with_absolute_names(table, path.parent), path.parent)
+        raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
+    table = {"name": path.stem} | parsed(text, str(path))
+    try:
+        return with_located(with_absolute_names(table, path.parent), path.parent)
+    except RecursionError as error:
+        raise CaseError([Problem(str(path), None, f"tables are nested too deeply ({error})")]) from None
 
 
 def parsed(text: str, source: str) -> Table:
     """Return the table that a ``text`` in TOML is; raises CaseError, with the ``source`` of the text as its key."""
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise CaseError([Problem(source, None, f"not a TOML file ({error})")]) from None
-    if is_deeper(table):
-        raise CaseError([Problem(source, None, TOO_DEEP)])
-    return table
 
 
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:

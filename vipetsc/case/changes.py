@@ -7,9 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from vipetsc.case.plain import DEEPEST, TOO_DEEP, is_deeper
 from vipetsc.case.section import Problem
-from vipetsc.io.names import readable
 
 ITEM = re.compile(r"(.+)\[([1-9]\d*)\]")  # an entry of a list, as in masses[2]
 
@@ -44,7 +42,7 @@ def with_overrides(table: dict[str, Any], overrides: Iterable[str]) -> tuple[dic
     # The table may be the built-in one, which later cases read too.
     table = copy.deepcopy(table)
     problems: list[Problem] = []
-    for override in map(readable, overrides):
+    for override in overrides:
         path, equals, text = (part.strip() for part in override.partition("="))
         keys = path.split(".")
         value = value_of(text)
@@ -55,8 +53,6 @@ def with_overrides(table: dict[str, Any], overrides: Iterable[str]) -> tuple[dic
             problems.append(
                 Problem("--set", override, "gives a single key; give the keys in further lines with a --set each")
             )
-        elif len(keys) > DEEPEST or is_deeper(value, DEEPEST - len(keys)):
-            problems.append(Problem("--set", override, TOO_DEEP))
         else:
             problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems

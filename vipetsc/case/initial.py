@@ -12,7 +12,7 @@ from pydantic import Field
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
 from vipetsc.case.section import described
-from vipetsc.io.names import readable, resolved_path
+from vipetsc.io.names import resolved_path
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
@@ -336,13 +336,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     amplitude, cell = state.largest(frequency)
     if amplitude == 0:
         raise CaseError([Problem("initial.path", initial.path, "the state in it is at rest")])
-    update = {
-        "path": readable(path),
-        "sha256": digest,
-        "amplitude": amplitude,
-        "time": state.time,
-        "orbit": state.orbit,
-    }
+    update = {"path": str(path), "sha256": digest, "amplitude": amplitude, "time": state.time, "orbit": state.orbit}
     return Beginning(initial.model_copy(update=update), frequency, cell, state.moving())
 
 

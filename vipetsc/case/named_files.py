@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from vipetsc.io.names import path_named, readable
-
 # Keys that name a file: `drive.samples.file` and `initial.path`, which sweeps and searches may vary, and the `file` of
 # `identify.records`.
 SECTIONS = "drive", "initial", "sweep", "optimise", "identify"
@@ -45,7 +43,7 @@ def relative_names(table: dict[str, Any]) -> list[str]:
         elif isinstance(value, list):
             for item in value:
                 yield from names(item, key)
-        elif key in KEYS and isinstance(value, str) and not path_named(value).is_absolute():
+        elif key in KEYS and isinstance(value, str) and not Path(value).is_absolute():
             yield value
 
     return [name for section in SECTIONS for name in names(table.get(section), section)]
@@ -53,10 +51,10 @@ def relative_names(table: dict[str, Any]) -> list[str]:
 
 def _absolute_name(name: str, folder: Path) -> str:
     """The ``name`` of a file of ``folder``, or of the current folder; as it is where neither has the file."""
-    path = path_named(name)
+    path = Path(name)
     # The folder of the case file first: a case that is moved with its data must not find other data of the same name.
     for place in (folder, Path()):
         # ``Path.is_file`` would raise for a name that is too long for the system.
         if os.path.isfile(place / path):
-            return readable((place / path).absolute())
+            return str((place / path).absolute())
     return name

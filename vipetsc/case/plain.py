@@ -1,4 +1,4 @@
-"""Tables built in a program: in the types of a TOML file, with names as keys, and not too deep."""
+"""Tables built in a program: in the types of a TOML file, with names as keys."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
@@ -8,19 +8,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from vipetsc.case.section import Problem
-
-# Python's copy and pickle fail from 480 to 980 levels on; the keys of a case have fewer than ten.
-DEEPEST = 50
-TOO_DEEP = f"tables and lists are nested more than {DEEPEST} levels deep; no key of a case needs this"
-
-
-def is_deeper(value: Any, levels: int = DEEPEST) -> bool:
-    """Return whether tables and lists, or what becomes one, stand more than so many ``levels`` deep in ``value``."""
-    if isinstance(value, Mapping):
-        value = value.values()
-    elif not isinstance(value, list | tuple):
-        return False
-    return levels == 0 or any(is_deeper(item, levels - 1) for item in value)
 
 
 def wrong_keys(value: Any, path: str = "") -> Iterator[Problem]:
@@ -36,7 +23,7 @@ def wrong_keys(value: Any, path: str = "") -> Iterator[Problem]:
 
 
 def plain_table(table: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return ``table``, which is not too deep, in the types of TOML; a value None is a key that is not given.
+    """Return ``table`` in the types of TOML; a value None is a key that is not given.
 
     Tuples and arrays become lists, numbers of numpy those of Python, paths text, and sections of a case tables.
     """

@@ -11,7 +11,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.case.section import described
-from vipetsc.io.names import readable, resolved_path
+from vipetsc.io.names import resolved_path
 from vipetsc.io.tables import read_table
 from vipetsc.lattice.drive import Interpolation
 
@@ -83,7 +83,7 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
 
     # Numbers that are smaller than those allowed in a case are noise about 0.
     times, values = np.where(np.abs(rows) < 1 / LARGEST, 0.0, rows).T.tolist()
-    filled = {"file": readable(file), "sha256": digest, "time": times, "value": values}
+    filled = {"file": str(file), "sha256": digest, "time": times, "value": values}
     return drive | {"samples": samples | filled}, []
 
 

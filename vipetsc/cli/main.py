@@ -11,8 +11,7 @@ from mpi4py import MPI
 import vipetsc
 from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import COMMON_ARGUMENTS
-from vipetsc.cli.messages import echo, reporting
-from vipetsc.cli.streams import report_unwritten
+from vipetsc.cli.messages import code_of, discard, echo, reporting
 from vipetsc.cli.verb import BAD_INPUT, FAILED, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
@@ -26,15 +25,23 @@ ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that prints on rank 0 only and ends all ranks together."""
+    """An argument parser that prints on rank 0 only, keeps its ``error_in_print``, and ends all ranks together."""
+
+    error_in_print: OSError | None = None
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        if message and MPI.COMM_WORLD.rank == 0:
+        if not message or MPI.COMM_WORLD.rank != 0:
+            return
+        try:
             super()._print_message(message, file)
+            sys.stdout.flush()
+        except OSError as error:
+            discard(sys.stdout)
+            self.error_in_print = error
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with ``status``; if that is 0, with the code of a failure to print the help."""
-        super().exit(status or on_root(MPI.COMM_WORLD, lambda: report_unwritten([sys.stdout])), message)
+        super().exit(status or on_root(MPI.COMM_WORLD, lambda: code_of("stdout", self.error_in_print)), message)
 
 
 def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
@@ -43,21 +50,26 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     if not has_verb:
         arguments = ["run", *arguments]  # of the built-in case
 
-    options = _parser(called=arguments[0]).parse_args(arguments)
+    parser = _parser(called=arguments[0])
+    try:
+        " ".join(arguments).encode()
+    except UnicodeEncodeError:
+        parser.error("an argument is not text in UTF-8, which files of results could not hold; rename the file")
+    options = parser.parse_args(arguments)
     # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
-        with reporting(MPI.COMM_WORLD, options, is_answer) as streams:
+        with reporting(MPI.COMM_WORLD, options, is_answer) as outputs:
             code = _call(options, petsc or {})
+            # Rank 0 prints for all, and all end with one code.
+            lost = on_root(MPI.COMM_WORLD, lambda: [code_of(output.title, output.error) for output in outputs])
     except FolderError as error:
         # The file of --log cannot be written, so that nothing else is set up to report it.
         if MPI.COMM_WORLD.rank == 0:
             print(f"vipetsc: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
-    # Rank 0 prints for all, and all end with one code.
-    unwritten = on_root(MPI.COMM_WORLD, lambda: report_unwritten(streams))
-    return code or unwritten
+    return code or next(filter(None, lost), 0)
 
 
 def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:

@@ -4,8 +4,10 @@ What a verb was asked to print is an "answer", as opposed to progress and warnin
 """
 
 import argparse
+import errno
 import logging
 import os
+import signal
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,14 +16,58 @@ from typing import Any, TextIO
 
 from mpi4py import MPI
 
-from vipetsc.cli.streams import CheckedStream
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import on_root
 from vipetsc.progress import BAR
 
 logger = logging.getLogger("vipetsc")
 answers = logging.getLogger("vipetsc.answers")
+CUT_OFF = 128 + signal.SIGPIPE  # exit code that a shell reports for a program that wrote into a closed pipe
 OFTEN = {"vipetsc.step", "vipetsc.landing", "vipetsc.read"}  # audit events too frequent for --verbose
+
+
+class Output(logging.StreamHandler[TextIO]):
+    """A handler that writes to a ``stream``, called ``title`` in messages, and keeps its first ``error`` in writing.
+
+    What comes after an error is dropped: a closed pipe or a full disk must not cost a run that is saved elsewhere.
+    """
+
+    def __init__(self, stream: TextIO, title: str) -> None:
+        super().__init__(stream)
+        self.title = title
+        self.error: OSError | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a message, unless an earlier one could not be written."""
+        if self.error is None:
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Keep an error of the system; others are defects, and are reported as such."""
+        error = sys.exc_info()[1]
+        if isinstance(error, OSError):
+            self.error = error
+            discard(self.stream)
+        else:
+            super().handleError(record)
+
+
+def discard(stream: TextIO) -> None:
+    """Let what is written to ``stream`` go nowhere, also what is left in its buffer, which Python writes at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def code_of(title: str, error: OSError | None) -> int:
+    """Return the exit code for an ``error`` in writing the stream ``title``, which is reported; 0 without an error."""
+    if error is None:
+        return 0
+    # A reader that closes the pipe, as `head` does, needs no message.
+    if error.errno == errno.EPIPE:
+        return CUT_OFF
+    logger.critical("vipetsc: %s: %s; some output was lost; the result files are complete", title, error.strerror)
+    return 1
 
 
 def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
@@ -47,19 +93,22 @@ def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
 
 
 @contextmanager
-def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[TextIO]]:
+def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[Output]]:
     """Print messages within the block as ``options`` ask for (quiet, verbose, log).
 
-    With ``is_answer``, answers are printed even with --quiet. The value of the block is the list of the streams that
-    must take all output, for ``report_unwritten``. All ranks must call it. Raises FolderError if the file of ``--log``
-    cannot be opened.
+    With ``is_answer``, answers are printed even with --quiet. The value of the block is the list of the outputs that
+    must take all messages, for ``code_of``. All ranks must call it. Raises FolderError if the file of ``--log`` cannot
+    be opened.
     """
-    handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
-    streams = [sys.stdout]
+    out = Output(sys.stdout, "stdout")
+    out.addFilter(lambda record: record.name == answers.name and (is_answer or not options.quiet))
+    err = Output(sys.stderr, "stderr")
+    err.addFilter(lambda record: record.name != answers.name)
+    err.setLevel(logging.WARNING if options.quiet else logging.DEBUG)
+    logs: list[Output] = []
     if options.log:
         # All ranks must raise the error: otherwise they would wait for rank 0 in the first collective call.
-        on_root(comm, lambda: streams.append(_open_log(options.log)))
-        handlers += [_log_handler(stream) for stream in streams[1:]]
+        on_root(comm, lambda: logs.append(_open_log(options.log)))
 
     # Messages do not go on to the root logger: the handler that `__main__` gives it would print everything again.
     is_verbose = options.verbose and comm.rank == 0
@@ -68,52 +117,37 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     logger.setLevel(logging.DEBUG if is_verbose else logging.INFO)
     # Progress bars write to stderr themselves, and look at the level of a logger of their own.
     logging.getLogger(BAR).setLevel(logging.CRITICAL if options.quiet else logging.NOTSET)
-    for handler in handlers:
+    for handler in (out, err, *logs):
         logger.addHandler(handler)
     if is_verbose:
         sys.addaudithook(_report_phase)
 
     try:
-        yield streams
+        yield [out, *logs]
     except Exception as error:
         # The error goes into the file alone: on stderr the exception hook of the process reports it.
-        for handler in handlers:
-            if handler.stream in streams[1:]:
-                handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
+        for log in logs:
+            log.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
         raise
     finally:
-        for handler in handlers:
+        for handler in (out, err, *logs):
             logger.removeHandler(handler)
             handler.close()
-        for stream in streams[1:]:
-            stream.close()
+        for log in logs:
+            log.stream.close()
         logger.propagate = True
         logger.setLevel(level)
 
 
-def _stream_handlers(quiet: bool, is_answer: bool) -> "list[logging.StreamHandler[TextIO]]":
-    """The handlers of stdout, for answers, and of stderr, for everything else."""
-    out = logging.StreamHandler(sys.stdout)
-    out.addFilter(lambda record: record.name == answers.name and (is_answer or not quiet))
-    err = logging.StreamHandler(sys.stderr)
-    err.addFilter(lambda record: record.name != answers.name)
-    err.setLevel(logging.WARNING if quiet else logging.DEBUG)
-    return [out, err]
-
-
-def _open_log(path: Path) -> CheckedStream:
+def _open_log(path: Path) -> Output:
     """The file of ``--log``, to whose end messages are added."""
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        stream = path.open("a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise FolderError(f"--log {path}: {error.strerror}; name a file that can be written") from error
-    return CheckedStream(descriptor, f"--log {path}", encoding="utf-8")
-
-
-def _log_handler(stream: TextIO) -> "logging.StreamHandler[TextIO]":
-    handler = logging.StreamHandler(stream)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    return handler
+    log = Output(stream, f"--log {path}")
+    log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    return log
 
 
 def _report_phase(event: str, arguments: tuple[Any, ...]) -> None:

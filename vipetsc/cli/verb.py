@@ -23,7 +23,6 @@ from vipetsc.cli.drawing import Pictures, draw_pictures
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
-from vipetsc.io.names import path_named
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
 if TYPE_CHECKING:
@@ -164,7 +163,7 @@ class StudyVerb(Verb):
         # One rank has read the case, and has imported the modules that it names; the others do now.
         on_every_rank(comm, case.import_plugins)
 
-        folder = options.out or Path("runs") / path_named(f"{case.name}{self.suffix}")
+        folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
         work = Work(options, folder, comm, stop)
         # Computed on rank 0 alone: warnings need the bands of the cell, which take a moment.
         work.warn(on_root(comm, case.warnings))

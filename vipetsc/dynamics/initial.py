@@ -1,5 +1,6 @@
 """Initial motion of a run: the cells of each rank, the motion of all sites, the energy of the state."""
 
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -11,7 +12,6 @@ from vipetsc.case.case_file import Problem
 from vipetsc.case.initial import file_hash
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
-from vipetsc.io.names import path_named
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain
 from vipetsc.lattice.modes import mode_shape
@@ -78,7 +78,7 @@ def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarr
 
 def _read_fields(initial: Any, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
     """The fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
-    path = path_named(str(initial.path))
+    path = Path(str(initial.path))
 
     def check() -> None:
         try:

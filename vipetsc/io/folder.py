@@ -28,7 +28,6 @@ import numpy as np
 import vipetsc
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.lock import FolderError, locked, remove_temporary_files
-from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
 from vipetsc.process import say
 from vipetsc.sources import source_key
@@ -298,7 +297,8 @@ def origin() -> dict[str, Any]:
         "hdf5_version": h5py.version.hdf5_version,
         "numpy_version": np.__version__,
         "python_version": platform.python_version(),
-        "command": " ".join(["vipetsc", *map(readable, sys.argv[1:])]),
+        # HDF5 stores text as UTF-8, which has not every name of a file.
+        "command": " ".join(["vipetsc", *sys.argv[1:]]).encode("utf-8", "replace").decode(),
         "petsc_options": given or "none",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": platform.node(),

@@ -16,7 +16,6 @@ from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
-from vipetsc.io.names import path_named
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, modes_of_a_cell, pass_bands, wave_bands
 from vipetsc.lattice.damped import damped_bloch, decay_length
 from vipetsc.parallel import StopRequest, on_root
@@ -34,7 +33,7 @@ JSON = argument("--json", action="store_true", help="print JSON instead of a tab
 def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Print pass bands, gaps and group velocities of a case's cell, and write them as a table and a picture."""
     case = on_root(comm, lambda: Case.load(options.case, options.set))
-    folder = options.out or Path("runs") / path_named(f"{case.name}-bands")
+    folder = options.out or Path("runs") / f"{case.name}-bands"
 
     # All ranks find modes together; everything else is a second's work for one.
     modes = modes_report(case, options, folder, comm)
