@@ -219,4 +219,10 @@ def test_recipes_and_citation_say_what_the_package_says():
     # The recipe and the package have the same bounds of versions.
     bounds = {name.removesuffix("-base"): bound for name, bound in re.findall(r"- ([\w-]+) >=(\S+)", run)}
     assert {name: bounds[name] for name in needed} == dict(line.split(">=", 1) for line in lines)
+    # What a test needs of an extra has the bounds of the extra.
+    tested = {line for line in extras["test"] if re.match(r"[\w-]+", line)[0] in needed}
+    assert tested <= {*lines}
+
+    # Every package that the program imports is below a version that nobody has tried.
+    assert all("<" in line for line in [*lines, *extras["movie"]])
     assert "- petsc * real_*\n" in run
