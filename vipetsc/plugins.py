@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc import register
+from vipetsc.process import announce
 from vipetsc.register import PARTS, PartError, RegisteredPart
 
 GROUP = "vipetsc.plugins"  # of entry points
@@ -80,10 +81,11 @@ def registered(kind: str) -> tuple[str, ...]:
 
 
 def call(part: RegisteredPart, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the value of a ``function`` of a ``part``.
+    """Return the value of a ``function`` of a ``part``, which is named before its first call.
 
     Raises PartError for errors of the program, and PartFailure for all others.
     """
+    announce(f"calling the {part.kind} {part.name!r} of {part.file}")
     try:
         return function(*arguments)
     except Exception as error:
@@ -129,6 +131,7 @@ def load(name: str) -> Plugin:
     """Import the module ``name`` once; raises PluginError if it fails, has changed since, or registers nothing."""
     plugin = _PLUGINS.get(name)
     if plugin is None:
+        announce(f"importing {name}")
         plugin = _imported(name)
         _PLUGINS[name] = plugin
 

@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import sys
+from functools import cache
 from types import FrameType
 
 logger = logging.getLogger(__name__)
@@ -53,3 +54,13 @@ def say(text: str) -> None:
     elif logger.isEnabledFor(logging.WARNING):
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
+
+
+@cache
+def announce(text: str) -> None:
+    """Report ``text`` once, on one rank, before code of a user's module begins.
+
+    Where that code never returns, or ends the process, this is the last line.
+    """
+    if not launched_rank():
+        say(f"vipetsc: {text}")

@@ -223,7 +223,9 @@ def test_names_are_those_of_the_modules_that_a_case_names(folder):
     # This case imports all modules: their names are then registered in the process.
     Case.load(folder / "case.toml")
     others = [str(folder / name) for name in ("factors.py", "pulses.py")]
-    with pytest.raises(CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; plugins"):
+    with pytest.raises(
+        CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; other names come from modules"
+    ):
         Case.load(folder / "case.toml", [f"plugins.modules={others}"])
     with pytest.raises(CaseError, match="did you mean 'hardening'"):
         Case.load(folder / "case.toml", ["contacts.law=hardenin"])
@@ -328,3 +330,49 @@ def test_two_ranks_have_the_bits_of_one(folder, out, tmp_path, on_ranks):
     on_ranks(2, "run", folder / "case.toml", "--out", tmp_path / "two", *set_words("output.figures=false"))
     with open(out / "run.h5") as one, open(tmp_path / "two/run.h5") as two:
         assert np.array_equal(one["velocity"], two["velocity"])
+
+
+PLAIN = """
+import os
+
+from vipetsc import register
+
+def force(x, k):
+    return k * x
+
+def slope(x, k):
+    return k
+
+def energy(x, k):
+    return 0.5 * k * x * x
+
+register.elastic_law("plain", force, slope, energy, onset_exponent=1.0)
+
+@register.measure("abrupt", unit="1", text="a measure that ends the process")
+def abrupt(run):
+    os._exit(9)
+"""
+# What the program reports before it calls code of these modules, which ends the process.
+REPORTED = {
+    "import os\n\nos._exit(9)\n": ["importing {file}"],
+    PLAIN: ["importing {file}", "compiling the law 'plain' of {file}", "calling the measure 'abrupt' of {file}"],
+}
+
+
+@pytest.mark.parametrize("source", REPORTED)
+def test_a_part_that_ends_the_process_is_named_before(source, tmp_path, vipetsc):
+    """Whatever a module does, the last line says which of its parts does it."""
+    file = tmp_path / "part.py"
+    file.write_text(source)
+    case = tmp_path / "case.toml"
+    case.write_text(
+        '[plugins]\nmodules = ["part.py"]\n[lattice]\npreset = "four-band"\ncells = 12\n'
+        '[contacts]\nlaw = "plain"\nstiffness = 2e5\nsites = [4]\nclearance = 1e-3\n'
+        "[drive]\namplitude = 1.0\n[time]\nend = 1e-3\n[output]\nfigures = false\n"
+    )
+    ended = vipetsc(0, "run", case, "--out", tmp_path / "out")
+    assert ended.returncode == 9
+    lines = ended.stderr.splitlines()
+    expected = ["vipetsc: " + line.format(file=file) for line in REPORTED[source]]
+    assert [line for line in lines if str(file) in line] == expected
+    assert lines[-1] == expected[-1]

@@ -13,6 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from vipetsc.compiled import c_address, kernel, users_function
+from vipetsc.process import announce
 from vipetsc.register import MOST_PARAMETERS, LawPart
 
 # Of x, the stiffness k and four parameters: one for all laws, so that a kernel calls any of them.
@@ -30,7 +31,8 @@ class CompiledLaw(NamedTuple):
 
 @cache
 def compiled_law(part: LawPart) -> CompiledLaw:
-    """The compiled functions of a law; raises ValueError for one that numba cannot compile."""
+    """The compiled functions of a law, which is named before; raises ValueError for one that numba cannot compile."""
+    announce(f"compiling the law {part.name!r} of {part.file}")
     addresses = [_address(function, len(part.parameters)) for function in (part.force, part.slope, part.energy)]
     return CompiledLaw(*addresses)
 
