@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import numba
 
@@ -29,14 +29,11 @@ ROOMS = ("modes", "dynamics", "contact", "spectra", "lattice")
 SHARED = ("compiled.py", "records.py", "register.py")
 
 
-@overload
-def kernel(function: Function, /) -> Function: ...
-@overload
-def kernel(**options: Any) -> Callable[[Function], Function]: ...
 def kernel(function: Any = None, /, **options: Any) -> Any:
     """Compile a function as ``numba.njit`` does, at its first call; a division by zero gives inf or NaN.
 
-    The code is kept between runs where files can be written.
+    The code is kept between runs where files can be written. Kernels count as untyped: their annotations say which
+    named tuple an argument has, and callers pass its ``Record``.
     """
     # No C code calls these functions: the wrapper that it would need is not compiled.
     decorate = _kept(numba.njit, error_model="numpy", no_cfunc_wrapper=True, **options)

@@ -379,8 +379,8 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
     assert len(ordered) == 6
     assert sorted(offered) == ["fig10", "figS3"]
     assert len(encoded) == 6
-    # Each picture has a PNG, a PDF and a file of numbers.
-    assert len(first.drawn) == 3 * 6
+    # Each picture has a PNG and a PDF.
+    assert len(first.drawn) == 2 * 6
     cpu = read_record(root)["cpu"]
     assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
 

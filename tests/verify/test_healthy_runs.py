@@ -162,3 +162,32 @@ def test_substeps_that_are_taken_in_spite_of_their_error_are_counted(length, for
     assert bool(taken) == bool(forced)
     assert cluster.state["forced"].tolist() == [forced]
     assert cluster.state["rejected"].tolist() == [1 - forced]
+
+
+@pytest.mark.parametrize("short", [1e-4, 1e-10, 1e-11])
+def test_a_mass_that_creeps_onto_a_stop_comes_to_rest_on_it(short):
+    """A constant force holds an overdamped mass at 1 m, a stop ``short`` of that: it ends pressed onto the stop.
+
+    1e-10 m are the tolerance of landings. There the damping of an impact, divided by its speed, took steps of
+    microseconds for ever.
+    """
+    cell = {
+        "masses": [1.0],
+        "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "next_cell": True}],
+        "grounding": [3.0],
+    }
+    contacts = {"law": "bilinear", "stiffness": 1e4, "restitution": 0.5, "sites": [1], "pair": [0, 1], "side": "plus"}
+    case = Case.from_table(
+        {
+            "name": "creeping",
+            "lattice": {"cells": 1, "cell": cell},
+            "contacts": contacts | {"clearance": 1.0 - short},
+            "drive": {"waveform": "step", "amplitude": 1.0, "ramp": 0.1, "frequency": 1.0},
+            "time": {"end": 200.0, "samples": 2001},
+            "output": {"figures": False},
+        }
+    )
+    run, result = simulated(case)
+    assert result.statistics["steps"] < 20_000
+    end = run["displacement"].values[-1, 0, 0]
+    assert end == pytest.approx(1.0 - short * (1 - 1e-4), abs=1e-10)

@@ -143,7 +143,7 @@ def check_scalars(scalar: Any = None) -> Check:
     from vipetsc.dynamics.petsc_library import refused_scalars
 
     value = scalar or PETSc.ScalarType
-    return Check("petsc scalars", str(np.dtype(value)), refused_scalars(value))
+    return Check("petsc scalars", str(np.dtype(value)), refused_scalars(value) or "")
 
 
 def loaded_libraries(name: re.Pattern[str]) -> list[str]:

@@ -181,16 +181,33 @@ def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, 
 
 
 @kernel
-def _begin_episode(site: Any, track: Any, rate: float, t: float, rested: bool) -> None:
-    """Begin the episode of a ``site`` that closes at w' = ``rate`` in m/s and ``t`` in s; ``rested``: from rest."""
+def _resolved_speed(site: Any, w: float) -> float:
+    """Return the approach speed in m/s below which the landing of a ``site`` at ``w`` in m does not resolve an impact.
+
+    A site may land up to a tolerance beyond its clearance, and then begins its contact with elastic energy. A slower
+    impact has less energy than that, and a damping divided by its speed would make the contact stiff without bound.
+    """
+    side = side_of(site.mode)
+    return np.sqrt(2.0 * elastic_energy(site.elastic, side * w - gap_of(site, side)) / site.reduced_mass)
+
+
+@kernel
+def _begin_episode(site: Any, track: Any, w: float, rate: float, t: float, rested: bool) -> None:
+    """Begin the episode of a ``site`` that closes at ``w`` in m, w' = ``rate`` in m/s and ``t`` in s.
+
+    ``rested`` says that it closes from rest.
+    """
     # A contact that closes from rest has no approach velocity. With rate = 0 the floor takes its place below. A law
     # without loss does not use it: there w' serves for the duration of the impact.
     if rested and site.damping != 0.0:
         rate = 0.0
     side = side_of(site.mode)
     # Without the floor a grazing onset would make the factor g unbounded.
-    track.counts.floored += abs(rate) < site.floor
-    site.approach = side * max(abs(rate), site.floor)
+    floor = site.floor
+    if site.damping != 0.0 and not rested:
+        floor = max(floor, _resolved_speed(site, w))
+    track.counts.floored += abs(rate) < floor
+    site.approach = side * max(abs(rate), floor)
 
     episode = track.episode
     episode.site = track.number
@@ -240,7 +257,7 @@ def _set_mode(
     energies[i] = energy + clipped_energy(site, motion[0])
 
     if not had_episode and in_episode(mode):
-        _begin_episode(site, track, motion[1], t, rested)
+        _begin_episode(site, track, motion[0], motion[1], t, rested)
         # The loss of an episode is the difference of ``energy`` between its end and its beginning.
         track.episode.loss = -energy
     elif had_episode and not in_episode(mode):

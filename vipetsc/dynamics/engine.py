@@ -9,7 +9,6 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.samples import Samples
 from vipetsc.parallel import StopRequest
@@ -38,7 +37,7 @@ class Engine(ABC):
 
     name: ClassVar[str]
     integrates_damping: ClassVar[bool]
-    lattice: LatticeRecord
+    lattice: Any
     state: PETSc.Vec
     time: float
 

@@ -54,4 +54,4 @@ def _pointer(typing_context: Any, address: Any, dtype: Any) -> Any:
 @inlined
 def array_at(address: int, length: int, dtype: Any) -> Any:
     """The array (length,) of a ``dtype`` at an int64 address."""
-    return numba.carray(_pointer(address, dtype), (length,))  # type: ignore[call-arg]
+    return numba.carray(_pointer(address, dtype), (length,))

@@ -143,8 +143,19 @@ class Ledger(Observer):
     """
 
     name = "ledger"
-    saved = ("worst", "most_work", "work", "dissipated", "dissipated_by_damping", "most_damped", "quadrature")
-    saved = (*saved, "quadrature_error", "coarse", "last_power", "last_even_power")
+    saved = (
+        "worst",
+        "most_work",
+        "work",
+        "dissipated",
+        "dissipated_by_damping",
+        "most_damped",
+        "quadrature",
+        "quadrature_error",
+        "coarse",
+        "last_power",
+        "last_even_power",
+    )
     worst = most_work = most_damped = 0.0
     work = dissipated = dissipated_by_damping = float("nan")
     quadrature = quadrature_error = coarse = 0.0

@@ -80,7 +80,7 @@ def _function_at(typing_context, address):  # type: ignore[no-untyped-def]
 @kernel
 def call_address(address: int, x: float, k: float, a: float, b: float, c: float, d: float) -> float:
     """Call the C function of ``SIGNATURE`` at an ``address``."""
-    function: Any = _function_at(address)  # type: ignore[call-arg]
+    function: Any = _function_at(address)
     return function(x, k, a, b, c, d)
 
 

@@ -28,7 +28,7 @@ from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.substeps import Cluster
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.parallel import StopRequest, on_every_rank
-from vipetsc.records import PartRecords, Record
+from vipetsc.records import Record
 
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
 """Steps done and the last one to do. Of a failure: 2 n if the state after n steps is not finite, 2 n + 1 if a cluster
@@ -91,7 +91,7 @@ def take_steps(
     halo: Halo,
     dofs: DofTables,
     clusters: Cluster,
-    each: PartRecords,
+    each: Any,
     tracks: Tracks,
     samples: Samples,
 ) -> tuple[int, np.ndarray]:

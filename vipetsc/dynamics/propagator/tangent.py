@@ -83,13 +83,14 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.orbit_tape import ClosedSubsteps, OrbitContacts, OrbitTape, clearance_on
-from vipetsc.dynamics.propagator.stencil import Halo, exchange
+from vipetsc.dynamics.propagator.stencil import exchange
 from vipetsc.dynamics.propagator.step_choice import refusal as refusal_of_steps
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
 from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
+from vipetsc.records import Record
 
 # Rows of the tape of a cluster unless the caller gives another number. A site that is not free has a row in each
 # substep, of 208 B with the motion at the nodes: 1.7 MB. A contact of the built-in case takes fewer than 30 substeps,
@@ -118,7 +119,7 @@ class _Workspace(NamedTuple):
     """Workspace of ``variations`` that move together, the ``halo`` for their exchanges, the PETSc objects behind it."""
 
     variations: Variations
-    halo: Halo
+    halo: Record
     petsc_objects: list
 
 

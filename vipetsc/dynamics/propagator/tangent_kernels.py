@@ -32,7 +32,6 @@ from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
 from vipetsc.dynamics.propagator.taylor import copy, evaluate, shift
-from vipetsc.records import PartRecords
 
 
 class Variations(NamedTuple):
@@ -193,7 +192,7 @@ def _shift_all(x: np.ndarray, count: int, terms: int, s: float) -> None:
 
 
 @kernel
-def linearise(each: PartRecords, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray) -> None:
+def linearise(each: Any, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray) -> None:
     """Put the matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion`` into ``out``.
 
     J maps the series of the free motion (dof, coefficient) and the variations of w'_minus (site,) at the step's

@@ -44,7 +44,7 @@ MOST_TRIALS = 10_000
 # Longest step that is taken without a search for changes, as a fraction of the first step without contacts.
 BLIND = 1e-6
 # A time step below this many rounding units of the time does not advance it reliably.
-SHORTEST_STEP = 8 * np.finfo(float).eps
+SHORTEST_STEP = 8 * float(np.finfo(float).eps)
 # Steps in radians of the first drive's frequency: the first one, and the length with which the controller begins, for
 # which any number of this size serves.
 FIRST_STEP = 0.002
