@@ -86,8 +86,8 @@ def test_impact_log_is_complete_and_ordered(run_folder):
 
 
 def test_a_stalled_run_states_when_and_where_and_keeps_its_samples(folder, monkeypatch):
-    # A step that needs more than 6 trials now counts as stalled, and the step at a steep onset needs more.
-    monkeypatch.setattr(integrator, "MOST_TRIALS", 6)
+    # Two trials for the one site now count as stalled, and the step at a steep onset needs more.
+    monkeypatch.setattr(integrator, "MOST_TRIALS", 1)
     result = simulate(small_case(), folder / "run")
     assert not result.complete
     assert not result.resumable
