@@ -391,7 +391,7 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
     assert encoded == []
 
     next((root / "figures").glob("fig10-*.png")).unlink()
-    assert len(make.make_paper(plan, root).drawn) == 3
+    assert len(make.make_paper(plan, root).drawn) == 2
     assert offered == ["fig10"]
     assert encoded == []
 

@@ -28,9 +28,11 @@ def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name,
     """A signal before any work ends the process with code 75, as a run that can be resumed; ranks print nothing."""
     # The tests may run under nohup, which ignores SIGHUP.
     not_ignored = f"import signal; signal.signal(signal.{name}, signal.SIG_DFL)"
+    # Workers of pytest-xdist inherit what MPI has set in the process that started them.
+    alone = {key: value for key, value in os.environ.items() if key != "OMPI_COMM_WORLD_RANK"}
     ended = subprocess.run(
         [sys.executable, "-c", not_ignored + REQUESTED.format(name=name)],
-        env=os.environ | launched,
+        env=alone | launched,
         stderr=subprocess.PIPE,
         text=True,
         check=False,
