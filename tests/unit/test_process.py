@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from vipetsc.process import RANKS
+
 pytestmark = pytest.mark.parallel(1)
 
 
@@ -29,7 +31,7 @@ def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name,
     # The tests may run under nohup, which ignores SIGHUP.
     not_ignored = f"import signal; signal.signal(signal.{name}, signal.SIG_DFL)"
     # Workers of pytest-xdist inherit what MPI has set in the process that started them.
-    alone = {key: value for key, value in os.environ.items() if key != "OMPI_COMM_WORLD_RANK"}
+    alone = {key: value for key, value in os.environ.items() if key not in RANKS}
     ended = subprocess.run(
         [sys.executable, "-c", not_ignored + REQUESTED.format(name=name)],
         env=alone | launched,
