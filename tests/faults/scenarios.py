@@ -347,7 +347,8 @@ def _content(path: Path) -> dict:
         for row in rows:
             if "key" in row:
                 # Records are compared as text, in which NaN equals NaN.
-                found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None})
+                statistics = _timeless(row.get("statistics") or {})
+                found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None, "statistics": statistics})
             else:
                 found[row.get("id") or row["linear"]] = (row.get("status"), row.get("measures"))
     elif path.name == "summary.json":
