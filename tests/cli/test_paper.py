@@ -73,9 +73,9 @@ def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
     assert second_call.complete is True
     assert modified(made) == before
 
-    # A picture consists of three files, which are drawn together.
+    # A picture consists of two files, which are drawn together.
     (made / "figures" / "fig10-reduced-model-printed.pdf").unlink()
-    assert len(make_paper(drawing(tiny_plan()), made).drawn) == 3
+    assert len(make_paper(drawing(tiny_plan()), made).drawn) == 2
 
 
 @pytest.mark.mpirun
