@@ -53,7 +53,7 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
         ("[sweep.drive]\namplitude = 3", "sweep.drive.amplitude = 3"),
         ("[sweep.drive]\namplitude = { linear = [1, 2], count = 1000000000 }", "n from 1 to 10000"),
         ("[sweep.drive]\namplitude = { linear = [1, 2], count = 200000 }\nfrequency = { log = [900, 990], count = 11 }",
-         "sweep: makes 2200000 members"),
+         "sweep: has 2,200,000 members"),
         ("[lattice]\ncells = 10000000000000", "lattice.cells = 10000000000000: must be less than or equal to"),
         ("[contacts]\nsites = 1000000000000", "contacts.sites = 1000000000000"),
         ("[contacts]\nsites = 301", "contacts.sites = 301: more sites than the lattice has cells, 300"),
