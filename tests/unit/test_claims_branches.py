@@ -9,6 +9,7 @@ import pytest
 
 from tests.unit.claim_files import measure, put_sweep
 from vipetsc.case import Sweep
+from vipetsc.io.read import RUN_NEEDS
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.spectra import power_law
 
@@ -219,8 +220,12 @@ def put_portraits(root: Path, linearity: float) -> None:
             file["time"] = time
             file["cell"] = np.arange(1, 13)
             file["velocity"] = velocity
+            # The claim reads motion and site; the rest makes the file a run.
+            file["dof"] = np.arange(1, 5)
             file["sites/cell"] = [4]
-            file["energy/work"] = time
+            for needed in RUN_NEEDS:
+                if needed not in file and needed != "case":
+                    file[needed] = np.zeros(1)
             file.attrs["case"] = member.case.to_toml()
 
 

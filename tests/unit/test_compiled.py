@@ -49,6 +49,8 @@ def small(tmp_path) -> SimpleNamespace:
     """
     folder = tmp_path / "vipetsc"
     (folder / "lattice").mkdir(parents=True)
+    # Python prefers a package with this file, anywhere on its path, to a folder without it.
+    (folder / "__init__.py").write_text("")
     for room in compiled.ROOMS:
         (folder / room).mkdir(exist_ok=True)
     (folder / "lattice" / "constants.py").write_text(CONSTANTS)
