@@ -10,8 +10,7 @@ import pytest
 
 from tests.models import IN_PHASE, OUT_OF_PHASE, reduced_model
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.point import Point
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS

@@ -11,8 +11,7 @@ import pytest
 from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
 from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch_checks import BranchMonitor
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.guards import half_trace_change
+from vipetsc.modes.continuation.arclength import Continuation, half_trace_change
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import unit
 from vipetsc.modes.shooting.charts import Relative

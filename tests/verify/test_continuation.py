@@ -11,9 +11,7 @@ import pytest
 from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
 from tests.verify.conftest import follow
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.segment import Segment
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Continuation, Segment, locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting.dop853 import Dop853Flow

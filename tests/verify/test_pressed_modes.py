@@ -20,8 +20,7 @@ from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.orbits import ShootingMethod
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import sample_orbit

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from tests.models import reduced_model
-from vipetsc.modes.continuation.segment import Segment
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Segment, locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError

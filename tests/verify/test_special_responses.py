@@ -23,7 +23,7 @@ from vipetsc.figures.nfrc import frequency_response
 from vipetsc.modes.balance.hill import Hill, Stability
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import locate
 from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response

@@ -32,8 +32,7 @@ from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError

@@ -110,8 +110,8 @@ class Frame(Protocol[S]):
 class PeriodicProblem(Protocol[S]):
     """Equations whose solutions form branches.
 
-    ``guards`` says which changes from point to point are guarded (``continuation.guards``), and ``tolerance`` is that
-    of Newton's method.
+    ``guards`` says which changes from point to point are guarded (``continuation.arclength``), and ``tolerance`` is
+    that of Newton's method.
     """
 
     tolerance: float

@@ -15,8 +15,7 @@ from mpi4py import MPI
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method, Monitor
-from vipetsc.modes.continuation.arclength import Continuation, StepRule
-from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.arclength import Continuation, StepRule, locate
 from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 

@@ -17,9 +17,7 @@ from vipetsc.modes.branches.branch_checks import BranchMonitor, sampled
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
-from vipetsc.modes.continuation.arclength import GuardedSteps, StepRule
-from vipetsc.modes.continuation.guards import OrbitProblem
-from vipetsc.modes.continuation.special import at_energy
+from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, StepRule, at_energy
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem
