@@ -31,6 +31,7 @@ from small_pictures import save_small
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
+from vipetsc import follow
 from vipetsc.case import Case
 from vipetsc.figures import schematics, style
 from vipetsc.io.read import open_run
@@ -142,6 +143,35 @@ def contact_law(case: Case) -> Figure:
     return figure
 
 
+def followed() -> Figure:
+    """Draw the curves of a pitchfork, with and without an imperfection, and of Bratu's problem."""
+    n = 39
+    grid = (np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1) - 2 * np.eye(n)) * (n + 1) ** 2
+    pitchfork = follow(lambda x, p: p * x - x**3, [0.0], -1.0, 1.0)
+    # The imperfect one consists of two curves: each is followed from one of its ends.
+    imperfect = [
+        *follow(lambda x, p: p * x - x**3 + 1e-2, [0.0], -1.0, 1.0),
+        *follow(lambda x, p: p * x - x**3 + 1e-2, [-1.0], 1.0, -1.0),
+    ]
+    bratu = follow(lambda u, p: grid @ u + p * np.exp(u), np.zeros(n), 0.5, 4.0, largest_step=0.5)
+
+    figure = style.new_figure(style.PAGE, 2.6)
+    left, right = figure.subplots(1, 2)
+    for axes, curves, colour in ((left, imperfect, style.BLACK), (left, pitchfork, style.BLUE), (right, bratu, "k")):
+        for curve in curves:
+            x = curve["x"].values[:, curve.sizes["unknown"] // 2]
+            p = curve["p"].values
+            unstable = curve["unstable"].values > 0
+            axes.plot(p, np.where(unstable, np.nan, x), color=colour)
+            axes.plot(p, np.where(unstable, x, np.nan), color=colour, ls="--")
+            for kind, marker in (("fold", "o"), ("branch-point", "s")):
+                chosen = curve["kind"].values == kind
+                axes.plot(p[chosen], x[chosen], marker, color=style.VERMILION, ms=4, zorder=5)
+    left.set(xlabel="p", ylabel="x", title="(a) Pitchfork")
+    right.set(xlabel="p", ylabel="u at 1/2", title="(b) Bratu's problem")
+    return figure
+
+
 def named_cell(run: xr.Dataset) -> Figure:
     """Draw the cell and the lattice of a ``run``, and write the words host, resonator and stop at its boxes."""
     figure = schematics.unit_cell(run, None)
@@ -216,6 +246,7 @@ def main(arguments: list[str] | None = None) -> int:
         with open_run(folder / "four-band/run.h5") as run:
             save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png", WIDTH, MOST)
             save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png", WIDTH, MOST)
+        save_small(drawn(folder, followed), PICTURES / "follow.png", WIDTH, MOST)
         for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
             draw_notebook(notebook, folder)
     return 0

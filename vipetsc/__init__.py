@@ -5,6 +5,7 @@
     simulate  one run of a case, in memory or in a folder
     sweep     every member of a sweep, in memory or in a folder
     analyse   the measures of a run: spectra, energies of the pass bands, entropy
+    follow    solutions of your own equations F(x, p) = 0: folds, branch points, the branches that cross there
     open      result files as xarray datasets
     CaseError raised for an invalid case: key, value and remedy of every problem
     register  contact laws, dissipation factors, waveforms, measures and figures of a user's module, by name
@@ -24,13 +25,25 @@ All keys, their units and their defaults are in the manual (``vipetsc manual cas
 from importlib import import_module
 
 __version__ = "0.1.0"
-__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "register", "simulate", "sweep"]
+__all__ = [
+    "Case",
+    "CaseError",
+    "Sweep",
+    "analyse",
+    "follow",
+    "install_abort_hook",
+    "open",
+    "register",
+    "simulate",
+    "sweep",
+]
 
 MODULES = {
     "Case": ("vipetsc.case", "Case"),
     "CaseError": ("vipetsc.case", "CaseError"),
     "Sweep": ("vipetsc.case", "Sweep"),
     "analyse": ("vipetsc.studies.analysis", "analyse"),
+    "follow": ("vipetsc.modes.user_equations", "follow"),
     "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
     "open": ("vipetsc.io.read", "open_results"),
     "register": ("vipetsc", "register"),

@@ -5,9 +5,21 @@ from vipetsc.case import CaseError as CaseError
 from vipetsc.case import Sweep as Sweep
 from vipetsc.dynamics.run import simulate as simulate
 from vipetsc.io.read import open_results as open
+from vipetsc.modes.user_equations import follow as follow
 from vipetsc.parallel import install_abort_hook as install_abort_hook
 from vipetsc.studies.analysis import analyse as analyse
 from vipetsc.studies.sweep import run_sweep as sweep
 
 __version__: str
-__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "register", "simulate", "sweep"]
+__all__ = [
+    "Case",
+    "CaseError",
+    "Sweep",
+    "analyse",
+    "follow",
+    "install_abort_hook",
+    "open",
+    "register",
+    "simulate",
+    "sweep",
+]

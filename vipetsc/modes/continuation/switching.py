@@ -21,8 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vipetsc.modes.continuation.crossing import crossing_row
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, unit
+from vipetsc.modes.problem import Attempt, ContinuationError
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import repetitions
 from vipetsc.modes.shooting.shooting import DenseFrame, Shooting
@@ -110,10 +111,7 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
     # The old branch's direction in the unknowns of this map, by a difference.
     ahead = replace(point, x=point.x + ALONG * point.tangent[:-1], period=point.period + ALONG * point.tangent[-1])
     along = frame.chart.encode(*_re_expressed(old, ahead, problem)) - frame.xi
-    # The null vectors are orthonormal: in their plane t has the coordinates (first, second). Turned by 90 deg it is r.
-    plane = directions[-2:]
-    first, second = plane @ (plane.T @ plane @ along)
-    row = unit(plane.T @ np.array([-second, first]))
+    row = crossing_row(directions[-2:], along)
     tolerance = max(old.tolerance, min(ROUNDINGS * rounding, LOOSEST))
     problem = Shooting(old.flow, MAPS[name], tolerance=tolerance, max_newton=max_newton)
     return Crossing(problem=problem, frame=problem.relative_frame(x, period), row=row)

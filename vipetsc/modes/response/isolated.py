@@ -19,7 +19,7 @@ import numpy as np
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.over_key import StatesOverKey
-from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.state import Response, returned
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps
 
@@ -137,11 +137,7 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
 
 
 class ClosingSteps(TurningSteps):
-    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or at an end of the range.
-
-    It has come back where t . (xi - xi_first), with the tangent t at the first state, turns positive from one state to
-    the next, and the state is not farther from the first one than a step.
-    """
+    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or at an end of the range."""
 
     def __init__(self, states: Equations, points: int, first: Response) -> None:
         super().__init__(states, points)
@@ -149,18 +145,13 @@ class ClosingSteps(TurningSteps):
 
     def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
         """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
-        is_near = np.linalg.norm(point.xi - self.first.xi) <= point.step
-        if self._beyond(before) < 0 <= self._beyond(point) and is_near:
+        if returned(self.first, before, point):
             first = self.first
             last = Response(
                 xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
             )
             return last, CLOSED
         return super().end(before, point)
-
-    def _beyond(self, point: Response) -> float:
-        """How far a state is beyond the first one along that one's tangent, in units of the unknowns."""
-        return float(self.first.tangent @ (point.xi - self.first.xi))
 
 
 CLOSED = "closed: it has come back to its first state"

@@ -56,3 +56,14 @@ class Response(Solution):
         """The measures, which every state has before it is written to a file."""
         assert self.measures is not None
         return self.measures
+
+
+def returned(first: Response, before: Response, point: Response) -> bool:
+    """Whether a curve comes back to its ``first`` state in the step from the state ``before`` to ``point``.
+
+    There t . (xi - xi_first), with the tangent t at the first state, turns positive, and the state is not farther from
+    the first one than a step.
+    """
+    beyond = first.tangent @ (before.xi - first.xi)
+    now = first.tangent @ (point.xi - first.xi)
+    return bool(beyond < 0 <= now and np.linalg.norm(point.xi - first.xi) <= point.step)

@@ -11,26 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.continuation.arclength import Continuation, Geometry, Verdict
+from vipetsc.modes.continuation.arclength import Continuation, Verdict
+from vipetsc.modes.continuation.turning import BoundedTurn
 from vipetsc.modes.problem import Attempt, ContinuationError
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.parallel import StoppedError, StopRequest
 
-# The following three numbers decide how many states lie on a curve, not its course: each state solves the equations. On
-# the curve of ``runs/examples/nfrc.toml`` for the restitution 0.7, with 21 harmonics, its folds stay the same to 1e-8
-# where one of them is changed. With half the TURN it has 203 states instead of 114, with twice the TURN 97; with a
-# CORRECTION of 0.03 it has 277, with 1 still 114; with a MOST_GROWTH of 1.3 or 2.5 it has 124 or 111.
-#
-# Largest angle in rad between tangents, and largest correction over the step, of a step that is accepted.
-TURN = 0.25
-CORRECTION = 0.1
-# The next step is TURN/2 over the turn times the last one, so that the curve turns by half of what is allowed, but at
-# most this factor times the last one.
-MOST_GROWTH = 1.6
-# A turn in rad below which the quotient is not formed: the growth is at its bound anyway.
-LEAST_ANGLE = 1e-9
 # Largest number of states on growing amplitudes to the beginning of a range: the examples have 40 to 180. Where the
 # case asks for short steps, as many are allowed as cover this arclength.
 MOST_RAMP = 300
@@ -39,41 +27,18 @@ LONGEST_RAMP = 30.0
 MOST_WEIGHTS = 10_000
 
 
-class TurningSteps:
-    """The step rule of steady states (``StepRule``): steps on which the curve turns by half of what is allowed.
+class TurningSteps(BoundedTurn[Response]):
+    """The step rule of steady states (``StepRule``): a bounded turn, and an end on the curve's range.
 
-    The curve ends on its range. Lengths of steps are those of [nfrc], in units of the unknowns; ``points`` is the
-    largest number of states.
+    Lengths of steps are those of [nfrc], in units of the unknowns; ``points`` is the largest number of states.
     """
 
     points_key = "nfrc.points"
-    chart = ""
 
     def __init__(self, states: SteadyStates | StatesOverKey, points: int) -> None:
+        options = states.options
+        super().__init__(points, options.first_step, options.smallest_step, options.largest_step)
         self.states = states
-        self.points = points
-        self.first_step = states.options.first_step
-        self.smallest_step = states.options.smallest_step
-
-    def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """The verdict on a failed attempt: half the step."""
-        residuals = attempt.residuals or "none"
-        why = f"Newton's method ended with {attempt.reason} (residuals {residuals})"
-        return Verdict(accepted=False, step=step / 2, why=why)
-
-    def judge(self, before: Response, after: Response, geometry: Geometry) -> Verdict:
-        """Accept a step on which neither the tangent turns too far nor the correction is too long; else half of it."""
-        # A comparison with NaN is false, which refuses the step.
-        why = ""
-        if not geometry.turn <= TURN:
-            why = f"the curve turns too sharply ({geometry.turn:.2g} rad)"
-        elif not geometry.corrector <= CORRECTION:
-            why = f"the correction is too long ({geometry.corrector:.2g} of the step)"
-        if why:
-            return Verdict(accepted=False, step=after.step / 2, why=why)
-        growth = min(MOST_GROWTH, 0.5 * TURN / max(geometry.turn, LEAST_ANGLE))
-        # An accepted turn is at most TURN, so that the quotient is at least 1/2, but for rounding.
-        return Verdict(accepted=True, step=min(after.step * max(growth, 0.5), self.states.options.largest_step))
 
     def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
         """The state on the end of the range, where ``point`` has passed it."""
