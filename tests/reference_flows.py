@@ -8,10 +8,9 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from vipetsc.modes import flow
+from vipetsc.modes.flow import EXTREMUM, MOST_ATTEMPTS, NONE, Advance, Change, Flow, correct
 from vipetsc.modes.problem import FlowError
-from vipetsc.modes.shooting import flow
-from vipetsc.modes.shooting.flow import Advance, Flow
-from vipetsc.modes.shooting.landing import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.system import System
 
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.

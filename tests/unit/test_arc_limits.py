@@ -14,17 +14,13 @@ from tests.conftest import StopAt, assert_same_bits, datasets
 from tests.reference_flows import FiniteDifferences, Tsrk
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
+from vipetsc.modes import flow
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.flow import MAPS, MOST_LONGER, ArcLimits, Dop853Flow, Flow
 from vipetsc.modes.problem import FlowError
-from vipetsc.modes.shooting import flow
-from vipetsc.modes.shooting.arc_limits import MOST_LONGER, ArcLimits
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.flow import Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StoppedError, StopRequest
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.models import CLEARANCE, reduced_model
 from vipetsc.lattice import Contact
-from vipetsc.modes.shooting.charts import Chart, Grazing, Relative
+from vipetsc.modes.shooting import Chart, Grazing, Relative
 from vipetsc.modes.system import ContactPair, System
 
 # A displacement in clearances, of either sign and never zero.

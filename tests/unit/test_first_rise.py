@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from scipy.integrate import DOP853
 
-from vipetsc.modes.shooting import dop853_step
-from vipetsc.modes.shooting.landing import CROSSING, EXTREMUM, NONE, first_rise
+from vipetsc.modes import flow
+from vipetsc.modes.flow import CROSSING, EXTREMUM, NONE, first_rise
 
 # Rounding of a gap of order one.
 ROUNDING = 1e-12
@@ -132,7 +132,7 @@ def test_a_step_that_starts_on_a_near_miss_leaves_it(rounding):
 def test_the_tableau_is_the_one_of_dop853():
     """The coefficients in the package's table are SciPy's to the bit."""
     for name in ("A", "B", "E3", "E5"):
-        ours = getattr(dop853_step, name)
+        ours = getattr(flow, name)
         reference = getattr(DOP853, name)
         # SciPy's tables also have the stages of a dense output, which the flow does not use.
         same_part = reference[tuple(slice(n) for n in ours.shape)]

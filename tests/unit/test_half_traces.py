@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from vipetsc.modes.shooting.stability import HalfTraceAbove, real_half_traces
+from vipetsc.modes.stability import HalfTraceAbove, real_half_traces
 
 pytestmark = pytest.mark.parallel(1)
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.linalg import expm
 
 from vipetsc.lattice import Contact, DenseCompliance
-from vipetsc.modes.balance import hill
+from vipetsc.modes import stability
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.balance.hill import ContourLine, Hill
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import NoMotionError
+from vipetsc.modes.stability import ContourLine, Hill
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def test_only_a_whole_number_of_turns_counts_zeros(half_turns, count):
 
 def test_growth_is_found_where_the_determinant_is_cut_off(monkeypatch):
     """An uncoupled stiff contact, by which D is e^60 and its logarithm cut off, does not change the fastest growth."""
-    monkeypatch.setattr(hill, "LARGEST_LOG", 20.0)
+    monkeypatch.setattr(stability, "LARGEST_LOG", 20.0)
     order = 41
     touching = Stops.both(Contact("bilinear", 30.0), 1.0)
     closed = Stops(Contact("bilinear", 1e3), -1.0, np.inf)

@@ -11,9 +11,8 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, diatomic
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 LINEAR_STOP = four_band_contact("bilinear")

@@ -11,11 +11,9 @@ import pytest
 from tests.models import IN_PHASE, OUT_OF_PHASE, reduced_model
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.continuation.arclength import Continuation, locate
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import System
 
 

@@ -12,13 +12,10 @@ from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
 from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch_checks import BranchMonitor
 from vipetsc.modes.continuation.arclength import Continuation, half_trace_change
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import unit
-from vipetsc.modes.shooting.charts import Relative
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Relative, Shooting, linear_start
 
 
 def test_steps_have_the_arclength_that_they_say(short_branch):

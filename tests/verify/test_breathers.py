@@ -11,10 +11,8 @@ from vipetsc.lattice import Chain, four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.condensed import state_of
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import resonance
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting, resonance
 from vipetsc.modes.system import System
 
 

@@ -13,12 +13,9 @@ from tests.verify.conftest import follow
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.continuation.arclength import Continuation, Segment, locate
 from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.problem import ContinuationError
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import resonance
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start, resonance
 from vipetsc.modes.system import System
 
 

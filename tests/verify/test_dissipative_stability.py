@@ -8,13 +8,13 @@ from scipy.integrate import solve_ivp
 
 from tests.steady_states import motion_at, nfrc_case
 from vipetsc.lattice import Contact, DenseCompliance
-from vipetsc.modes.balance import hill
+from vipetsc.modes import stability
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.hill import LEAST_OF_FINITE, Hill
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
+from vipetsc.modes.stability import LEAST_OF_FINITE, Hill
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -50,7 +50,7 @@ def test_determinants_of_many_exponents_are_those_of_hills_matrix(monkeypatch, e
     The matrix is built here block by block from the compliance G and the contacts' Jacobian J; ``entries`` bounds the
     number of matrix entries that are held at once.
     """
-    monkeypatch.setattr(hill, "ENTRIES", entries)
+    monkeypatch.setattr(stability, "ENTRIES", entries)
     omega = 1.8
     last = 5
     law = Contact("hertz", 50.0, restitution=0.7)

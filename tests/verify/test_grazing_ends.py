@@ -10,7 +10,7 @@ import pytest
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.grazing import grazing_contacts
+from vipetsc.modes.shooting import grazing_contacts
 from vipetsc.modes.system import ContactPair, System
 
 

@@ -19,9 +19,9 @@ from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Contact, four_band
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.flow import ArcLimits
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.problem import FlowError
-from vipetsc.modes.shooting.arc_limits import ArcLimits
 from vipetsc.parallel import StoppedError
 
 DOFS = 4

@@ -10,7 +10,7 @@ import pytest
 from tests.rigs import TWO_MASSES, followed
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice.modal_compliance import ModalCompliance
-from vipetsc.modes.balance import hill, order_matrices
+from vipetsc.modes import stability
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -54,9 +54,8 @@ def test_stops_that_are_not_touched_do_not_count(monkeypatch):
     series = states.balance.series(xi[:-1] * states.clearance, 1.2)
     assert 0 < len(series.acting) < 5
     exponents = np.array([1e-3, 0.02 + 0.3j, 0.1 + 0.5j])
-    few = hill.Hill(states.compliance, 1.2, 9, odd=False, finite=True).determinants(series, exponents)
-    for module in (hill, order_matrices):
-        monkeypatch.setattr(module, "FEW_PAIRS", 5)
-    every = hill.Hill(states.compliance, 1.2, 9, odd=False, finite=True).determinants(series, exponents)
+    few = stability.Hill(states.compliance, 1.2, 9, odd=False, finite=True).determinants(series, exponents)
+    monkeypatch.setattr(stability, "FEW_PAIRS", 5)
+    every = stability.Hill(states.compliance, 1.2, 9, odd=False, finite=True).determinants(series, exponents)
     np.testing.assert_allclose(few, every, rtol=1e-9)
     assert np.abs(every - 1).max() > 1e-3

@@ -23,12 +23,11 @@ from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.flow import MAPS
 from vipetsc.modes.problem import unit
 from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import sample_orbit
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting import Shooting, sample_orbit
 
 OF_MASS = 0.2
 OF_STIFFNESS = 1e-7

@@ -11,7 +11,7 @@ from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
 from vipetsc.modes import Branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.flow import Dop853Flow
 from vipetsc.modes.system import ContactPair, System
 
 WALL = 1000.0  # N/m, the spring of each of two masses of 1 kg to the ground

@@ -19,14 +19,12 @@ from vipetsc.modes.branches import condensed
 from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.lattice import floquet
 from vipetsc.modes.lattice.floquet import largest_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.problem import ContinuationError
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import System
 
 STOPS = [Stops.both(four_band_contact(), CLEARANCE)]

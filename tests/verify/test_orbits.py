@@ -7,9 +7,8 @@ import pytest
 
 from tests.models import CLEARANCE, OUT_OF_PHASE, reduced_model
 from tests.reference_flows import FiniteDifferences, Tsrk
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting
 
 
 def superposed(stiffness, masses, centre, displacement, velocity, duration):

@@ -21,11 +21,8 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation, locate
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import sample_orbit
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
 from vipetsc.modes.system import ContactPair, System
 from vipetsc.studies.linear_modes import pressed_contacts
 

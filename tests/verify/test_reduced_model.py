@@ -15,7 +15,7 @@ from vipetsc.lattice import Chain, four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch_checks import BranchMonitor
 from vipetsc.modes.continuation.arclength import Continuation, locate
-from vipetsc.modes.shooting.orbit import resonance
+from vipetsc.modes.shooting import resonance
 from vipetsc.modes.system import System
 
 

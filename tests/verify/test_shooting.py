@@ -10,12 +10,9 @@ from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import sample_orbit
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.stability import half_traces, multipliers
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
+from vipetsc.modes.stability import half_traces, multipliers
 from vipetsc.modes.system import SmoothSpring, System
 
 

@@ -13,12 +13,10 @@ import pytest
 from tests.models import reduced_model
 from vipetsc.modes.continuation.arclength import Segment, locate
 from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import repetitions
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting import Shooting, repetitions
 
 
 def of_kind(kind: str, points: Iterable[Point]) -> list[Point]:

@@ -20,13 +20,13 @@ from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.verbs.branch_verbs import curve_rows
 from vipetsc.figures.nfrc import frequency_response
-from vipetsc.modes.balance.hill import Hill, Stability
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import locate
 from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
+from vipetsc.modes.stability import Hill, Stability
 
 pytestmark = pytest.mark.parallel(1)
 

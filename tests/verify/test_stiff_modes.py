@@ -13,10 +13,8 @@ from scipy.integrate import quad, solve_ivp
 from vipetsc.case import NnmCase
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import SmoothSpring, System
 
 pytestmark = pytest.mark.parallel(1)

@@ -22,12 +22,9 @@ from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.condensed import condensed_system, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.lattice.krylov import LatticeShooting
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import sample_orbit
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
 from vipetsc.modes.system import ContactPair, System
 
 MASS = 2.0

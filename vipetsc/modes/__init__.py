@@ -4,12 +4,13 @@ The system is M u'' + K u + f(u) = 0 with masses in contact pairs and smooth spr
 mode is a family of periodic orbits that begins at a linear mode (Kerschen et al. 2009; Rosenberg's in the odd case).
 
 **Modules.** ``problem`` is the interface between continuation and a method; ``system`` is the system, ``point`` an
-orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns.
+orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns. ``shooting`` finds periodic orbits by
+integrating them with ``flow``, ``stability`` has their multipliers. Each of these begins with its equations.
 
-**Subpackages**, whose docstrings derive the methods. ``shooting`` finds periodic orbits by integrating them,
-``lattice`` finds orbits of whole lattices on all ranks, ``balance`` finds them by their harmonics; ``continuation``
-follows branches of any of them, ``branches`` follows and stores the branches of a case. ``response`` has steady
-responses to a drive, which are not modes but are found by the same equations and the same continuation.
+**Subpackages**, whose docstrings derive the methods. ``lattice`` finds orbits of whole lattices on all ranks,
+``balance`` finds periodic motions by their harmonics; ``continuation`` follows branches of any of them, ``branches``
+follows and stores the branches of a case. ``response`` has steady responses to a drive, which are not modes but are
+found by the same equations and the same continuation.
 
 A user-written loop (importing the package loads PETSc)::
 
@@ -34,10 +35,8 @@ from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System

@@ -6,12 +6,6 @@ import numpy as np
 
 from vipetsc.modes.problem import Solution
 
-# A motion counts as unstable if a perturbation grows faster than the first number times its frequency in rad/s: by more
-# than 1 % in a period, or a Floquet multiplier with a modulus beyond the second number. Multipliers of stable motions,
-# of modulus 1, come out with the errors of the methods. Files have the threshold beside the numbers.
-LEAST_GROWTH = 1.6e-3
-UNSTABLE_BEYOND = float(np.exp(2 * np.pi * LEAST_GROWTH))
-
 # Quantities of a point: name in the files, type, unit, description.
 QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "energy": ("energy", float, "J", "energy"),

@@ -7,12 +7,10 @@ forces, k = 0..K, obey Z_k + G(k Om) F_k(Z) = Z_k^linear at the frequency Om, wh
 and springs in a periodic motion. ``shifted_compliance`` is the linear system between them, and ``harmonic_balance`` the
 equations of a motion's harmonics. ``conservative`` has branches of conservative motions, ``harmonic_frame`` the
 unknowns in which a step of such a branch is taken, ``describing_function`` a pair's first guess in a gap,
-``departures`` the contact episodes as shooting counts them, ``hill`` the stability of a motion by Hill's determinant:
-its matrices are in ``order_matrices``, and ``high_orders`` makes them smaller where there are many harmonics.
+``departures`` the contact episodes as shooting counts them. ``modes.stability`` has the stability of a motion.
 """
 
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.balance.stops import Stops

@@ -5,8 +5,7 @@ import numpy as np
 from vipetsc.case.nnm_table import Guards
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting import Shooting, repetitions, sample_orbit
 
 # Points between two checks whether a branch has passed on to another one; each check integrates fifteen arcs.
 REPETITIONS_EVERY = 50

@@ -20,20 +20,19 @@ from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
 from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.continuation.arclength import StepRule
+from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import FlowError, NoMotionError, PeriodicProblem, StartError
 from vipetsc.modes.shared_frequencies import check_start
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting import Shooting
+from vipetsc.modes.stability import Hill
 from vipetsc.modes.system import System, elastic_stops
 from vipetsc.parallel import StopRequest
 

@@ -15,7 +15,7 @@ from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import linear_start
 from vipetsc.modes.system import System, elastic_stops
 from vipetsc.parallel import StopRequest
 

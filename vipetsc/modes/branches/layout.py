@@ -9,8 +9,9 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
-from vipetsc.modes.point import OF_LOSSES, QUANTITIES, UNSTABLE_BEYOND, Point
+from vipetsc.modes.point import OF_LOSSES, QUANTITIES, Point
 from vipetsc.modes.problem import S
+from vipetsc.modes.stability import UNSTABLE_BEYOND
 
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 unknown"
 MULTIPLIERS = {

@@ -30,11 +30,10 @@ from vipetsc.case import NnmCase
 from vipetsc.dynamics.propagator.orbit_tape import ClosedSubsteps
 from vipetsc.lattice import Contact
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.flow import SEPARATION, Arc
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting.flow import SEPARATION, Arc
-from vipetsc.modes.shooting.orbit import whole_period
-from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting import Shooting, whole_period
 from vipetsc.modes.system import elongation_rows
 
 # Nodes of Gauss's rule in a piece of an arc, and the longest piece in radians of the fastest motion. A contact that is

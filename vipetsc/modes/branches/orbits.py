@@ -19,13 +19,10 @@ from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, StepRule, at_energy
 from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS, ShootingMap
-from vipetsc.modes.shooting.shooting import Shooting
-from vipetsc.modes.shooting.shooting_equations import ShootingEquations
-from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.shooting import Shooting, ShootingEquations, linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
 

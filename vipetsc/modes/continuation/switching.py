@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.modes.continuation.crossing import crossing_row
+from vipetsc.modes.flow import MAPS
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import repetitions
-from vipetsc.modes.shooting.shooting import DenseFrame, Shooting
+from vipetsc.modes.shooting import DenseFrame, Shooting, repetitions
 
 # The numbers below were measured at eleven special points of the benchmark of Kerschen and Peeters and of the paper's
 # model with either law. At seven of these points another branch crosses.

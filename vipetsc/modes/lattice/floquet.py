@@ -30,8 +30,8 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.dynamics.eigen import load_slepc
-from vipetsc.modes.callbacks import CallbackErrors
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
+from vipetsc.modes.newton import CallbackErrors
 from vipetsc.modes.point import Point
 from vipetsc.modes.system import System
 

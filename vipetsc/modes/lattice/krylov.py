@@ -21,13 +21,12 @@ from scipy.sparse.linalg import splu
 from vipetsc.lattice import Chain
 from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.flow import ShootingMap
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError, StartError
-from vipetsc.modes.shooting.charts import Chart
-from vipetsc.modes.shooting.maps import ShootingMap
-from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
+from vipetsc.modes.shooting import Chart, ShootingEquations, ShootingFrame
 from vipetsc.modes.system import System
 
 # Residual of GMRES over the right side. Newton's steps to a breather take 140 to 165 products in all; with 1e-8 they

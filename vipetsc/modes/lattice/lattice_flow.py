@@ -26,8 +26,8 @@ from vipetsc.dynamics.propagator.tangent import MOST_TAPE_ROWS, TangentPropagato
 from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.departures import union_length
+from vipetsc.modes.flow import ArcLimits
 from vipetsc.modes.problem import FlowError
-from vipetsc.modes.shooting.arc_limits import ArcLimits
 from vipetsc.parallel import StoppedError
 
 # Errors allowed in a contact's substep, relative to its speed: below the 1e-12 to which orbits of lattices are

@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from vipetsc.case.nfrc_table import NfrcTable
-from vipetsc.modes.balance.hill import Perturbations, Stability
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import SpecialKind
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.stability import Perturbations, Stability
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5

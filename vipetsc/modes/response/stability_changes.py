@@ -17,9 +17,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vipetsc.modes.balance.hill import AT_ZERO, Perturbations, Stability
 from vipetsc.modes.problem import NoMotionError, SpecialKind
 from vipetsc.modes.response.state import Measures, Response
+from vipetsc.modes.stability import AT_ZERO, Perturbations, Stability
 
 BRANCH_POINT = "branch-point"
 PERIOD_DOUBLING = "period-doubling"

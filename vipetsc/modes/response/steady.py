@@ -23,7 +23,6 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import ComplianceError, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import FlowError, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of, driven_points, forces_of
@@ -31,6 +30,7 @@ from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, largest_values
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Measures, Response
+from vipetsc.modes.stability import Hill, Perturbations, Stability
 
 # The power of a force counts as rounding below this fraction of amplitude times frequency times displacement, as in a
 # finite lattice without loss: nothing comes in, of which there could be fractions.

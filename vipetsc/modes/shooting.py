@@ -1,0 +1,844 @@
+"""Shooting: periodic orbits of a flow as boundary value problems over a part of their period.
+
+``flow`` gives the flow phi_t of an initial state and its derivative S = d phi_t/d y0; the unknowns are initial values x
+and the period T. The flow is reversible, t -> -t with v -> -v, so that an orbit that is at rest (v = 0) twice, at 0 and
+T/2, is periodic: half a period is enough, with the n unknowns u(0) and the n equations v(T/2; u0, 0) = 0. If f is odd
+the orbit u(t + T/2) = -u(t) passes the centre u = 0 at T/4: a quarter is enough,
+
+    H(x, T) = u(T/4; x, 0) = 0,    dH/dx = A,    dH/dT = v(T/4)/4,    S = [[A, B], [C, D]].
+
+The n equations for n + 1 unknowns leave a curve of solutions, the branch. The whole period may be shot as well, for
+comparison, but its equations are worse conditioned (``MAPS``). ``ShootingEquations`` are those of any flow and
+derivative. ``Shooting`` has the matrix of the flow's sensitivities; ``modes.lattice`` does without a matrix.
+
+**Charts** are the unknowns xi (n + 1,) of order one in place of x (n,) and T. A chart belongs to a point of the branch,
+with the initial values x_0 and the period T_0. It encodes (x, T) as xi, decodes it, and gives d(x, T)/dxi (n + 1,
+n + 1); ``size`` = max |x_0| is the unit of initial values. Initial values are displacements in m where an arc starts at
+rest, velocities in m/s where it starts at the centre. The last unknown is T/T_0, the others are
+
+    relative       x_i/size; in the place of a site's resonator w/scale, with w = c . x, where the arc starts at rest
+    grazing        x_i/size; in the place of one site's resonator y, where y |y| = (sigma w - D)/D
+
+w is the elongation of a contact, c its row with 1 at the resonator and -1 at the other mass, if there is one, and D its
+clearance in m on the side sigma. D is not 0: ``System`` refuses contacts that touch at rest, about which no motion is
+linear.
+
+**Why grazing needs a chart.** An orbit that starts at rest on its largest sigma w, beyond D, is in contact for the time
+2 [2 (sigma w - D)/|w''|]^1/2. The impulse of a force that grows as (sigma w - D)^n then changes the orbit by the order
+(sigma w - D)^(n + 1/2). For the bilinear contact, n = 1, its derivative by w is a square root, whose slope at D is
+infinite: tangents turn without bound there. In y the change is of the order y^(2 n + 1), and smooth enough.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from vipetsc.modes.departures import Departure, within_arc
+from vipetsc.modes.flow import MOST_LONGER, Arc, ArcLimits, Flow, ShootingMap
+from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.newton import BorderedNewton, DenseNewton
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, StartError, unit
+from vipetsc.modes.shared_frequencies import check_start
+from vipetsc.modes.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
+from vipetsc.modes.system import ContactPair, System
+
+# A contact grazes if the largest value of its gap is within this fraction of the clearance of zero. The parabola below
+# errs by less: through 2000 samples of a quarter of the period by 1e-8 of a harmonic of order 30, and by 1e-6 of one of
+# order 100.
+TOUCH = 1e-5
+
+
+def grazing_contacts(system: System, u: np.ndarray) -> list[int]:
+    """The numbers, from 1, of contacts that graze along displacements ``u`` (samples, n) in m at equal times.
+
+    At each local maximum among the samples a parabola through it and its two neighbours gives the largest value.
+    """
+    # The gap is positive where a contact is closed; its negative, of a contact pressed at rest, where it is open.
+    beyond = np.where(system.is_pressed, -1.0, 1.0) * system.gaps(u)
+    clearances = np.abs(system.clearances_at(u @ system.contact_rows.T)).min(axis=0)
+    numbers = []
+    for contact, (values, clearance) in enumerate(zip(beyond.T, clearances, strict=True)):
+        # The motion has only been on a side without a stop.
+        if not np.isfinite(clearance):
+            continue
+        # While w is on a side without a stop its gap is -inf, of which no parabola can be formed.
+        values = np.maximum(values, -1e3 * clearance)
+        peaks = [values[0], values[-1]]
+        is_peak = (values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])
+        for i in np.flatnonzero(is_peak) + 1:
+            before, at, after = values[i - 1 : i + 2]
+            bend = before - 2 * at + after
+            peaks.append(at - (after - before) ** 2 / (8 * bend) if bend < 0 else at)
+        if np.min(np.abs(peaks)) <= TOUCH * clearance:
+            numbers.append(contact + 1)
+    return numbers
+
+
+# The chart ``grazing`` is chosen if |w| at the start is within this fraction of the clearance of it. The paper's
+# out-of-phase branches up to 100 J (116 points with Hertz's law, 141 with the bilinear one) take up to 12 % more Newton
+# steps with values from 0.01 to 0.2.
+NEAR_GRAZING = 0.05
+# Lower bound of |y| in the derivative of w by y, 2 D |y|, which vanishes at the touch itself. The smallest gap beside 0
+# is a rounding error of 1e-16 of D, with a y of 1e-8: the bound acts at the touch alone.
+SMALLEST_ROOT = 1e-9
+
+
+class Chart(ABC):
+    """Unknowns for initial values and period at and near one orbit."""
+
+    size: float
+    period: float
+
+    @abstractmethod
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+
+    @abstractmethod
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+
+    @abstractmethod
+    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+
+    @abstractmethod
+    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+
+
+class DenseChart(Chart):
+    """A chart with the matrix of its derivative."""
+
+    @abstractmethod
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """The matrix d(x, period)/d xi (n + 1, n + 1) at the unknowns ``xi`` (n + 1,)."""
+
+    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+        return self.derivative(xi) @ changes
+
+    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+        return np.linalg.solve(self.derivative(xi), changes)
+
+
+class Relative(DenseChart):
+    """Initial values over the largest one, and elongations of contacts over a scale of their own.
+
+    The scale of w is max(|w_0|, |D|), with the smaller clearance D of the contact, and ``size`` at most. Over ``size``
+    itself a large common motion would hide the changes of w that make and break contacts. Without ``rest``, where an
+    arc starts at the centre, all initial values are over ``size``: they are velocities, and all w are 0.
+
+    Of contacts that form a closed ring one has no unknown of its own: its w is the sum of the others, so that with it
+    the chart could not be inverted.
+    """
+
+    def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
+        self.size = float(np.abs(x).max())
+        self.period = period
+        self.weights = np.eye(len(x)) / self.size
+        if rest:
+            for number in _without_rings(system.contacts):
+                row = system.contact_rows[number]
+                pair = system.contacts[number]
+                scale = min(max(abs(row @ x), abs(pair.stops.clearance)), self.size)
+                self.weights[pair.resonator] = row / scale
+        self.inverse = np.linalg.inv(self.weights)
+        n = len(x)
+        self._derivative = np.zeros((n + 1, n + 1))
+        self._derivative[:n, :n] = self.inverse
+        self._derivative[n, n] = period
+
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+        return np.append(self.weights @ x, period / self.period)
+
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+        return self.inverse @ xi[:-1], float(xi[-1] * self.period)
+
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+        return self._derivative
+
+
+class Grazing(DenseChart):
+    """Initial values over the largest one, with y for the contact that is nearest to its clearance.
+
+    Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. If it has no stop on that side,
+    y is the root of the gap to the stop on the other side. ``contact`` is the number of the contact, ``sign`` is sigma,
+    and ``index`` the place of y among the unknowns.
+    """
+
+    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
+        self.size = float(np.abs(x).max())
+        self.period = period
+        w = system.contact_rows @ x
+        nearest = int(np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1).argmin())
+        self.contact = nearest
+        self.row = system.contact_rows[nearest]
+        self.index = system.contacts[nearest].resonator
+        self.sign = float(system.sides_at(w)[nearest])
+        self.clearance = float(system.clearances_at(w)[nearest])
+        if self.clearance == np.inf:
+            self.sign = -self.sign
+            self.clearance = system.contacts[nearest].stops.clearance
+
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+        xi = np.append(x / self.size, period / self.period)
+        gap = self.sign * (self.row @ x) / self.clearance - 1
+        xi[self.index] = np.sign(gap) * np.sqrt(np.abs(gap))
+        return xi
+
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+        x = xi[:-1] * self.size
+        y = xi[self.index]
+        x[self.index] = 0.0
+        x[self.index] = self.sign * self.clearance * (1 + y * abs(y)) - self.row @ x
+        return x, float(xi[-1] * self.period)
+
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+        d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
+        d[self.index, :-1] = -self.row * self.size
+        d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), SMALLEST_ROOT)
+        return d
+
+
+CHARTS: dict[str, type[Relative | Grazing]] = {"relative": Relative, "grazing": Grazing}
+
+
+def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
+    """Numbers of the ``contacts`` whose elongations may be unknowns in the places of their resonators, all at once.
+
+    Left out are contacts that close a ring, each from a host to a resonator that is the host of the next.
+    """
+    # If several contacts have one resonator, the elongation of the last one is the unknown in its place.
+    host_of: dict[int, int | None] = {}
+    for number, pair in enumerate(contacts):
+        mass = pair.host
+        while mass is not None and mass != pair.resonator:
+            mass = host_of.get(mass)
+        if mass is None:
+            host_of[pair.resonator] = pair.host
+            yield number
+
+
+def near_grazing(system: System, x: np.ndarray) -> bool:
+    """Whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
+    w = system.contact_rows @ x
+    distance = np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1)
+    return bool(distance.min(initial=np.inf) < NEAR_GRAZING)
+
+
+class AnyArc(Protocol):
+    """Interface of the arcs of all flows: the quantities of the orbit."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the arc in s."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps that the flow has tried."""
+
+    @property
+    def episodes(self) -> int:
+        """Number of contact episodes in the arc."""
+
+    @property
+    def closed(self) -> float:
+        """Time in s with a contact closed."""
+
+    def spans(self) -> Iterable[tuple[float, float]]:
+        """Begin and end in s of every contact episode, cut off at the arc's start and end."""
+
+
+A = TypeVar("A", bound=AnyArc)
+
+
+class ShootingFrame(Generic[A]):
+    """The shooting equations in the unknowns of a ``chart`` at one orbit.
+
+    The argument ``tangent`` (n + 1,) is d(x, period) along the branch, of any length, or empty where there is none yet.
+    The attribute ``tangent`` is the same direction in the chart's unknowns, of unit length; without the argument there
+    is none. ``unit`` is that of the residual: the chart's, times ``ShootingMap.end_unit``, since velocities may have to
+    vanish at the end of an arc that starts with displacements.
+    """
+
+    tangent: np.ndarray
+
+    def __init__(
+        self, problem: "ShootingEquations[A]", chart: Chart, x: np.ndarray, period: float, tangent: np.ndarray
+    ) -> None:
+        self.problem = problem
+        self.chart = chart
+        self.unit = chart.size * problem.map.end_unit(period)
+        self.xi = chart.encode(x, period)
+        if tangent.size:
+            self.tangent = unit(chart.to_unknowns(self.xi, tangent))
+
+    def encode(self, point: Point) -> np.ndarray:
+        """The unknowns (n + 1,) of another orbit."""
+        return self.chart.encode(point.x, point.period)
+
+    def direction(self, point: Point) -> np.ndarray:
+        """The branch's direction (n + 1,) at another orbit, of any length."""
+        return self.chart.to_unknowns(self.encode(point), point.tangent)
+
+    def arc(self, xi: np.ndarray) -> A:
+        """The arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
+        if np.all(np.isfinite(xi)):
+            x, period = self.chart.decode(xi)
+            if period > 0:
+                return self.problem.arc(x, period)
+        raise FlowError("Newton's method left the domain: the period is not positive")
+
+    def residual(self, xi: np.ndarray) -> np.ndarray:
+        """The residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
+        return self.problem.residual(self.arc(xi)) / self.unit
+
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the orbit at an ``arclength`` along the tangent."""
+        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
+
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value.
+
+        It fails where it comes to an arc of ``MOST_LONGER`` times the steps of that at the guess. Raises StoppedError
+        in a block of ``ArcLimits.stopped_by``.
+        """
+        problem = self.problem
+        try:
+            with problem.limits.attempt():
+                longest = MOST_LONGER * self.arc(guess).steps
+        except FlowError as error:
+            return Attempt(converged=False, reason=str(error), history=[], xi=guess, left_domain=True)
+        with problem.limits.attempt(longest):
+            rounding = problem.rounding(self.chart.period)
+            return problem.newton.solve(self, guess, row, value, problem.tolerance, rounding)
+
+    @abstractmethod
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+
+    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
+        """The orbit that an attempt has converged to; ``direction`` (n + 1,) is the branch's unit tangent or None."""
+        problem = self.problem
+        chart = self.chart
+        x, period = chart.decode(attempt.xi)
+        arc = problem.arc(x, period)
+        traces, largest = problem.stability(arc)
+        size = float(np.abs(x).max()) * problem.map.end_unit(period)
+
+        tangent = np.empty(0)
+        energy_tangent = slope = np.nan
+        if direction is not None:
+            # df/dE from the tangent: along a vertical piece of the branch the energy stands still.
+            tangent = chart.to_changes(attempt.xi, direction)
+            energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
+            slope = np.inf
+            if energy_tangent:
+                slope = float(-tangent[-1] / period**2 / energy_tangent)
+
+        return Point(
+            x=x,
+            period=period,
+            energy=problem.energy(x),
+            residual=float(np.abs(problem.residual(arc)).max()) / size,
+            half_traces=traces,
+            multiplier=largest,
+            episodes=arc.episodes,
+            closed=arc.closed / arc.duration,
+            newton=len(attempt.history) - 1,
+            tangent=tangent,
+            slope=slope,
+            energy_tangent=energy_tangent,
+        )
+
+
+class ShootingEquations(ABC, Generic[A]):
+    """Periodic orbits of a ``system``: initial values x (n,) and a period.
+
+    The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
+    the centre; for an orbit half of the state vanishes at its end. ``limits`` are those of the flow's arcs. x are
+    displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre. Raises
+    ValueError if the map needs an odd system and the system is not.
+    """
+
+    guards: frozenset[str]
+    limits: ArcLimits
+    newton: BorderedNewton[Any]
+
+    def __init__(self, system: System, shooting_map: ShootingMap, tolerance: float) -> None:
+        if "centre" in (shooting_map.start, shooting_map.end) and not system.odd:
+            raise ValueError(
+                f"the {shooting_map.name} map needs forces that change sign with the displacement; "
+                "this system's do not: use map = 'half'"
+            )
+        self.system = system
+        self.map = shooting_map
+        self.tolerance = tolerance
+        n = system.dofs
+        displacements = slice(0, n)
+        velocities = slice(n, 2 * n)
+        # The half of the state that is free at the arc's start, and the half that should vanish at its end.
+        self.free = velocities
+        if shooting_map.starts_at_rest:
+            self.free = displacements
+        self.zero = displacements
+        if shooting_map.ends_at_rest:
+            self.zero = velocities
+        self._latest: tuple[bytes, float, A] | None = None
+
+    def start(self, x: np.ndarray) -> np.ndarray:
+        """The state (2n,) at the start of the arc from initial values ``x``."""
+        state = np.zeros(2 * self.system.dofs)
+        state[self.free] = x
+        return state
+
+    def arc(self, x: np.ndarray, period: float) -> A:
+        """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
+        # Bytes are compared faster than arrays of a few numbers.
+        values = x.tobytes()
+        if self._latest is None or self._latest[:2] != (values, period):
+            self._latest = values, period, self._integrate(self.start(x), period)
+        return self._latest[2]
+
+    @abstractmethod
+    def _integrate(self, start: np.ndarray, period: float) -> A:
+        """The arc from a state ``start`` (2n,) over the map's fraction of the ``period``."""
+
+    def rounding(self, period: float) -> float:
+        """The largest scaled residual that rounding may leave of an orbit of a ``period`` in s; 0 if it is unknown."""
+        return 0.0
+
+    @abstractmethod
+    def end(self, arc: A) -> np.ndarray:
+        """The state (2n,) at an arc's end."""
+
+    @abstractmethod
+    def stability(self, arc: A) -> tuple[np.ndarray, float]:
+        """Half-traces of an orbit, and the largest modulus of its multipliers; empty and NaN without a matrix."""
+
+    def residual(self, arc: A) -> np.ndarray:
+        """The residual (n,) at the arc's end, which vanishes for an orbit: displacements in m or velocities in m/s."""
+        return self.end(arc)[self.zero]
+
+    def end_rate(self, arc: A) -> np.ndarray:
+        """Time derivative (n,) of what should vanish at the arc's end."""
+        n = self.system.dofs
+        end = self.end(arc)
+        # At rest velocities should vanish, whose rates are accelerations; at the centre displacements.
+        if self.map.ends_at_rest:
+            return -self.system.forces(end[:n]) / self.system.masses
+        return end[n:]
+
+    def energy(self, x: np.ndarray) -> float:
+        """Energy in J of the orbit with initial values ``x`` (n,)."""
+        zero = np.zeros_like(x)
+        if self.map.starts_at_rest:
+            return self.system.energy(u=x, v=zero)
+        return self.system.energy(u=zero, v=x)
+
+    def energy_gradient(self, x: np.ndarray) -> np.ndarray:
+        """dE/dx (n,) in J over the unit of ``x``."""
+        if self.map.starts_at_rest:
+            return self.system.forces(x)
+        return self.system.masses * x
+
+    @abstractmethod
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
+        """The frame at any initial values ``x`` (n,) and period; ``tangent`` (n + 1,) may be empty."""
+
+    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
+        """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
+        if chart == "auto":
+            chart = "relative"
+            if self.map.starts_at_rest and near_grazing(self.system, point.x):
+                chart = "grazing"
+        return self.frame_at(chart, point.x, point.period, point.tangent)
+
+    def departures(self, point: Point) -> list[Departure]:
+        """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
+
+        Raises FlowError if the arc cannot be integrated.
+        """
+        spans = self.arc(point.x, point.period).spans()
+        in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
+        return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
+
+    def grazing(self, point: Point) -> list[int]:
+        """No contact: a subclass whose orbits have all masses on one rank may look for those that graze."""
+        return []
+
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+
+        It is 0 at an equilibrium, and infinite for maps from centre to centre. Of two rests the smaller value counts.
+        All ranks must call it.
+        """
+        n = self.system.dofs
+        rests = []
+        if self.map.starts_at_rest:
+            rests.append(point.x)
+        if self.map.ends_at_rest and self.map.fraction < 1:
+            rests.append(self.end(self.arc(point.x, point.period))[:n])
+        accelerations = [np.abs(self.system.forces(u) / self.system.masses).max() for u in rests]
+        size = max((np.abs(u).max() for u in rests), default=1.0)
+        return float(min(accelerations, default=np.inf) / size * (point.period / (2 * np.pi)) ** 2)
+
+    @abstractmethod
+    def null_vector(self, start: Point) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+
+    def first_tangent(self, start: Point, direction: int) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
+
+        Raises ContinuationError at a branch point, where the tangent is not unique.
+        """
+        tangent = self.null_vector(start)
+        energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
+        # Where the energy is stationary neither sign is towards growing energy: the null vector is taken as it is.
+        sign = np.sign(energy_tangent) or 1.0
+        return tangent * (sign * direction)
+
+    def turn(self, before: Point, after: Point) -> float:
+        """Angle in rad between the tangents of two orbits in relative units at the first; 0 without a tangent."""
+        if not (before.tangent.size and after.tangent.size):
+            return 0.0
+        chart = self.relative_chart(before.x, before.period)
+        tangents = np.column_stack([before.tangent, after.tangent])
+        first, second = chart.to_unknowns(chart.encode(before.x, before.period), tangents).T
+        # The product of two unit vectors may be beyond 1 by rounding.
+        return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
+
+    @abstractmethod
+    def relative_chart(self, x: np.ndarray, period: float) -> Chart:
+        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+
+        It has the gaps of contacts only where they are at the start of the map.
+        """
+
+    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
+        """Folds of the energy and of the frequency."""
+        # Where all contacts are as at rest an orbit may lie on a linear branch, whose energy and frequency turn by
+        # rounding alone: folds are then sought between two orbits that both have contacts which close or open.
+        if not self.system.is_linear_at_rest or (left.episodes and right.episodes):
+            yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
+            yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
+
+    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
+        """The ``fold`` of the energy; a subclass may add the resonance whose tongue it begins or ends."""
+        return fold
+
+
+# An orbit that comes back after a part of its period to within this fraction of its size repeats itself. On in-phase
+# branches of the paper's model, orbits that are other ones passed three times come back to within 4e-13. Of 125 other
+# orbits two come back to within 2e-7 and 1e-5, all others miss by 8e-3 at least.
+SAME = 1e-6
+# Numbers of repetitions that are looked for. A motion passed n times repeats itself for each prime factor of n, and one
+# that is passed more often without any of these factors is not found.
+PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
+
+
+class ShotOrbits(Protocol):
+    """Orbits shot with sensitivities: what of ``Shooting`` is needed to look at one of them."""
+
+    flow: Flow
+    map: ShootingMap
+    system: System
+    free: slice
+
+    def arc(self, x: np.ndarray, period: float) -> Arc:
+        """The arc from initial values ``x`` (n,)."""
+
+    def residual(self, arc: Arc) -> np.ndarray:
+        """The residual (n,) at the arc's end, which vanishes for an orbit."""
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+
+
+def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
+
+    Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
+    """
+    start = problem.arc(point.x, point.period).start
+    count = round(problem.map.fraction * samples)
+    u, v = np.hsplit(problem.flow.states(start, point.period / samples, count, point.period), 2)
+    return whole_period(u, problem.map, samples, 1), whole_period(v, problem.map, samples, -1)
+
+
+def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, parity: int) -> np.ndarray:
+    """Values (samples, ...) at uniform times of a period, from those of an arc, its start and its end included.
+
+    ``parity`` is 1 of displacements, which are even about a rest and odd about the centre, and -1 of velocities.
+    """
+    # A quarter ends at the centre, about which displacements are odd: the part then ends at rest.
+    if shooting_map.quarter:
+        part = np.concatenate([part, -parity * part[-2::-1]])
+    if len(part) < samples:
+        sign = 1
+        if not (shooting_map.starts_at_rest or shooting_map.ends_at_rest):
+            sign = -1
+        part = np.concatenate([part, parity * sign * part[-2::-1]])
+    return part[:samples]
+
+
+def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
+    """The number k of the k:1 internal resonance to whose tongue an orbit belongs; 1 without a resonance.
+
+    It is the number of zeros in half a period of the contacts' relative motion, or, without contacts, of displacements:
+    the largest over all of them. On the tongue the higher mode oscillates k times in a period of the lower one.
+    """
+    u, _ = sample_orbit(problem, point, samples)
+    rows = problem.system.contact_rows
+    w = u
+    if len(rows):
+        w = u @ rows.T
+    # A contact at a node of the motion moves by rounding alone, and passes zero at random.
+    amplitude = np.abs(w).max(axis=0)
+    positive = w[:, amplitude > SAME * amplitude.max()] > 0
+    passes = np.sum(positive != np.roll(positive, 1, axis=0), axis=0)
+    return int(passes.max()) // 2
+
+
+def repetitions(problem: ShotOrbits, point: Point) -> int:
+    """How often an orbit passes the same motion in its period: the smallest such number among ``PRIMES``, else 1.
+
+    Along a branch from a linear mode it is 1, except where a tongue of a k:1 internal resonance crosses the branch of
+    another mode: there the orbit is that mode's, passed k times.
+    """
+    # Displacements are compared with the orbit's size, velocities with the size times a frequency.
+    start = problem.arc(point.x, point.period).start
+    rate = problem.flow.omega_ref(point.period)
+    size = np.abs(start).max()
+    if not problem.map.starts_at_rest:
+        size = size / rate
+    scale = size * np.repeat([1.0, rate], problem.system.dofs)
+
+    for count in PRIMES:
+        later = problem.flow.arc(start, point.period / count, point.period).end
+        if np.all(np.abs(later - start) <= SAME * scale):
+            return count
+    return 1
+
+
+# A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
+# this of the level, on either side, a change of sign is rounding and no special point.
+LEAST_CROSSING = 1e-6
+# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``). Those of two masses, of
+# chains and of pressed contacts with r from 7 to 2,400 are up to 3.6 times that in the map of half a period, 6 times
+# in that of the whole, and 0.7 times in that of a quarter.
+ROUNDING = 8
+# If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
+# and the tangent is not unique.
+DEGENERATE = 1e-12
+# Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
+# than ``TOUCH``.
+SAMPLES = 2000
+
+
+class DenseFrame(ShootingFrame[Arc]):
+    """Shooting equations with the matrix of their derivative."""
+
+    problem: "Shooting"
+    chart: DenseChart
+
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        return self.jacobian_of(self.arc(xi), xi)
+
+    def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
+        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+        return self.tangent_towards(xi, self.tangent)
+
+    def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
+        # The null vector, of either sign.
+        direction = np.linalg.svd(self.jacobian(xi))[2][-1]
+        if direction @ reference < 0:
+            return -direction
+        return direction
+
+
+class Shooting(ShootingEquations[Arc]):
+    """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
+
+    Newton's method solves the n equations and one more linear row in the unknowns of a chart; it ends at a scaled
+    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within its
+    ``rounding``, or after ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
+    """
+
+    guards = frozenset({"half_trace", "turn_relative"})
+
+    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
+        super().__init__(flow.system, shooting_map, tolerance)
+        self.flow = flow
+        self.limits = flow.limits
+        # If nothing holds the system, its momentum stays 0 in an arc from rest to rest, whatever the start: one
+        # equation is lost. The centre of mass is kept in its place instead. An arc that starts at the centre (u = 0)
+        # has it there.
+        self._kept = None
+        if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
+            self._kept = flow.system.mean_motion
+        self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
+        self._frames: LatestValues[tuple[Point, str], ShootingFrame[Arc]] = LatestValues(1)
+
+    def _integrate(self, start: np.ndarray, period: float) -> Arc:
+        return self.flow.arc(start, self.map.fraction * period, period)
+
+    def end(self, arc: Arc) -> np.ndarray:
+        """The state (2n,) at an arc's end."""
+        return arc.end
+
+    def rounding(self, period: float) -> float:
+        """The largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
+
+        Let the fastest mode be r times as fast as the orbit. A step of the flow is a radian of that mode or less, and
+        rounds its velocity, which may be r times that of the orbit, to eps r. The mode sums the errors of some r steps
+        as a random walk, to eps r^(3/2) of the orbit's velocity.
+        """
+        ratio = self.flow.omega_ref(period) * period / (2 * np.pi)
+        return float(ROUNDING * np.finfo(float).eps * ratio**1.5)
+
+    def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
+        """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
+        traces = half_traces(self.system, self.map, arc)
+        # A single mass has the trivial pair alone, whose multiplier is 1.
+        return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
+
+    def residual(self, arc: Arc) -> np.ndarray:
+        """Values (n,) that vanish at the arc's end, plus the displacement of the centre of mass times a frequency."""
+        end = super().residual(arc)
+        if self._kept is None:
+            return end
+        return end + self.flow.omega * (self._kept @ arc.start[self.free])
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+        sensitivity = arc.sensitivity[self.zero, self.free]
+        if self._kept is not None:
+            sensitivity = sensitivity + self.flow.omega * self._kept
+        return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
+
+    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[Arc]:
+        """The frame at an orbit, as ``ShootingEquations.frame`` describes it; the latest one is kept."""
+        # A step of a branch and the search for its special points begin at the same orbit.
+        return self._frames.get((point, chart), lambda: super(Shooting, self).frame(point, chart))
+
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
+        """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
+        if tangent is None:
+            tangent = np.empty(0)
+        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
+
+    def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
+        """The unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
+        return DenseFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
+
+    def relative_chart(self, x: np.ndarray, period: float) -> Relative:
+        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+
+        It has the gaps of contacts only where the map starts at rest.
+        """
+        return Relative(self.system, x, period, rest=self.map.starts_at_rest)
+
+    def null_vector(self, start: Point) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+        chart = CHARTS["relative"](self.system, start.x, start.period)
+        xi = chart.encode(start.x, start.period)
+        matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
+        values, directions = np.linalg.svd(matrix)[1:]
+        if values[-1] < DEGENERATE * values[0]:
+            raise ContinuationError(
+                f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values "
+                f"{values}; start at another energy (nnm.start_energy) or switch branches there"
+            )
+        return chart.derivative(xi) @ directions[-1]
+
+    def grazing(self, point: Point) -> list[int]:
+        """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
+        start = self.arc(point.x, point.period).start
+        interval = self.map.fraction * point.period / SAMPLES
+        u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
+        return grazing_contacts(self.system, u)
+
+    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
+        """Folds, what the half-traces tell, and a contact that just touches.
+
+        A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
+        doubles the period (the others); 0 doubles the period of quarter-period orbits.
+        """
+        yield from super().special_kinds(left, right)
+        if self.system.is_linear_at_rest and not (left.episodes or right.episodes):
+            return
+        # The half-traces of a quarter map belong to half a period. There a multiplier of -1 returns after the whole
+        # period, which breaks the symmetry; multipliers +-i, half-trace 0, are -1 over the period and double it.
+        levels = {1.0: "branch-point", -1.0: "period-doubling"}
+        if self.map.quarter:
+            levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
+        # Each search takes a dozen integrations: half-traces that are complex at both points are left out. Two real
+        # ones may meet within the step and be complex in between, so that a point that is found must have a real one.
+        for level, name in levels.items():
+            for i in real_half_traces(left, right):
+                test = HalfTraceAbove(i, level)
+                yield SpecialKind(name, test, floor=LEAST_CROSSING, accept=test.is_real)
+
+        # Several contacts may begin within one step, one after the other or, by a symmetry, at one point.
+        fewest, most = sorted((left.episodes, right.episodes))
+        for count in range(fewest + 1, most + 1):
+            yield touch_of(count)
+
+    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
+        """A fold of the energy with the resonance whose tongue it begins or ends."""
+        return replace(fold, resonance=resonance(self, fold))
+
+
+def touch_of(count: int) -> SpecialKind[Point]:
+    """Points at which the number of contact episodes becomes ``count``, or falls below it.
+
+    A mere touch is no episode: such a point has one fewer.
+    """
+
+    def above(point: Point) -> float:
+        return 1.0 if point.episodes >= count else -1.0
+
+    return SpecialKind("grazing", above, finish=lambda point, left, right: replace(point, episodes=count - 1))
+
+
+def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Point:
+    """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
+
+    Raises StartError if the mode has no stiffness, if other modes share its frequency, or if Newton's method does not
+    converge from the linear mode at that energy.
+    """
+    omega, shapes = problem.system.linear_modes()
+    if not omega[mode] > 0:
+        raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
+    check_start(problem.system, mode, energy)
+    # The energy of a mass-normalised mode q is (q'^2 + omega^2 q^2)/2: from rest all of it is potential, from the
+    # centre, where the initial values are velocities, all of it is kinetic.
+    amplitude = np.sqrt(2 * energy)
+    if problem.map.starts_at_rest:
+        amplitude /= omega[mode]
+    x = shapes[:, mode] * amplitude
+    frame = problem.frame_at("relative", x, 2 * np.pi / omega[mode], np.empty(0))
+    row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
+    attempt = frame.solve(frame.xi, row, row @ frame.xi)
+    if not attempt.converged:
+        why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy or increase nnm.tolerance"
+        raise StartError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
+    return frame.measures(attempt)
