@@ -22,6 +22,7 @@ from vipetsc.lattice import (
     pass_bands,
     waves_at,
 )
+from vipetsc.lattice.bands import fastest_speed
 from vipetsc.lattice.cell import cell_problems
 
 KAPPA = np.linspace(0, np.pi, 41)
@@ -387,3 +388,13 @@ def test_a_small_gap_is_a_gap(detuning):
     assert high - low == pytest.approx(np.sqrt(2) - np.sqrt(2 / (1 + detuning)), rel=1e-4)
     # At the edges of a gap waves stand.
     assert bloch(cell, np.pi).group_velocity == pytest.approx([0, 0], abs=1e-8 / detuning)
+
+
+@pytest.mark.parametrize("coupling", [10.0, 1e-2, 1e-6, 1e-9, 1e-13])
+def test_cells_that_are_hardly_joined_have_slow_waves(coupling):
+    """A rigid cell of two masses m has waves of sqrt(c/2m) cells/s, also where their omega^2 is rounding of others'."""
+    springs = (Spring(0, 0, coupling, next_cell=True), Spring(0, 1, 1e4))
+    cell = UnitCell((0.01, 0.01), springs, 0, 1)
+    speed = np.sqrt(coupling / 0.02)
+    assert abs(bloch(cell, 0.0).group_velocity[0]) == pytest.approx(speed, rel=2e-3)
+    assert fastest_speed(cell) <= 1.1 * speed

@@ -33,6 +33,10 @@ STILL = 1e-7
 OFF_ZERO = 3e-4
 # At smaller wavenumbers omega^2 of the acoustic branch is below this fraction of the highest one: it is 2e-8 at most.
 SLOWLY = 1e-6
+# Below this fraction of the highest one an omega^2 may differ by more than 1e-6 of itself by rounding.
+ROUNDING = 1e-10
+EPS = float(np.finfo(float).eps)
+TINY = float(np.finfo(float).tiny)
 # Bands touch where their omega^2 differ by less than this fraction of the highest one; rounding is 1e-14 of it.
 TOUCHING = 1e-12
 # Fraction of a frequency below which a gap is one of rounding. Two masses that differ by 1e-8 open a wider one.
@@ -79,7 +83,13 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     near_zero = np.abs(kappa) < OFF_ZERO
     if near_zero.any():
         off_zero = np.asarray(OFF_ZERO)
-        limit = _group_velocity(*_eigenpairs(cell, off_zero), _stiffness_slope(cell, off_zero) * (root[:, None] * root))
+        squared_there, vectors_there = _eigenpairs(cell, off_zero)
+        slope_there = _stiffness_slope(cell, off_zero) * (root[:, None] * root)
+        limit = _group_velocity(squared_there, vectors_there, slope_there)
+        # Of cells that are hardly joined the branch is rounding even there. Its slope is not: omega^2 is v^2 kappa^2.
+        is_rounding = squared_there < ROUNDING * squared_there[-1]
+        slopes = np.maximum(_eigenvalue_slope(vectors_there, slope_there), 0)
+        limit = np.where(is_rounding, np.sqrt(slopes / (2 * OFF_ZERO)), limit)
         is_slow = near_zero[..., None] & (squared < SLOWLY * squared[..., -1:])
         group_velocity = np.where(is_slow, limit, group_velocity)
     return BlochPoint(
@@ -89,8 +99,14 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
 
 def _group_velocity(squared: np.ndarray, vectors: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Return u* K' u / (2 omega) (..., band) of ``vectors`` (..., dof, band), with K' = ``slope`` (..., dof, dof)."""
-    eigenvalue_slope = np.einsum("...ij,...ij->...j", vectors.conj(), slope @ vectors).real
-    return np.asarray(eigenvalue_slope / (2 * np.sqrt(np.maximum(squared, np.finfo(float).tiny))))
+    # A smaller square is rounding: the slope over its root may be any number.
+    least = np.maximum(EPS * squared[..., -1:], TINY)
+    return np.asarray(_eigenvalue_slope(vectors, slope) / (2 * np.sqrt(np.maximum(squared, least))))
+
+
+def _eigenvalue_slope(vectors: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return u* K' u (..., band), the derivatives of omega^2 by the wavenumber."""
+    return np.asarray(np.einsum("...ij,...ij->...j", vectors.conj(), slope @ vectors).real)
 
 
 def _resolve_touching(kappa: np.ndarray, squared: np.ndarray, vectors: np.ndarray, slope: np.ndarray) -> None:
@@ -173,7 +189,9 @@ def _speed(cell: UnitCell, band: int, kappa: float) -> float:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
     squared, vector = _eigenpair(cell, band, kappa)
     slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
-    return abs(slope) / (2 * float(np.sqrt(max(squared, float(np.finfo(float).tiny)))))
+    # The mean of all squares, which the trace gives, is at most the largest one.
+    mean = float(np.mean(np.diagonal(cell.stiffness_matrix(np.asarray(kappa))).real / cell.masses))
+    return abs(slope) / (2 * float(np.sqrt(max(squared, EPS * mean, TINY))))
 
 
 def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:
