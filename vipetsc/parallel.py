@@ -17,6 +17,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.process import STOP_SIGNALS, end_now
+from vipetsc.wording import of_system
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -32,8 +33,10 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         if comm.rank and getattr(error, "from_root", False):
             time.sleep(2)  # rank 0 raised the same: its message is enough, and it ends this rank
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
-        if isinstance(error, OSError | MemoryError):
-            # A full disk or too little memory is the machine's matter: the trace would hide the message.
+        # A full disk or too little memory is the machine's matter: the trace would hide the message.
+        if isinstance(error, OSError):
+            text = of_system(error)
+        elif isinstance(error, MemoryError):
             text = str(error) or "out of memory"
         else:
             text = "".join(traceback.format_exception(kind, error, trace))

@@ -1,6 +1,7 @@
 """Numbers with nouns and names with units, as tables, messages and pictures write them."""
 
 import difflib
+import os
 from collections.abc import Iterable, Sequence
 
 MOST_SHOWN = 8  # entries of a list, which with the number of all of them fit on a line
@@ -12,6 +13,18 @@ def shortened(items: Sequence[object]) -> str:
     if len(items) > MOST_SHOWN:
         shown += f", ... ({len(items)})"
     return shown
+
+
+def of_system(error: OSError) -> str:
+    """The message of an ``error``; where it is the system's own, the file, the system's reason, and the remedy."""
+    # The package's own messages name the file, and may have the number of the system's error.
+    if error.errno is None or error.strerror != os.strerror(error.errno):
+        return error.strerror or str(error)
+    # Of a renaming both names, since either folder may be the cause.
+    names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
+    file = " to ".join(names) or "a file"
+    remedy = "after the cause is removed, the same command continues"
+    return f"{file} could not be read or written: {error.strerror}; {remedy}"
 
 
 def counted(number: int | str, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""Campaigns of many faults, with a report: ``scripts/campaign faults | kills | cases``."""
+"""Campaigns of many faults, with a report: ``scripts/campaign faults | kills | calls | cases``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from tests.faults import trials
+from tests.faults import failing_calls, trials
 from tests.faults.inject import KINDS
 from tests.faults.phases import phases
 from tests.faults.scenarios import SCENARIOS
@@ -25,6 +25,8 @@ from vipetsc.case import Case
 Row = dict[str, Any]
 # Scenarios of verbs with results: after a kill the same command resumes them.
 KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
+# Scenarios with a folder of results, in which calls of the file system can fail.
+WRITING = [scenario.name for scenario in SCENARIOS.values() if "{out}" in scenario.words]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:
@@ -70,14 +72,37 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
             crew_tasks = [task for task in tasks if task["ranks"] == ranks]
             rows += [judged(task, stages, options) for task, stages in crew.do(crew_tasks)]
 
+    return {"seed": options.seed, "rows": rows, "bad": summary(rows, options, "kills")}
+
+
+def calls(options: argparse.Namespace) -> dict[str, Any]:
+    """Let single calls of the file system fail, or end their process; repeat the command, and compare its results."""
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="calls-") as work, ExitStack() as leaving:
+        library = failing_calls.build(Path(work))
+        crews = {}
+        for ranks in options.ranks:
+            crew = Crew(Path(work) / str(ranks), ranks, options.patience, preload=library)
+            crews[ranks] = leaving.enter_context(crew)
+
+        unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
+        tasks = list(trials.failing_calls(unbroken, options.seed, options.count))
+        for ranks, crew in crews.items():
+            crew_tasks = [task for task in tasks if task["ranks"] == ranks]
+            rows += [judged(task, stages, options) for task, stages in crew.do(crew_tasks)]
+    return {"seed": options.seed, "rows": rows, "bad": summary(rows, options, "failing calls")}
+
+
+def summary(rows: Sequence[Row], options: argparse.Namespace, noun: str) -> int:
+    """Print how many trials each scenario had, how many met their fault, and how many went wrong; return the last."""
     bad = sum(bool(row["wrong"]) for row in rows)
     for name in options.only:
         named = [row for row in rows if row["scenario"] == name]
         in_time = sum(bool(row["came"]) for row in named)
         lost = sum(bool(row["wrong"]) for row in named)
-        print(f"{name:<13}{len(named):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
-    print(f"seed {options.seed}: {len(rows)} kills, {bad} of them not as they should be")
-    return {"seed": options.seed, "rows": rows, "bad": bad}
+        print(f"{name:<13}{len(named):>5} {noun}, {in_time:>4} before the end, {lost} not as they should be")
+    print(f"seed {options.seed}: {len(rows)} {noun}, {bad} of them not as they should be")
+    return bad
 
 
 def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Row:
@@ -156,6 +181,13 @@ def main() -> int:
     part.add_argument("--only", nargs="+", choices=SCENARIOS, default=KILLED)
     part.add_argument("--ranks", nargs="+", type=int, default=[1, 2, 3])
     part.set_defaults(function=kills)
+
+    part = kinds.add_parser("calls", parents=[common], help=calls.__doc__, description=calls.__doc__)
+    part.add_argument("--seed", type=int, default=1)
+    part.add_argument("--count", type=int, default=300)
+    part.add_argument("--only", nargs="+", choices=SCENARIOS, default=WRITING)
+    part.add_argument("--ranks", nargs="+", type=int, default=[1, 2])
+    part.set_defaults(function=calls)
 
     part = kinds.add_parser("cases", parents=[common], help=cases.__doc__, description=cases.__doc__)
     part.add_argument("--seed", type=int, default=1)

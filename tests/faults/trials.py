@@ -17,6 +17,7 @@ from random import Random
 from typing import Any
 
 from tests.conftest import clean_environment
+from tests.faults.failing_calls import KINDS as ERRORS
 from tests.faults.inject import KINDS
 from tests.faults.scenarios import unreadable
 
@@ -41,12 +42,15 @@ Record = dict[str, Any]
 class Crew:
     """Workers on ``ranks`` ranks that do tasks in ``folder``; a call must end within ``patience`` s.
 
+    ``preload`` is the library of ``failing_calls``, for trials with a failing call.
+
     A worker does one task after another until one of them ends it. ``with Crew(...) as crew`` leaves no process behind.
     """
 
     folder: Path
     ranks: int
     patience: float = 40.0
+    preload: Path | None = None
 
     def __post_init__(self) -> None:
         self.worker: subprocess.Popen | None = None
@@ -124,6 +128,8 @@ class Crew:
         worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), str(self.patience)]
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
         environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
+        if self.preload:
+            command[1:1] = ["-x", f"LD_PRELOAD={self.preload}"]
         with (self.folder / "mpirun.log").open("w") as file:
             # The worker gets a process group, which can be killed, but no session: Linux gives each session a fair part
             # of the cores, and the priority that scripts/test gives to mpirun holds only within a session.
@@ -260,6 +266,26 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
         }  # fmt: skip
 
 
+def failing_calls(unbroken: dict[int, dict[str, Record]], seed: int, count: int) -> Iterator[Task]:
+    """Yield trials in which a call of the file system fails, or is the last of its process, at random.
+
+    ``unbroken`` are the records of ``references``, by the number of ranks.
+    """
+    random = Random(seed)
+    places = sorted((name, ranks) for ranks, records in unbroken.items() for name in records)
+    for turn in range(count):
+        # All scenarios in turn, since calls of one of them may be a hundred times those of another.
+        name, ranks = places[turn % len(places)]
+        calls = unbroken[ranks][name]["calls"]
+        rank = random.choice([rank for rank, number in enumerate(calls) if number] or [0])
+        call = random.randint(1, max(calls[rank], 1))
+        kind = random.choice(ERRORS)
+        yield {
+            "id": f"{turn}: {name} on {ranks} ranks, {kind} at call {call} of {calls[rank]} of rank {rank}",
+            "do": "trial", "scenario": name, "kind": kind, "rank": rank, "ranks": ranks, "call": call,
+        }  # fmt: skip
+
+
 def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> list[str]:
     """Return the defects of a trial, in words; ``allowed`` is the time in s from the fault to the end of all ranks."""
     ended = stages.get("ended", {})
@@ -280,6 +306,9 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     codes = CODES.get(kind, CODES_AT_PHASES.get(task.get("phase"), {1}))
     if "delay" in task:
         codes = codes | OF_MPIRUN[kind]
+    # What need not be removed may stay; a folder that cannot be locked is refused.
+    if "call" in task and kind != "sigkill":
+        codes = {0, 1, 2}
     if ended["code"] not in codes:
         wrong.append(f"exit code {ended['code']}")
 
@@ -289,6 +318,11 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
         wrong.append(f"{len(messages)} messages")
     if "Traceback" in errors and kind != "exception":
         wrong.append("traceback")
+    if "call" in task and ended["code"] in (1, 2):
+        if not messages:
+            wrong.append("no message")
+        if "[Errno" in errors:
+            wrong.append("the system's own sentence")
 
     wrong += ended["broken"]
     if finished.get("code") != 0:

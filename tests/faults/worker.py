@@ -27,6 +27,7 @@ petsc4py.init(["faults", "-no_signal_handler"])
 
 from mpi4py import MPI
 
+from tests.faults.failing_calls import FailingCalls
 from tests.faults.inject import Injector
 from tests.faults.scenarios import (
     SCENARIOS,
@@ -68,6 +69,7 @@ class Worker:
     def __post_init__(self) -> None:
         self.comm = MPI.COMM_WORLD.Dup()
         self.injector = Injector()
+        self.calls = FailingCalls()
         self.errors = self.folder / f"errors-{self.comm.rank}"
 
     def do(self, task: Task) -> None:
@@ -101,9 +103,12 @@ class Worker:
 
         if self.comm.rank == task["rank"] and "phase" in task:
             self.injector.arm(task["phase"], task["number"], task["kind"], self.folder / "fired")
+        if self.comm.rank == task["rank"] and "call" in task:
+            self.calls.arm(task["call"], task["kind"], out, self.folder / "fired")
         self._report(task, "begun", processes=self.comm.allgather(os.getpid()))
         ended = self._call(words)
         self.injector.disarm()
+        self.calls.disarm()
         self._report(task, "ended", **ended, **self._left_behind(out))
 
     def _case(self, scenario: Scenario) -> Path:
@@ -137,10 +142,12 @@ class Worker:
         self.comm.Barrier()
 
         self.injector.disarm()
+        self.calls.arm(0, "sigkill", wanted)
         # The call may have to compile kernels.
         ended = self._call(words_of(scenario.words, case, wanted), 10.0)
         counts = self.comm.gather(self.injector.disarm())
-        self._report(task, "finished", **ended, counts=counts)
+        calls = self.comm.gather(self.calls.disarm())
+        self._report(task, "finished", **ended, counts=counts, calls=calls)
 
     def _left_behind(self, out: Path) -> dict[str, Any]:
         """Return whether the fault came, the time in s since then, and files of results that cannot be read."""

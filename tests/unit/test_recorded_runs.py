@@ -1,5 +1,8 @@
 """Records of the runs of a study, and the ring on which runs with one site take place."""
 
+import errno
+import os
+from pathlib import Path
 from types import SimpleNamespace
 
 from mpi4py import MPI
@@ -7,11 +10,13 @@ from mpi4py import MPI
 import pytest
 
 from vipetsc.case.law import LawCase
-from vipetsc.io.records import RecordFile
+from vipetsc.io.atomic import unwritten
+from vipetsc.io.records import Record, RecordFile
 from vipetsc.parallel import StopRequest
 from vipetsc.sources import hash_of, source_key
-from vipetsc.studies.recorded_runs import RecordedRuns, RecordPaths
+from vipetsc.studies.recorded_runs import Key, RecordedRuns, RecordPaths
 from vipetsc.studies.ring import Ring
+from vipetsc.wording import of_system
 
 
 def recorded_runs(folder) -> RecordedRuns:
@@ -103,3 +108,30 @@ def test_the_ring_is_endless_and_has_one_site_or_none():
     assert with_site.drive.amplitude == 2.0
     assert without.contacts.sites == []
     assert without.output.window == [setting.site + 1, setting.site + 1]
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ESTALE, errno.EMFILE, errno.ENOSPC])
+@pytest.mark.parametrize("message", ["", "law.h5 could not be written"])
+def test_an_error_of_the_file_system_ends_all_runs_and_is_no_failure_of_one(tmp_path, number, message):
+    """The error names the file, and no record counts the run as failed, also where any exception is a failure."""
+    failure = OSError(number, message) if message else OSError(number, os.strerror(number), "law.h5")
+
+    def work(key: Key) -> Record:
+        raise failure
+
+    runs = RecordedRuns("runs", tmp_path, MPI.COMM_SELF, StopRequest(), failures=(Exception,))
+    with pytest.raises(OSError, match=r"^law\.h5 could not") as caught:
+        runs.compute(["a"], work)
+    assert message or "the same command continues" in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_message_of_the_system_gets_its_file_and_a_remedy(tmp_path):
+    """Both names of a renaming are in it; messages of the package stay as they are, without a number."""
+    with pytest.raises(OSError, match="No such file") as caught:
+        os.replace(tmp_path / "a", tmp_path / "b")
+    message = of_system(caught.value)
+    assert all(word in message for word in (f"{tmp_path}/a", f"{tmp_path}/b", "No such file", "the same command"))
+    assert "[" not in message
+    assert of_system(unwritten(Path("x.h5"), OSError(errno.EIO, "I/O"))).startswith("x.h5 could not be written")
+    assert of_system(OSError("no ffmpeg")) == "no ffmpeg"

@@ -8,7 +8,7 @@ import secrets
 import shutil
 import sys
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise unwritten(path, error) from error
     finally:
-        aside.unlink(missing_ok=True)
+        # One that cannot be removed is left to the next claim: its error would hide the first one.
+        with suppress(OSError):
+            aside.unlink()
 
 
 class _WholeFile(io.RawIOBase):
@@ -113,7 +115,8 @@ def remove_abandoned(folder: Path) -> None:
     for path in folder.glob(".*.part"):
         named = of_this_host.fullmatch(path.name)
         if named and not _is_running(int(named[1])):
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink()
 
 
 def _is_running(process: int) -> bool:

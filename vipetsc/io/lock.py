@@ -66,8 +66,9 @@ def _lock(path: Path) -> Iterator[None]:
 def _unlock(path: Path, descriptor: int) -> None:
     """Give back the lock of a folder that ``descriptor`` holds."""
     # Removed while it is still locked: a process that has opened it by now gets the lock of a file without a name,
-    # notices that, and tries again.
-    (path / LOCK).unlink(missing_ok=True)
+    # notices that, and tries again. A file that cannot be removed does not matter: nobody holds its lock.
+    with suppress(OSError):
+        (path / LOCK).unlink()
     os.close(descriptor)
 
 
@@ -75,10 +76,9 @@ def remove_temporary_files(folder: Path) -> None:
     """Remove temporary files, and locks that nobody holds, which killed commands have left in ``folder`` and below it.
 
     The caller has the lock of ``folder``. Another command may have the lock of a folder in it, for example of a member
-    of a sweep: files there are left alone.
+    of a sweep: files there are left alone. What cannot be removed stays, since no reader takes it for a result.
     """
-    for temporary in folder.glob(".*.part"):
-        temporary.unlink(missing_ok=True)
+    _remove_parts(folder)
 
     for inner in filter(Path.is_dir, folder.iterdir()):
         descriptor = None
@@ -86,10 +86,16 @@ def remove_temporary_files(folder: Path) -> None:
             descriptor, _ = _try_to_lock(inner)
             if descriptor is None:
                 continue
-        for temporary in inner.glob(".*.part"):
-            temporary.unlink(missing_ok=True)
+        _remove_parts(inner)
         if descriptor is not None:
             _unlock(inner, descriptor)
+
+
+def _remove_parts(folder: Path) -> None:
+    """Remove temporary files from ``folder``."""
+    for temporary in folder.glob(".*.part"):
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def _acquire(path: Path, created: list[Path]) -> int | None:

@@ -1,4 +1,4 @@
-"""Jobs done by teams of ranks: a single job may fail; a request to stop or a full disk ends all jobs."""
+"""Jobs done by teams of ranks: a single job may fail; a request to stop or an error of the file system ends all."""
 
 import sys
 import time
@@ -8,11 +8,11 @@ from typing import NamedTuple, TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.io.errors import is_disk_full
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 from vipetsc.plugins import PROGRAMMING, PartFailure
 from vipetsc.progress import Progress
 from vipetsc.register import PartError
+from vipetsc.wording import of_system
 
 BLOCKS = 100  # that each team draws, at least: none then waits for the last longer than 1 % of the whole
 # Time in s that a rank whose job failed waits for the rest of its team to have failed as well. Ranks that fail together
@@ -51,7 +51,7 @@ class TaskPool:
     """Teams of ranks that draw jobs until none are left, or until some rank got a request to stop (``stopped``).
 
     ``busy`` is the time in s that this rank worked on them. A job may end in ``failures``; other exceptions end
-    all jobs, as a full disk and errors of a program (``PROGRAMMING``) do.
+    all jobs, as those of the file system (OSError) and errors of a program (``PROGRAMMING``) do.
     """
 
     def __init__(
@@ -74,7 +74,8 @@ class TaskPool:
         """Do all ``jobs``, begun in their order; returns how many were done. Collective.
 
         ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
-        the disk is full, or after an exception that is no failure; PartError if a part of a user's module is wrong.
+        a file cannot be read or written, or after an exception that is no failure; PartError if a part of a user's
+        module is wrong.
         """
         reports = self.comm.allgather(self._draw_jobs(jobs, work, progress, fail))
         self.stopped = any(report.last.ending == Ending.STOPPED for report in reports)
@@ -178,7 +179,7 @@ class TaskPool:
             try:
                 on_root(self.team, lambda: fail(job, end.reason))
             except OSError as error:  # the failure could not be recorded
-                return JobEnd(Ending.FATAL, str(error))
+                return JobEnd(Ending.FATAL, of_system(error))
         return end
 
     def _judge(self, error: Exception) -> JobEnd:
@@ -186,10 +187,11 @@ class TaskPool:
         is_failure = isinstance(error, self.failures) and not isinstance(error, PROGRAMMING)
         if isinstance(error, PartError) and not (isinstance(error, PartFailure) and is_failure):
             return JobEnd(Ending.PART, str(error))
-        if is_failure and not is_disk_full(error):
-            return JobEnd(Ending.FAILED, reason_of(error))
+        # A file that cannot be read or written says nothing about the job, which may succeed in the next call.
         if isinstance(error, OSError):
-            return JobEnd(Ending.FATAL, str(error))
+            return JobEnd(Ending.FATAL, of_system(error))
+        if is_failure:
+            return JobEnd(Ending.FAILED, reason_of(error))
         return JobEnd(Ending.FATAL, reason_of(error))
 
 
