@@ -95,6 +95,17 @@ def call(part: RegisteredPart, function: Callable[..., Any], *arguments: Any) ->
         raise PartFailure(text) from error
 
 
+def announce_parts(modules: Sequence[str]) -> None:
+    """Name the parts of the ``modules`` of a case on which results depend, before other ranks than 0 call them.
+
+    ``call`` names a part on rank 0 alone: a line of each rank would be too many.
+    """
+    for name in modules:
+        for part in load(name).parts:
+            if part.kind not in NEVER_RESULTS:
+                announce(f"ranks call the {part.kind} {part.name!r} of {part.file}")
+
+
 def number_of(part: RegisteredPart, value: Any, what: str = "value") -> float:
     """Return the real number that a function of a ``part`` has returned; raises PartError for any other ``value``.
 

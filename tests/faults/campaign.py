@@ -86,7 +86,7 @@ def calls(options: argparse.Namespace) -> dict[str, Any]:
             crews[ranks] = leaving.enter_context(crew)
 
         unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
-        tasks = list(trials.failing_calls(unbroken, options.seed, options.count))
+        tasks = list(trials.failing_calls(unbroken, options.seed, options.count, options.kinds))
         for ranks, crew in crews.items():
             crew_tasks = [task for task in tasks if task["ranks"] == ranks]
             rows += [judged(task, stages, options) for task, stages in crew.do(crew_tasks)]
@@ -186,6 +186,7 @@ def main() -> int:
     part.add_argument("--seed", type=int, default=1)
     part.add_argument("--count", type=int, default=300)
     part.add_argument("--only", nargs="+", choices=SCENARIOS, default=WRITING)
+    part.add_argument("--kinds", nargs="+", choices=failing_calls.KINDS, default=failing_calls.KINDS)
     part.add_argument("--ranks", nargs="+", type=int, default=[1, 2])
     part.set_defaults(function=calls)
 

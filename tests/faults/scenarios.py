@@ -138,6 +138,8 @@ range = [0.97, 1.01]
 harmonics = 3
 points = 5
 """
+# The parameter of the curves is a key of the case.
+OVER_KEY = NFRC.replace("range = [0.97, 1.01]", 'over = "contacts.clearance"\nrange = [1.2e-3, 1.8e-3]\nfixed = [2.0]')
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
 # One clearance is identified from a record with contacts, in two starts: one for each of two ranks.
@@ -234,6 +236,7 @@ SCENARIOS = {
         Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
         Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
         Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
+        Scenario("nfrc-over-key", OVER_KEY, f"nfrc {OUT} {PLAIN}"),
         Scenario("design", DESIGN, f"design {OUT}", ranks=2),
         Scenario("law", LAW, f"law {OUT} {PLAIN}", ranks=2),
         Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}", ranks=2),

@@ -266,7 +266,9 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
         }  # fmt: skip
 
 
-def failing_calls(unbroken: dict[int, dict[str, Record]], seed: int, count: int) -> Iterator[Task]:
+def failing_calls(
+    unbroken: dict[int, dict[str, Record]], seed: int, count: int, kinds: Sequence[str] = ERRORS
+) -> Iterator[Task]:
     """Yield trials in which a call of the file system fails, or is the last of its process, at random.
 
     ``unbroken`` are the records of ``references``, by the number of ranks.
@@ -279,7 +281,7 @@ def failing_calls(unbroken: dict[int, dict[str, Record]], seed: int, count: int)
         calls = unbroken[ranks][name]["calls"]
         rank = random.choice([rank for rank, number in enumerate(calls) if number] or [0])
         call = random.randint(1, max(calls[rank], 1))
-        kind = random.choice(ERRORS)
+        kind = random.choice(kinds)
         yield {
             "id": f"{turn}: {name} on {ranks} ranks, {kind} at call {call} of {calls[rank]} of rank {rank}",
             "do": "trial", "scenario": name, "kind": kind, "rank": rank, "ranks": ranks, "call": call,

@@ -121,8 +121,11 @@ def test_a_measure_with_a_mistake_ends_a_sweep_at_once(folder, ranks, number, re
 
 @pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks):
-    """A function that fails for the numbers of one run fails this member alone, also in a team of ranks."""
+def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks, capfd):
+    """A function that fails for the numbers of one run fails this member alone, also in a team of ranks.
+
+    Rank 0 names it before any rank calls it, since another one may never come back from it.
+    """
     comm = MPI.COMM_WORLD
     if comm.rank == 0:
         returned = "[][0] if record.run.sizes['episode'] else 1.0"
@@ -134,5 +137,7 @@ def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks):
     result = run_sweep(Sweep.from_table(table), folder / "out", comm)
 
     assert result.count(FAILED) == 1
+    named = f"ranks call the measure 'mine-9' of {folder / 'part.py'}"
+    assert (named in capfd.readouterr().err) == (comm.size > 1 and comm.rank == 0)
     failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
     assert "IndexError" in failed[0]["reason"]

@@ -392,7 +392,9 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
     file.append(record_of_linear(linear, "wave"))
     _, warnings = conclude(Results(sweep, tmp_path))
 
-    assert warnings == ["3 members: seen", "1 member: alone"]
+    # What only some members have is said.
+    history = "1 of 3 members have no value (NaN) of entropy/history, entropy/snapshot"
+    assert warnings == ["3 members: seen", "1 member: alone", history]
     ensemble = open_ensemble(tmp_path)
     assert ensemble["status"].values.tolist() == [SCALED] * 3
     assert ensemble["work"].values.tolist() == [1, 4, 1]

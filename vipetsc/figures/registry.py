@@ -247,6 +247,8 @@ def draw(
 
     Raises
     ------
+    ResultFileError
+        For results with numbers that are not finite, or none, of which a figure cannot be drawn.
     KeyError
         For a name that is no figure of ``source``, and for a file that lacks something.
     OSError, ValueError
@@ -258,13 +260,14 @@ def draw(
 
     with rc_style(), Files() as opened_here:
         opened = opened_here if files is None else files
-        return draw_each(
-            drawings(source, folders, opened, names, omit),
-            target=folders[0] / "figures",
-            formats=formats,
-            turns=itertools.count() if turns is None else turns,
-            keep=keep,
-        )
+        with opened.naming_spoilt():
+            return draw_each(
+                drawings(source, folders, opened, names, omit),
+                target=folders[0] / "figures",
+                formats=formats,
+                turns=itertools.count() if turns is None else turns,
+                keep=keep,
+            )
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:

@@ -32,8 +32,16 @@ def reasons_without_pictures(
 
     The figures are those in ``names``, by default all; of sweeps by default measures, and the figure that shows
     branches too if ``folders`` hold any. A branch of which nothing is drawn has the name of its file. Results are
-    opened as ``files``, and stay open for those who draw them. Raises KeyError as ``figure_names``.
+    opened as ``files``, and stay open for those who draw them. Raises KeyError as ``figure_names``, and ResultFileError
+    for results with numbers that are not finite, or none, for which a reason cannot be given.
     """
+    with files.naming_spoilt():
+        reasons = _reasons(source, folders, files, names)
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def _reasons(source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None) -> dict[str, str]:
+    """Return the reason for each figure, empty for those that are drawn; see ``reasons_without_pictures``."""
     if source == SWEEP:
         return _reasons_of_sweeps(folders, files, names)
 
@@ -51,7 +59,7 @@ def reasons_without_pictures(
         for name in figure_names(source, names, folders, files):
             without = specs[name].without
             reasons[name] = without(result_of(source, folders[0], files)) if without else ""
-    return {name: reason for name, reason in reasons.items() if reason}
+    return reasons
 
 
 def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[str]) -> dict[str, str]:

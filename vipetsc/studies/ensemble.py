@@ -22,6 +22,7 @@ from vipetsc.spectra.measures import PART, power_of, row_of
 from vipetsc.studies.linear_run import FITTED, LINEAR, MEASURES, MEMBER, MEMBERS, LinearRun, of_motion
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
+from vipetsc.wording import counted, shortened
 
 # Members of a curve, and points from its peak on, for which a power law is fitted: two lie on one of any kind.
 LEAST_FITTED = 3
@@ -189,6 +190,20 @@ class Results:
                 energy = self.tables["bands/modal_energy"]
                 # Energies grow with the square of the amplitude, as the work does.
                 energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
+
+    def gaps(self) -> list[str]:
+        """Sentences on measures that only some of the members have that did not fail; the others' are NaN."""
+        done = (self.status == COMPLETE) | (self.status == SCALED)
+        names: dict[int, list[str]] = {}
+        for name in _layout(self):
+            if name in self.tables:
+                rows = self.tables[name][self.first][done]
+                without = int(np.isnan(rows).reshape(len(rows), -1).all(axis=1).sum())
+                if 0 < without < len(rows):
+                    names.setdefault(without, []).append(name)
+
+        members = counted(int(done.sum()), "member")
+        return [f"{number} of {members} have no value (NaN) of {shortened(names[number])}" for number in sorted(names)]
 
     def merge_files(self) -> None:
         """Merge the records of all ranks into one file, without outdated ones."""

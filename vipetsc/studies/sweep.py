@@ -25,6 +25,7 @@ from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import SWEEP, claimed
 from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
+from vipetsc.plugins import announce_parts
 from vipetsc.progress import say
 from vipetsc.sources import source_key
 from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Results, assemble
@@ -172,6 +173,9 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun]]:
         survey = _survey(plan, folder)
         surveys.append(survey)
+        # Another rank may be the first that calls a part which never returns.
+        if comm.size > 1 and survey.drawn and (named := survey.drawn[0].case.plugins):
+            announce_parts(named.modules)
         # Where no member is missing, no rank needs the linear runs, which may be large to send.
         linear: dict[str, LinearRun] = {}
         if len(survey.missing):
@@ -313,6 +317,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
         "failed": [_failed_member(results, number) for number in np.flatnonzero(status == FAILED)],
     }
     warnings = summarise([text for first in results.first for text in results.warnings.get(int(first), ())])
+    warnings += results.gaps()
 
     path = folder / "index.json"
     text = json.dumps(index, indent=1, default=int) + "\n"
