@@ -129,7 +129,7 @@ def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks, c
     comm = MPI.COMM_WORLD
     if comm.rank == 0:
         returned = "[][0] if record.run.sizes['episode'] else 1.0"
-        (folder / "part.py").write_text(MEASURE.format(number=9, returned=returned))
+        (folder / "part.py").write_text(MEASURE.format(number=9 + ranks, returned=returned))
     comm.Barrier()
     table = SWEEP | {"plugins": {"modules": [str(folder / "part.py")]}}
     table["sweep"] = SWEEP["sweep"] | {"ranks": min(ranks, comm.size), "drive": {"amplitude": [1.0, 1e3, 2.0]}}
@@ -137,7 +137,7 @@ def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks, c
     result = run_sweep(Sweep.from_table(table), folder / "out", comm)
 
     assert result.count(FAILED) == 1
-    named = f"ranks call the measure 'mine-9' of {folder / 'part.py'}"
+    named = f"ranks call the measure 'mine-{9 + ranks}' of {folder / 'part.py'}"
     assert (named in capfd.readouterr().err) == (comm.size > 1 and comm.rank == 0)
     failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
     assert "IndexError" in failed[0]["reason"]
