@@ -34,6 +34,8 @@ def branch_of(**columns: np.ndarray | list) -> xr.Dataset:
     branch = xr.Dataset({name: ("point", values) for name, values in columns.items()})
     if "multiplier_max" in branch:
         branch["multiplier_max"].attrs["unstable_beyond"] = 1.5
+    if "kind" in branch:
+        branch["kind"].attrs["flag_meanings"] = "regular"
     return branch
 
 

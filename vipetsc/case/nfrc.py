@@ -18,6 +18,7 @@ from vipetsc.case.names import distinct
 from vipetsc.case.nfrc_ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
+from vipetsc.case.response_measures import RESPONSE, measures_of
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
@@ -103,6 +104,7 @@ class NfrcCase(Case):
         problems = [
             *_check_waves(nfrc, cell),
             *check_ground(nfrc, sections["lattice"], chain, gaps_of_sites(contacts, list(chain.clearances))),
+            *_check_points_at(nfrc, measures_of(nfrc, sections["lattice"], sections["output"], chain)),
         ]
         return sections | {"nfrc": nfrc}, problems
 
@@ -362,6 +364,14 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
+
+
+def _check_points_at(nfrc: NfrcTable, measures: Mapping[str, Any]) -> Iterator[Problem]:
+    """Problems with quantities of ``nfrc.points_at`` that states do not have."""
+    names = [*PARAMETERS, *(name.removeprefix(RESPONSE) for name in measures)]
+    for name in nfrc.points_at:
+        if name not in names:
+            yield Problem("nfrc.points_at", name, f"use one of {', '.join(names)}")
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.schema import Positive, Range, once
+from vipetsc.case.schema import Finite, Positive, Range, once
 from vipetsc.case.section import described
 from vipetsc.case.varied_key import is_key
 
@@ -74,6 +74,11 @@ class NfrcTable(Section):
         "special points other than folds: where states become stable or unstable, or all where the number"
         " of growing perturbations changes",
         "stability",
+    )
+    points_at: dict[str, list[Finite]] = described(
+        "quantities (`frequency`, `amplitude`, `largest`, `largest/2`, `peak_acceleration/name`) with values at which"
+        " points are stored, wherever a curve passes them",
+        {},
     )
     points: int = described("largest number of points of a curve", 1000, ge=1)
     first_step: Positive = described("first arclength step, in clearances and scaled parameters", 0.02)

@@ -167,6 +167,11 @@ class NnmTable(Section):
     orbits_at: list[Positive] = described(
         "energies at which orbits are stored, wherever the branch passes them", [], unit="J"
     )
+    points_at: dict[Literal["energy", "frequency", "period", "closed"], list[Positive]] = described(
+        "values at which points are stored, wherever a branch passes them: of the energy in J, the frequency in rad/s,"
+        " the period in s, the fraction of the time in contact",
+        {},
+    )
     switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = described(
         "kinds of special points at which crossing branches are followed", []
     )

@@ -1,8 +1,11 @@
 """Measures of whole frequency responses, for searches: their names, and what they are of."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.nfrc_table import NfrcTable
+from vipetsc.case.schema import LatticeTable, OutputTable
+from vipetsc.lattice import Chain, nonlinear_places
 from vipetsc.spectra.measures import JOINT
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS
 
@@ -25,14 +28,23 @@ class ResponseMeasure(NamedTuple):
     unit: str
 
 
-def response_measures(case: NfrcCase) -> dict[str, ResponseMeasure]:
-    """The measures, by name, of the curves of a ``case``: those of its sites, and of what ``[output]`` asks for."""
-    output = case.output
-    sites = [str(number) for number in range(1, len(case.model().chain.sites) + 1)]
+def response_measures(case: Any) -> dict[str, ResponseMeasure]:
+    """The measures, by name, of the curves of an ``NfrcCase``: of its sites, and of what ``[output]`` asks for."""
+    return measures_of(case.nfrc, case.lattice, case.output, case.model().chain)
+
+
+def measures_of(
+    nfrc: NfrcTable, lattice: LatticeTable, output: OutputTable, chain: Chain
+) -> dict[str, ResponseMeasure]:
+    """The measures, by name, of the curves of a case with these sections and this ``chain``."""
+    sites = [str(number) for number in range(1, len(chain.sites) + 1)]
     members: dict[str, list[str]] = {}
     if sites:
         members |= {"largest": sites, "closed": sites}
-    if case.nfrc.infinite:
+    springs = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
+    if springs:
+        members["largest_elongation"] = springs
+    if nfrc.infinite:
         members["share"] = list(FRACTIONS)
     if output.points:
         points = [point.name for point in output.points]
@@ -42,15 +54,29 @@ def response_measures(case: NfrcCase) -> dict[str, ResponseMeasure]:
         members |= dict.fromkeys(("transmission", "steady_transmission"), pairs)
     if output.forces:
         members |= dict.fromkeys(("largest_force", "first_force"), sites)
-        if case.lattice.ends == "fixed" and not (case.nfrc.infinite or case.nfrc.open_ends):
+        if lattice.ends == "fixed" and not (nfrc.infinite or nfrc.open_ends):
             members |= {quantity: list(WALLS) for quantity in ("largest_wall_force", "first_wall_force")}
 
     measures: list[ResponseMeasure] = []
     for quantity, names in members.items():
         unit = (LAYOUT | OUTPUTS)[quantity].units
-        if names is sites:
+        if names in (sites, springs):
             measures.append(ResponseMeasure(name=f"{RESPONSE}{quantity}", quantity=quantity, member=None, unit=unit))
         for member, name in enumerate(names):
             named = f"{RESPONSE}{quantity}/{name}"
             measures.append(ResponseMeasure(name=named, quantity=quantity, member=member, unit=unit))
     return {measure.name: measure for measure in measures}
+
+
+def value_of(measures: Mapping[str, ResponseMeasure], name: str, quantities: Mapping[str, Any]) -> float:
+    """The value of a measure, by its name without ``RESPONSE``, in a state with these ``quantities``.
+
+    Names that are no measure of a whole curve, such as ``frequency``, are those of a quantity that is one number.
+    """
+    measure = measures.get(f"{RESPONSE}{name}")
+    if measure is None:
+        return float(quantities[name])
+    values = quantities[measure.quantity]
+    if measure.member is None:
+        return float(values.max())
+    return float(values[measure.member])

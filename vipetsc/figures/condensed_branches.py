@@ -16,6 +16,7 @@ from vipetsc.figures.branch_curves import draw_branch
 from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.frequency_energy import MARKS
 from vipetsc.figures.panels import annotate_empty, label_panels
+from vipetsc.io.branch_kinds import kind_names
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import wave_bands
 
@@ -39,8 +40,7 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     branches = []
     for path in paths:
         with open_netcdf(path, "branch", ("harmonics", "elongation", "kind")) as file:
-            names = np.array(file["kind"].attrs["flag_meanings"].split())
-            branches.append(file.load().assign(kind=("point", names[file["kind"].values])))
+            branches.append(file.load().assign(kind=("point", kind_names(file))))
 
     # All rows have the panels that one of them needs, so that their axes stand below each other.
     columns = 3

@@ -29,6 +29,7 @@ from vipetsc.figures import style
 from vipetsc.figures.branch_curves import draw_branch, lowest, smooth
 from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
+from vipetsc.io.branch_kinds import CHOSEN, kind_names
 from vipetsc.io.netcdf import open_netcdf
 
 # What the panels read; ``draw_branch`` shows by ``multiplier_max`` which orbits are stable.
@@ -39,6 +40,7 @@ MARKS = {
     "branch-point": ("D", "branch point"),
     "symmetry-breaking": ("^", "symmetry breaking"),
     "period-doubling": ("v", "period doubling"),
+    CHOSEN: ("X", "chosen value"),
 }
 HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 # Special points that are marked. A branch through many tongues has hundreds, whose marks would hide the curve: there
@@ -114,9 +116,7 @@ def _read(path: Path) -> xr.Dataset:
     """Return the branch in ``path`` with the kinds of its points in words."""
     with open_netcdf(path, "branch", NEEDS) as file:
         branch = file.load()
-    # The kinds' numbers, ``flag_values``, are places in this list.
-    kinds = np.array(branch["kind"].attrs["flag_meanings"].split())
-    return branch.assign(kind=("point", kinds[branch["kind"].values]))
+    return branch.assign(kind=("point", kind_names(branch)))
 
 
 def _holds(branch: xr.Dataset, beginning: str) -> bool:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
 from vipetsc.figures.stability import StabilityLook, draw_states, draw_undecided
+from vipetsc.io.branch_kinds import CHOSEN, kind_names
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.wording import with_unit
 
@@ -24,12 +25,13 @@ ENERGIES = {
     "upper": ("U, other harmonics", style.VERMILION, style.DOTTED),
     "lost": ("L, dissipated in contacts", style.ORANGE, "-."),
 }
-# Marks of special points, by the codes of the variable ``kind``: label, marker, size.
+# Marks of special points, by the names of their kinds: label, marker, size.
 SPECIAL = {
-    1: ("fold", "o", 3.5),
-    2: ("Neimark-Sacker", "D", 3.0),
-    3: ("period doubling", "^", 3.8),
-    4: ("branch point", "s", 3.2),
+    "fold": ("fold", "o", 3.5),
+    "neimark-sacker": ("Neimark-Sacker", "D", 3.0),
+    "period-doubling": ("period doubling", "^", 3.8),
+    "branch-point": ("branch point", "s", 3.2),
+    CHOSEN: ("chosen value", "X", 3.8),
 }
 LEAST_FRACTION = 1e-3  # of the energy: a smaller one cannot be told from zero in the panel
 
@@ -201,8 +203,9 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
 def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: bool = False) -> None:
     """Mark the special points of a curve that shows ``values`` (point,), ``labelled`` for a legend if asked for."""
     parameter = parameter_of(branch)
-    for code, (label, marker, size) in SPECIAL.items():
-        (places,) = np.nonzero(branch["kind"].values == code)
+    kinds = kind_names(branch)
+    for kind, (label, marker, size) in SPECIAL.items():
+        (places,) = np.nonzero(kinds == kind)
         if places.size:
             look = {"ms": size, "mfc": "white", "mec": style.VERMILION, "ls": "none", "marker": marker}
             if labelled:

@@ -7,6 +7,7 @@ readers are in this room because figures, which read branches, do not load PETSc
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from vipetsc.io.netcdf import open_netcdf, root_attributes
@@ -19,6 +20,9 @@ CONDENSED = "condensed"
 
 RESPONSES = "responses"
 """Steady states under a harmonic drive (nonlinear frequency response)."""
+
+CHOSEN = "chosen"
+"""Kind of points at values that the case asks for, whose names in files are ``quantity@value``."""
 
 BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES)
 
@@ -44,6 +48,12 @@ def kind_of_file(path: Path, needs: Sequence[str] = ()) -> str:
         return _known(kind)
     with open_netcdf(path, "branch", needs) as branch:
         return branch_kind(branch)
+
+
+def kind_names(branch: xr.Dataset) -> np.ndarray:
+    """Return the kind (point,) of each point of a branch file; "chosen" of points at values that the case asks for."""
+    names = [name if "@" not in name else CHOSEN for name in branch["kind"].attrs["flag_meanings"].split()]
+    return np.array(names)[branch["kind"].values]
 
 
 def _known(kind: str) -> str:

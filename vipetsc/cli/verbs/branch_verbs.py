@@ -246,6 +246,11 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
         elif kind == "fold":
             rows.append((heading, "none"))
 
+    # Points at chosen values: quantity@value.
+    for kind in dict.fromkeys(point.kind for point in curve.points if "@" in point.kind):
+        at = parameter[curve.is_kind(kind)]
+        rows.append((kind, ", ".join(f"{value:.6g}" for value in at) + f" {unit}"))
+
     jumps = []
     for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):
         # The numbers of the states along a slow sweep go up or down one by one, unless the sweep jumps.

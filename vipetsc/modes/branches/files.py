@@ -13,7 +13,7 @@ from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed_layout import CondensedLayout
-from vipetsc.modes.branches.kinds import kinds_of
+from vipetsc.modes.branches.kinds import kinds_in
 from vipetsc.modes.branches.layout import BranchLayout
 from vipetsc.modes.branches.orbit_layout import OrbitLayout
 from vipetsc.modes.branches.response_layout import ResponseLayout
@@ -45,7 +45,7 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
     layout = LAYOUTS[branch.kind]
 
     # Codes are stored with their meanings, by which they are read: lists of kinds may grow.
-    names = kinds_of(branch.kind)
+    names = kinds_in(branch)
     kinds = np.array([names.index(p.kind) for p in branch.points], np.int8)
     flags = {"flag_values": np.arange(len(names), dtype=np.int8), "flag_meanings": " ".join(names)}
 

@@ -98,6 +98,7 @@ class Growth:
         ``chart`` is the name of the unknowns in which steps are taken (``Continuation``).
         """
         last = continuation.point
+        chosen = self.method.chosen(problem)
         # A special point between the newest two points may need the direction of the one before them.
         one_before_last = None
         regular = branch.regular()
@@ -120,6 +121,7 @@ class Growth:
                     grazing=self.method.locates_grazing,
                     before=one_before_last,
                     missed=missed,
+                    chosen=chosen,
                 )
 
             # As in regular points, ``next_step`` is that of the step after the one that found them.

@@ -11,10 +11,20 @@ import numpy as np
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
-from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 from vipetsc.parallel import StopRequest
 
 Monitor = Callable[[S], str | None]
+
+
+def value_kind(
+    name: str, value: float, quantity: Callable[[S], float], accept: Callable[[S], bool] | None = None
+) -> SpecialKind[S]:
+    """Points where the ``quantity`` of that ``name`` has a ``value``; their kind is ``name@value``."""
+    size = abs(value) or 1.0
+    # Names of kinds are separated by blanks in files.
+    kind = f"{'_'.join(name.split())}@{value:.12g}"
+    return SpecialKind(kind, lambda point: (quantity(point) - value) / size, accept=accept)
 
 
 class CrossingBranch(NamedTuple):
@@ -95,6 +105,10 @@ class Method(ABC, Generic[S]):
     def assess(self, problem: PeriodicProblem[S], point: S) -> S:
         """The point with the quantities of its file that continuation does not need."""
         return point
+
+    def chosen(self, problem: PeriodicProblem[S]) -> list[SpecialKind[S]]:
+        """Kinds of points that the case asks for, beside the special ones: those where a quantity has a value."""
+        return []
 
     def monitor(self, problem: PeriodicProblem[S]) -> Monitor[S]:
         """A check of every new point: a sentence ends the branch, None lets it go on."""

@@ -9,19 +9,21 @@ from typing import cast
 
 from mpi4py import MPI
 
+import numpy as np
+
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, sampled
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
-from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
+from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor, value_kind
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, StepRule, at_energy
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import NoMotionError, PeriodicProblem
+from vipetsc.modes.problem import NoMotionError, PeriodicProblem, SpecialKind
 from vipetsc.modes.shooting import Shooting, ShootingEquations, linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
@@ -62,6 +64,21 @@ class NnmMethod(Method[Point]):
         if isinstance(problem, ShootingEquations):
             return problem.limits.stopped_by(stop)
         return super().stopped_by(problem, stop)
+
+    def chosen(self, problem: PeriodicProblem[Point]) -> list[SpecialKind[Point]]:
+        """The points at the values ``nnm.points_at``."""
+
+        def quantity(name: str, point: Point) -> float:
+            # Points have their frequency in Hz, keys in rad/s.
+            if name == "frequency":
+                return 2 * np.pi / point.period
+            return float(getattr(point, name))
+
+        return [
+            value_kind(name, value, partial(quantity, name))
+            for name, values in self.options.points_at.items()
+            for value in values
+        ]
 
     @property
     def directions(self) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from mpi4py import MPI
@@ -10,13 +11,14 @@ import numpy as np
 
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.response_measures import FRACTIONS, WALLS
+from vipetsc.case.response_measures import FRACTIONS, WALLS, response_measures, value_of
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.method import CrossingBranch, Method
-from vipetsc.modes.problem import PeriodicProblem
+from vipetsc.modes.branches.method import CrossingBranch, Method, value_kind
+from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.problem import PeriodicProblem, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
@@ -25,6 +27,7 @@ from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
+from vipetsc.modes.stability import Perturbations
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
 
@@ -131,6 +134,34 @@ class ResponseMethod(Method[Response]):
             return ClosingSteps(states, max(self.case.nfrc.points - 1 - done, 0), first)
 
         return CrossingBranch(name, lambda: (states, first), rule)
+
+    def chosen(self, problem: PeriodicProblem[Response]) -> list[SpecialKind[Response]]:
+        """The states at the values ``nfrc.points_at``, within the range."""
+        assert isinstance(problem, SteadyStates | StatesOverKey)
+        options = self.case.nfrc
+        of_curve = response_measures(self.case)
+        low, high = (bound / problem.parameter.scale for bound in options.range)
+        rounding = 1e-9 * (high - low)
+        # All values of all quantities are compared at the same few states.
+        latest = LatestValues[bytes, dict[str, Any]](4)
+
+        def measured(xi: np.ndarray) -> dict[str, Any]:
+            # The stability, which is not asked for here, is computed where the state is assessed.
+            measures = problem.measured(xi, Perturbations(0, 0j))
+            fields = measures._asdict() | dict(measures.outputs)
+            return fields | {"share": measures.fractions}
+
+        def quantity(name: str, point: Response) -> float:
+            return value_of(of_curve, name, latest.get(point.xi.tobytes(), lambda: measured(point.xi)))
+
+        def is_within(point: Response) -> bool:
+            return bool(low - rounding <= point.xi[-1] <= high + rounding)
+
+        return [
+            value_kind(name, value, partial(quantity, name), is_within)
+            for name, values in options.points_at.items()
+            for value in values
+        ]
 
     def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
         """The state with its measures, which special points have already."""

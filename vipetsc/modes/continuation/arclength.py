@@ -672,21 +672,22 @@ def locate(
     grazing: bool = False,
     before: S | None = None,
     missed: list[str] | None = None,
+    chosen: Sequence[SpecialKind[S]] = (),
 ) -> list[S]:
     """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
-    Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``. ``chart`` is as
-    for ``Continuation``. With ``grazing`` every change of the number of contacts is located as well, which takes about
-    40 corrections where it must be bracketed. With the point ``before`` the left one, two special points of one kind
-    within the step are found as well. For each special point that cannot be located a sentence is appended to
-    ``missed``.
+    Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``, and those
+    ``chosen``. ``chart`` is as for ``Continuation``. With ``grazing`` every change of the number of contacts is located
+    as well, which takes about 40 corrections where it must be bracketed. With the point ``before`` the left one, two
+    special points of one kind within the step are found as well. For each special point that cannot be located a
+    sentence is appended to ``missed``.
 
     An energy fold has a half-trace of 1, as a branch point has. In a step with an energy fold no branch point is
     therefore looked for: it would be the fold again.
     """
     points: list[S] = []
     segment = Segment(problem, chart, left, right)
-    for kind in problem.special_kinds(left, right):
+    for kind in [*problem.special_kinds(left, right), *chosen]:
         if kind.name == "grazing" and not grazing:
             continue
         if kind.name == "branch-point" and any(p.kind == "fold-energy" for p in points):
