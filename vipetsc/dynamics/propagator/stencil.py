@@ -23,10 +23,10 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.records import Record
 
-# Fewest consecutive cells for which the stencil is used, and cells that it runs over at a time: their sums stay in the
-# processor's first cache.
+# Fewest consecutive cells for which the stencil is used, one vector of the processor.
 SHORTEST = 8
-CHUNK = 512
+# Most cells that it runs over at a time: four sums of each, and what they read, stay in the processor's first cache.
+CHUNK = 320
 
 
 class HaloRegions:
@@ -117,7 +117,8 @@ class Stencil(NamedTuple):
     Owned cells in the ranges ``interior`` (range, 2), half open, read only owned ones, far from the ends and from cells
     that differ: output rows are summed four at a time, of which one may be there twice. For cell 0, and with the state
     as one row of numbers, the outputs of block b go to the places ``blocks`` (block, 4); its terms, ``starts[b]`` to
-    ``starts[b + 1]``, are ``values`` (term, 4) times the numbers at the ``places`` (term,). Cell i is i places further.
+    ``starts[b + 1]``, a multiple of four, are ``values`` (term, 4) times the numbers at ``places`` (term,). Cell i is i
+    places further.
 
     ``borders`` (table, 2 dof, 2 reach + 1, output) are dense rows of the other cells, with zeros for more outputs than
     2 dof up to a multiple of four; ``border_cells`` (cell, 3) has the halo's first column for each, the owned cell that
@@ -205,9 +206,11 @@ def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
     values = []
     for block in blocks:
         row, column = np.nonzero(entries[block].any(axis=0))
-        starts.append(starts[-1] + len(row))
-        places.append(row * layout.owned + column - reach)
-        values.append(entries[block][:, row, column].T.copy())
+        # Up to a multiple of four, the last number is read again, times zero.
+        extra = -len(row) % 4
+        starts.append(starts[-1] + len(row) + extra)
+        places.append(np.pad(row * layout.owned + column - reach, (0, extra), mode="edge"))
+        values.append(np.pad(entries[block][:, row, column].T, [(0, extra), (0, 0)]))
     return SparseRows(
         blocks=blocks * layout.owned,
         starts=np.array(starts),
@@ -263,34 +266,63 @@ def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarr
 
 
 @kernel
-def _add_terms(x: np.ndarray, places: np.ndarray, values: np.ndarray, begin: int, total: np.ndarray) -> None:
-    """Put the sum of ``values`` (term,) times ``x`` at ``places`` (term,) + ``begin`` into ``total`` (cell,).
+def _add_terms(
+    x: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
+    begin: int,
+    sum0: np.ndarray,
+    sum1: np.ndarray,
+    sum2: np.ndarray,
+    sum3: np.ndarray,
+) -> None:
+    """Put the sum of ``values`` (term, 4) times ``x`` at ``places`` (term,) + ``begin`` into four sums (cell,).
 
-    Cell i has its ``x`` i places further. Terms are added in their order.
+    There is a multiple of four terms, which are added in their order. Cell i has its ``x`` i places further.
     """
     # Indices without a sign: numba counts negative ones from the end, and would ask for the sign in each loop.
-    cells = np.uint64(total.size)
-    total[:] = 0.0
-    # Four terms at a time: a sum is read from the cache and written to it once for all four.
-    t = 0
-    while t + 4 <= places.size:
-        p0 = np.uint64(places[t] + begin)
-        p1 = np.uint64(places[t + 1] + begin)
-        p2 = np.uint64(places[t + 2] + begin)
-        p3 = np.uint64(places[t + 3] + begin)
-        v0 = values[t]
-        v1 = values[t + 1]
-        v2 = values[t + 2]
-        v3 = values[t + 3]
+    cells = np.uint64(sum0.size)
+    sum0[:] = 0.0
+    sum1[:] = 0.0
+    sum2[:] = 0.0
+    sum3[:] = 0.0
+
+    # Four terms of four sums at a time: a number is read once for all sums, a sum once for all terms. The factors have
+    # names, not an array, so that they stay in the processor's registers.
+    for t in range(0, places.size, 4):
+        a = np.uint64(places[t] + begin)
+        a0 = values[t, 0]
+        a1 = values[t, 1]
+        a2 = values[t, 2]
+        a3 = values[t, 3]
+
+        b = np.uint64(places[t + 1] + begin)
+        b0 = values[t + 1, 0]
+        b1 = values[t + 1, 1]
+        b2 = values[t + 1, 2]
+        b3 = values[t + 1, 3]
+
+        c = np.uint64(places[t + 2] + begin)
+        c0 = values[t + 2, 0]
+        c1 = values[t + 2, 1]
+        c2 = values[t + 2, 2]
+        c3 = values[t + 2, 3]
+
+        d = np.uint64(places[t + 3] + begin)
+        d0 = values[t + 3, 0]
+        d1 = values[t + 3, 1]
+        d2 = values[t + 3, 2]
+        d3 = values[t + 3, 3]
+
         for i in range(cells):
-            total[i] = total[i] + v0 * x[p0 + i] + v1 * x[p1 + i] + v2 * x[p2 + i] + v3 * x[p3 + i]
-        t += 4
-    while t < places.size:
-        p0 = np.uint64(places[t] + begin)
-        v0 = values[t]
-        for i in range(cells):
-            total[i] += v0 * x[p0 + i]
-        t += 1
+            xa = x[a + i]
+            xb = x[b + i]
+            xc = x[c + i]
+            xd = x[d + i]
+            sum0[i] = sum0[i] + a0 * xa + b0 * xb + c0 * xc + d0 * xd
+            sum1[i] = sum1[i] + a1 * xa + b1 * xb + c1 * xc + d1 * xd
+            sum2[i] = sum2[i] + a2 * xa + b2 * xb + c2 * xc + d2 * xd
+            sum3[i] = sum3[i] + a3 * xa + b3 * xb + c3 * xc + d3 * xd
 
 
 @kernel
@@ -305,13 +337,25 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
 
     # So many neighbouring cells at once: all have the same rows of P.
     for first, stop in stencil.interior:
-        for begin in range(first, stop, CHUNK):
-            size = min(CHUNK, stop - begin)
+        # Parts of equal size, in whole vectors if the cells suffice; the last one may overlap the one before.
+        count = stop - first
+        parts = (count + CHUNK - 1) // CHUNK
+        size = (count + parts - 1) // parts
+        size = min((size + SHORTEST - 1) // SHORTEST * SHORTEST, count)
+        for part in range(parts):
+            begin = min(first + part * size, stop - size)
             for b in range(to.shape[0]):
                 terms = slice(stencil.starts[b], stencil.starts[b + 1])
-                for k in range(4):
-                    total = y[to[b, k] + begin :][:size]
-                    _add_terms(x, places[terms], values[terms, k], begin, total)
+                _add_terms(
+                    x,
+                    places[terms],
+                    values[terms],
+                    begin,
+                    y[to[b, 0] + begin :][:size],
+                    y[to[b, 1] + begin :][:size],
+                    y[to[b, 2] + begin :][:size],
+                    y[to[b, 3] + begin :][:size],
+                )
 
     for column, cell, table in stencil.border_cells:
         multiply_dense(stencil.borders[table], columns, column, stencil.total)
