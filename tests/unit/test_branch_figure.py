@@ -24,7 +24,7 @@ from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.modes.branches.stored_states import stored_states
+from vipetsc.modes.branches.files import stored_states
 
 EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 

@@ -16,7 +16,7 @@ import xarray as xr
 from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
-from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
+from vipetsc.modes.branches.files import read_branch, table, to_dataset, write_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.regions import regions
@@ -44,7 +44,7 @@ def branch(short_branch) -> Branch:
 
 def table_of(branch: Branch) -> str:
     """Return the CSV table of a branch as text."""
-    return str(LAYOUTS[branch.kind].table(branch))
+    return table(to_dataset(branch), branch.kind)
 
 
 def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False, **nnm) -> Branch:

@@ -23,7 +23,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import measure
+from vipetsc.modes.branches.sweeps import measure
 from vipetsc.modes.response import isolated
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates

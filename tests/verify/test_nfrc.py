@@ -33,8 +33,7 @@ from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
-from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_folds
+from vipetsc.modes.branches.sweeps import ParameterSweep, measure, sweep_down, sweep_up, swept, with_stable_folds
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.stability import Hill

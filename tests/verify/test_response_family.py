@@ -24,7 +24,7 @@ from vipetsc.figures.response_family import legend_of
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import measure
+from vipetsc.modes.branches.sweeps import measure
 
 pytestmark = pytest.mark.parallel(1)
 

@@ -24,9 +24,9 @@ from vipetsc.io.export import write_curves
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import OUTPUTS
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
+from vipetsc.spectra.responses import OUTPUTS
 
 pytestmark = pytest.mark.parallel(1)
 

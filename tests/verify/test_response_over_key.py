@@ -17,8 +17,8 @@ from vipetsc.case.case_file import put
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import parameter_values
 from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.branches.sweeps import parameter_values
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steps import first_state
 

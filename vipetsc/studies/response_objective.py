@@ -12,8 +12,8 @@ from vipetsc.case.objective import MeasuredTable
 from vipetsc.case.response_measures import ResponseMeasure, response_measures
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.response_layout import measure, parameter_values
 from vipetsc.modes.branches.responses import ISOLA
+from vipetsc.modes.branches.sweeps import measure, parameter_values
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.spectra.responses import CurvePart, largest_response, widest_gap
 

@@ -230,7 +230,7 @@ def parameter_unit(case: NfrcCase, curve: "Branch") -> str:
 
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     """Summary of a curve as rows: its length, special points, jumps of slow sweeps, stable points, energy balance."""
-    from vipetsc.modes.branches.response_layout import measure, parameter_values, sweep_down, sweep_up
+    from vipetsc.modes.branches.sweeps import measure, parameter_values, sweep_down, sweep_up
 
     options = case.nfrc
     rows = [("curve", curve.name), ("points", f"{len(curve.points)}; {curve.ending}")]

@@ -21,9 +21,9 @@ from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import stored_states
 from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
-from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.lattice.floquet import with_multipliers

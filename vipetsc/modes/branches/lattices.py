@@ -8,9 +8,9 @@ from vipetsc.case import NnmCase
 from vipetsc.case.names import distinct
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import stored_states
 from vipetsc.modes.branches.losses import dissipation_of, with_lattice_loss
 from vipetsc.modes.branches.orbits import NnmMethod, map_of, start_energy
-from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point

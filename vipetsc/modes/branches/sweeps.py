@@ -4,6 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.response.state import Response
+from vipetsc.spectra.responses import LAYOUT, OUTPUTS, Stored
+
 
 class ParameterSweep(NamedTuple):
     """States of a curve in order: the ``parameter``, which the sweep lets grow, a ``size``, and the ``stable`` ones.
@@ -68,3 +72,58 @@ def _states_across(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]
         if passes and sweep.stable[low] and sweep.stable[high] and not {low, high} & passed:
             ahead.append(high)
     return ahead
+
+
+def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
+    """The outputs that the states of a curve have."""
+    if not branch.points:
+        return {}
+    present = branch.points[0].measured.outputs
+    return {name: stored for name, stored in OUTPUTS.items() if name in present}
+
+
+def measure(branch: Branch[Response], stored: str) -> np.ndarray:
+    """A measure or an output (state, ...) of every state, by its name in the file."""
+    if stored in OUTPUTS:
+        return np.array([p.measured.outputs[stored] for p in branch.points])
+    if stored == "harmonics":
+        return np.array([p.measured.harmonics.real for p in branch.points])
+    if stored == "harmonics_imaginary":
+        return np.array([p.measured.harmonics.imag for p in branch.points])
+    if stored == "share":
+        return np.array([p.measured.fractions for p in branch.points])
+    return np.array([getattr(p.measured, stored) for p in branch.points])
+
+
+def parameter_values(branch: Branch[Response]) -> np.ndarray:
+    """The value (point,) of the parameter that varies along a curve."""
+    over = str(branch.about["over"])
+    if over in LAYOUT:
+        return measure(branch, over)
+    return measure(branch, "parameter")  # a key of the case
+
+
+def sweep_up(branch: Branch[Response]) -> list[int]:
+    """States that a slow growth of the parameter passes, from the first stable one."""
+    return swept(_sweep(branch, 1))
+
+
+def sweep_down(branch: Branch[Response]) -> list[int]:
+    """States that a slow fall of the parameter passes, from the last of the sweep up."""
+    passed = sweep_up(branch)
+    if not passed:
+        return []
+    return swept(_sweep(branch, -1), passed[-1])
+
+
+def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
+    """The states of a curve for a sweep up (``sign`` 1) or down (-1)."""
+    # With the sign a sweep down is one up as well; -1 unstable perturbations mean that stability is undecided.
+    stable = measure(branch, "unstable") == 0
+    fold = branch.is_kind("fold")
+    parameter = sign * parameter_values(branch)
+    # The first contact stands for the state; without contacts the first spring that is not linear.
+    name = "largest_elongation"
+    if branch.dofs:
+        name = "largest"
+    return ParameterSweep(parameter, size=measure(branch, name)[:, 0], stable=with_stable_folds(stable, fold))

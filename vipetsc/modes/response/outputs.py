@@ -76,7 +76,7 @@ class ResponseOutputs:
         self.cells = sorted({cell for cell, _ in self._masses} | {wall.cell for wall in self.walls})
 
     def of(self, motion: HarmonicMotion) -> dict[str, np.ndarray]:
-        """The values of a steady state by their names in its file (``branches.response_layout``)."""
+        """The values of a steady state by their names in its file (``spectra.responses``)."""
         values: dict[str, np.ndarray] = {}
         if self._springs:
             elongations = motion.relative[len(self.contacts) :]
