@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import re
 from collections.abc import Iterable, Sequence
 
 MOST_SHOWN = 8  # entries of a list, which with the number of all of them fit on a line
@@ -13,6 +14,19 @@ def shortened(items: Sequence[object]) -> str:
     if len(items) > MOST_SHOWN:
         shown += f", ... ({len(items)})"
     return shown
+
+
+def system_number(error: Exception) -> int:
+    """The number of the system's error that an ``error`` of Python or HDF5 reports; 0 without one."""
+    # HDF5 gives the number in its message alone.
+    in_text = re.search(r"errno = (\d+)", str(error))
+    return getattr(error, "errno", None) or int(in_text[1] if in_text else 0)
+
+
+def system_reason(error: Exception) -> str:
+    """The system's reason for an ``error`` of Python or HDF5; else the text of the error."""
+    number = system_number(error)
+    return os.strerror(number) if number else str(error)
 
 
 def of_system(error: OSError) -> str:

@@ -15,7 +15,7 @@ from vipetsc.case import measured as measured_module
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import RecordTable, SensorTable, read_measured
 from vipetsc.studies.further_sensor import _further_sensor
-from vipetsc.studies.identified import _start_values, _warnings_of_parameters, parameter_lines
+from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples, parameter_lines
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
@@ -437,3 +437,23 @@ def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path)
 
     problems = problems_of(record_in(path, sensors=sensors))
     assert problems == {"identify.records[1].sensors[2].drive": "2: the case has 1 drive"}
+
+
+@pytest.mark.parametrize(("outliers", "is_said"), [(0, False), (1, True), (3, True), (10, True), (40, False)])
+def test_a_misfit_of_few_samples_is_said(outliers, is_said):
+    """Samples within an impact that the model has of another duration make the misfit, and the others the noise."""
+    residuals = 2e-3 * np.random.default_rng(1).standard_normal(200)
+    residuals[100 : 100 + outliers] = 0.9
+    data = xr.Dataset(
+        {
+            "data/channel": ("datum", np.zeros(200, int)),
+            "data/time": ("datum", 1e-5 * np.arange(200)),
+            "data/measured": ("datum", np.zeros(200)),
+            "data/model": ("datum", residuals),
+            "channels/unit": ("channel", ["m/s"]),
+        }
+    )
+    sentences = list(few_samples(data, "near"))
+    assert len(sentences) == is_said
+    if is_said:
+        assert all(word in sentences[0] for word in (f"{outliers} sample", "between 0.001 and"))

@@ -15,6 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vipetsc.wording import system_number, system_reason
+
 Arrays = Mapping[str, np.ndarray]
 
 
@@ -134,17 +136,8 @@ def _is_running(process: int) -> bool:
 
 def unwritten(path: Path, error: Exception) -> OSError:
     """An OSError with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
-    number = getattr(error, "errno", None) or 0
-    in_text = re.search(r"errno = (\d+)", str(error))
-    if not number and in_text:
-        # HDF5 gives the number in its message alone.
-        number = int(in_text[1])
-
-    reason = str(error)
-    if number:
-        reason = os.strerror(number)
     remedy = "after the cause is removed, the same command continues"
-    return OSError(number, f"{path} could not be written: {reason}; {remedy}")
+    return OSError(system_number(error), f"{path} could not be written: {system_reason(error)}; {remedy}")
 
 
 def discard(folder: Path) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
-from vipetsc.wording import shortened
+from vipetsc.wording import shortened, system_reason
 
 # xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
 if TYPE_CHECKING:
@@ -246,8 +246,8 @@ def root_attributes(path: str | Path, kind: str, needs: Sequence[str] = ()) -> d
 
 def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFileError:
     """The error that reports that a file cannot be opened as HDF5, because of ``error``."""
-    reason = str(error)
-    if "unable to lock" in reason:
+    reason = system_reason(error)
+    if "unable to lock" in str(error):
         reason = "another program has it open for writing"
     if isinstance(error, KeyError):
         reason = "it lacks the coordinate of a dimension of its variables"

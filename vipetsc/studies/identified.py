@@ -22,6 +22,7 @@ from vipetsc.identification.uncertainty import (
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
 from vipetsc.studies.further_sensor import further_sensor_values
+from vipetsc.wording import counted
 
 LAYOUT = {
     "parameter": ("parameter", "1", "what is sought"),
@@ -99,6 +100,10 @@ BEYOND_NOISE = 1.2
 # A probability of residuals below this over the number of channels is reported. Of a hundred fits whose residuals are
 # white one is reported.
 IMPROBABLE = 0.01
+# A misfit of which so small a fraction of a channel's samples (FEW) makes this share is not noise: of residuals that
+# are normal it takes more than half.
+FEW = 0.05
+MOST_OF_MISFIT = 0.9
 # Residuals below this fraction of their channel are those of rounding and steps, not noise.
 EXACT = 1e-6
 # Distance of a coordinate from its bound up to which its value is at that bound. A fit stays inside, and comes as near
@@ -354,6 +359,30 @@ def _warnings_of_channels(data: xr.Dataset) -> Iterator[str]:
             f"the residuals are not white ({'; '.join(names[coloured])}): the model lacks something that the data have,"
             " such as another contact law, and the intervals are too narrow"
         )
+
+    channel = data["data/channel"].values
+    for number, name in enumerate(names):
+        if misfit[number] > EXACT * data["channels/size"].values[number]:
+            yield from few_samples(data.isel(datum=channel == number), name)
+
+
+def few_samples(data: xr.Dataset, name: str) -> Iterator[str]:
+    """A sentence on a channel of that ``name`` whose misfit is that of a few samples; ``data`` are its samples."""
+    residuals = data["data/model"].values - data["data/measured"].values
+    order = np.argsort(-(residuals**2), kind="stable")
+    shares = np.cumsum(residuals[order] ** 2) / np.sum(residuals**2)
+    count = int(np.searchsorted(shares, MOST_OF_MISFIT)) + 1
+    if count > FEW * len(residuals):
+        return
+    times = data["data/time"].values[order[:count]]
+    others = np.sqrt(np.mean(residuals[order[count:]] ** 2))
+    unit = data["channels/unit"].values[int(data["data/channel"].values[0])]
+    share = 100 * shares[count - 1]
+    yield (
+        f"{name}: {share:.3g} % of the squared residuals are those of {counted(count, 'sample')} of {len(residuals)}"
+        f" between {times.min():.6g} and {times.max():.6g} s, and the others miss by {others:.3g} {unit}; look whether"
+        " these samples are outliers, or within an impact that lasts longer or shorter than by the contact law"
+    )
 
 
 def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
