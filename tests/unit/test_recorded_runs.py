@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import pytest
 
 from vipetsc.case.law import LawCase
 from vipetsc.io.atomic import unwritten
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.records import Record, RecordFile
 from vipetsc.parallel import StopRequest
 from vipetsc.sources import hash_of, source_key
@@ -135,3 +137,13 @@ def test_the_message_of_the_system_gets_its_file_and_a_remedy(tmp_path):
     assert "[" not in message
     assert of_system(unwritten(Path("x.h5"), OSError(errno.EIO, "I/O"))).startswith("x.h5 could not be written")
     assert of_system(OSError("no ffmpeg")) == "no ffmpeg"
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_message_about_a_file_has_no_number_also_where_another_error_quotes_it(number):
+    """The text is a sentence; a copy, as other ranks get it, is the same."""
+    error = pickle.loads(pickle.dumps(unwritten(Path("x.h5"), OSError(number, "bare"))))
+    assert str(error).startswith("x.h5 could not be written")
+    assert error.errno == number
+    assert is_of_file_system(error)
+    assert not is_of_file_system(FileNotFoundError(errno.ENOENT, "there is none"))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
-from vipetsc.io.errors import is_disk_full
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_every_rank, on_root
 
@@ -102,8 +102,8 @@ def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
         # The message says which file, and why.
         raise
     except (OSError, KeyError, ValueError) as error:
-        # After a check by `prepare` an error is one of the program. A full disk says nothing about the file.
-        if pictures.prepare or is_disk_full(error):
+        # After a check by `prepare` an error is one of the program. One of the file system is not about it.
+        if pictures.prepare or is_of_file_system(error):
             raise
         article = "an" if pictures.noun[0] in "aeiou" else "a"
         path = folders[0] / pictures.file

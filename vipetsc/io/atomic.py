@@ -15,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vipetsc.io.errors import UnwrittenError
 from vipetsc.wording import system_number, system_reason
 
 Arrays = Mapping[str, np.ndarray]
@@ -134,10 +135,10 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def unwritten(path: Path, error: Exception) -> OSError:
-    """An OSError with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
+def unwritten(path: Path, error: Exception) -> UnwrittenError:
+    """An error with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
     remedy = "after the cause is removed, the same command continues"
-    return OSError(system_number(error), f"{path} could not be written: {system_reason(error)}; {remedy}")
+    return UnwrittenError(system_number(error), f"{path} could not be written: {system_reason(error)}; {remedy}")
 
 
 def discard(folder: Path) -> None:

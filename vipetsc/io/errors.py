@@ -2,12 +2,20 @@
 
 import errno
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Errors of the system that are about the path that was given.
+OF_PATHS = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
 
 
-def is_disk_full(error: Exception) -> bool:
-    """Whether an ``error`` says that nothing else can be written either."""
-    return getattr(error, "errno", None) in DISK_FULL
+def is_of_file_system(error: Exception) -> bool:
+    """Whether an ``error`` is one of the file system, as a full disk, and says nothing about what a file holds."""
+    return isinstance(error, OSError) and bool(error.errno) and error.errno not in OF_PATHS
+
+
+class UnwrittenError(OSError):
+    """A file that could not be written; the message is a sentence, and the number that of the system's error."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
 
 
 class FolderError(ValueError):

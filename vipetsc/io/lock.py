@@ -144,10 +144,15 @@ def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
 
         # A holder that ended after the file was opened has removed it, and a lock on a file without a name keeps nobody
         # out.
-        if _is_file(descriptor, path / LOCK):
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, f"process {os.getpid()} on {platform.node()} {TOKEN}\n".encode())
-            return descriptor, None
+        try:
+            if _is_file(descriptor, path / LOCK):
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, f"process {os.getpid()} on {platform.node()} {TOKEN}\n".encode())
+                return descriptor, None
+        except OSError:
+            # A process that goes on would keep the lock without knowing it.
+            os.close(descriptor)
+            raise
         os.close(descriptor)
 
 

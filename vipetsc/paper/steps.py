@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mpi4py import MPI
 
-from vipetsc.io.errors import is_disk_full
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.plan import MISSING, STALE, PaperStep, PartMaker, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
@@ -30,7 +30,7 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
     except Exception as error:
         # If one rank fails alone, the others are in a collective call and would wait for it for ever.
         alone = comm.size > 1 and not getattr(error, "from_root", False)
-        if alone or is_disk_full(error):
+        if alone or is_of_file_system(error):
             raise
         notes.append(f"failed: {name}: {error or type(error).__name__}")
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from vipetsc.cli.arguments import SET, argument
 from vipetsc.cli.messages import echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
-from vipetsc.io.errors import is_disk_full
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
@@ -70,7 +70,7 @@ def write_exports(path: Path) -> list[Path]:
             written += write_curves(source)
     # OSError: a file that was cut off or is no HDF5. ValueError: a file of another program.
     except (OSError, ValueError) as error:
-        if is_disk_full(error):
+        if is_of_file_system(error):
             raise
         raise FolderError(str(error)) from error
     return written
