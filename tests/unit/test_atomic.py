@@ -1,6 +1,7 @@
 """Every writer leaves a whole file or none, also on a full disk; a file that cannot be read is named."""
 
 import errno
+import fcntl
 import os
 import platform
 import resource
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,6 +20,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures.style import save
 from vipetsc.io.atomic import StoredArrays, atomic_write, remove_abandoned, save_arrays, write_text
+from vipetsc.io.lock import FolderError, locked
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 
@@ -130,3 +134,11 @@ def test_a_file_cut_in_the_middle_is_named(tmp_path, name, read):
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(OSError, match=str(path)):
         read(path)
+
+
+def test_a_lock_that_cannot_be_written_is_given_back(tmp_path):
+    """A process that goes on after the error, as a notebook does, can take the lock again, and so can others."""
+    with full_disk(0), pytest.raises(FolderError, match="File too large"), locked(MPI.COMM_SELF, tmp_path):
+        pass
+    with (tmp_path / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
