@@ -175,7 +175,7 @@ def test_bad_cases_write_nothing(in_process, case, tmp_path):
 
 def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
     """Even with --force a search replaces no results of another verb, and no other verb those of a search."""
-    for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
+    for evidence in ("run.h5", "branch-mode-1.h5", "ensemble.h5"):
         folder = tmp_path / evidence.split(".")[0]
         folder.mkdir()
         (folder / "case.toml").write_text("")

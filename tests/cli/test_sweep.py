@@ -42,18 +42,14 @@ def case(tmp_path) -> Path:
 
 
 @pytest.mark.mpirun
-def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, case, tmp_path):
-    """Twelve members leave an index and an ensemble over both axes; members without contact scale one linear run."""
+def test_a_sweep_leaves_members_and_an_ensemble(vipetsc, in_process, case, tmp_path):
+    """Twelve members leave an ensemble over both axes; members without contact scale one linear run."""
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
 
-    index = json.loads((out / "index.json").read_text())
-    assert sum(index["members"].values()) == 12
-    assert not index["members"]["failed"]
-    assert index["failed"] == []
-
     with h5py.File(out / "ensemble.h5") as file:
+        assert json.loads(file.attrs["failed"]) == []
         amplitude = file["amplitude"][...]
         status = file["status"][...]
         episodes = file["contact_episodes"][...]
@@ -72,7 +68,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert np.ptp(entropy[0, quiet]) == 0
 
     visible = {path.name for path in out.iterdir() if path.name[0] != "."}
-    assert visible == {"case.toml", "members.jsonl", "ensemble.h5", "index.json"}
+    assert visible == {"case.toml", "members.jsonl", "ensemble.h5"}
 
     second = in_process("sweep", case, "--out", out)
     assert re.search(r"computed now +0 in", second.stdout)
@@ -137,17 +133,15 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
     assert "contacts.sites = [41]: outside the lattice; cells are numbered from 1 to 40" in ended.stdout
 
     # There is one failed member for each of the six amplitudes.
-    rows = json.loads((out / "index.json").read_text())["failed"]
-    assert [row["place"][0] for row in rows] == [1] * 6
     with h5py.File(out / "ensemble.h5") as file:
         work = file["work"][...]
         assert np.isnan(work[1]).all()
         assert np.isfinite(work[[0, 2]]).all()
-        assert len(json.loads(file.attrs["failed"])) == 6
+        assert [row["place"][0] for row in json.loads(file.attrs["failed"])] == [1] * 6
 
 
 def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path):
-    """A member that stalls has its place and the reason in the index, and the other member is not affected."""
+    """A member that stalls has its place and the reason in the ensemble, and the other member is not affected."""
     out = tmp_path / "out"
     # A contact this stiff needs time steps below the rounding error of the time.
     stiff = set_words("contacts.stiffness=1e45", "time.engine=ts")
@@ -156,9 +150,9 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path)
     ended = in_process("sweep", case, "--out", out, *stiff, *two)
 
     assert ended.returncode == 1
-    index = json.loads((out / "index.json").read_text())
-    assert index["members"]["scaled"] == 1
-    (stalled,) = index["failed"]
+    with h5py.File(out / "ensemble.h5") as file:
+        assert file["status"][...].tolist() == [[1, 2]]
+        (stalled,) = json.loads(file.attrs["failed"])
     assert stalled["place"] == [0, 1]
     assert "stalled" in stalled["reason"]
 

@@ -62,8 +62,8 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
     if comm.rank == 0:
         assert len(branches) == 2
         for branch in branches:
-            assert branch.ending.startswith("failed: step below")
-            assert "nnm.guards.half_trace" in branch.ending
+            assert branch.ended.sentence.startswith("failed: step below")
+            assert "nnm.guards.half_trace" in branch.ended.sentence
             # The table has a row of names, and then one row for each point.
             rows = (folder / f"branch-{branch.name}.csv").read_text().splitlines()
             assert len(rows) == len(branch.points) + 1 > 2
@@ -89,9 +89,9 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     whole = folder / "whole"
     if comm.rank == 0:
         first, second = stopped
-        assert first.ending == "stopped on request after point 13; continue with --resume"
+        assert first.ended.sentence == "stopped on request after point 13; continue with --resume"
         assert len(read_branch(folder / "branch-mode-1.h5").points) == 14
-        assert second.ending.startswith("20 points reached")
+        assert second.ended.sentence.startswith("20 points reached")
         whole.mkdir()
     comm.Barrier()
 
@@ -146,7 +146,7 @@ def test_a_lattice_that_is_stopped_within_an_arc_goes_on_to_the_same_bits(folder
         stopped = follow_all(case, parts, comm, resume=True, stop=stop)
         assert stop.seen < never.seen
         for branch in stopped:
-            assert branch.ending.startswith("stopped on request")
+            assert branch.ended.sentence.startswith("stopped on request")
             assert len(branch.points) < 4
     follow_all(case, parts, comm, resume=True)
     comm.Barrier()

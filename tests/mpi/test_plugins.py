@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from mpi4py import MPI
 
 import pytest
@@ -139,5 +137,4 @@ def test_a_measure_that_fails_for_some_runs_fails_these_members(folder, ranks, c
     assert result.count(FAILED) == 1
     named = f"ranks call the measure 'mine-{9 + ranks}' of {folder / 'part.py'}"
     assert (named in capfd.readouterr().err) == (comm.size > 1 and comm.rank == 0)
-    failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
-    assert "IndexError" in failed[0]["reason"]
+    assert "IndexError" in result.failures[0]["reason"]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
 import tomllib
-from argparse import Namespace
 from errno import ENOSPC
 
 from mpi4py import MPI
@@ -16,16 +14,13 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
-from vipetsc.cli.verb import Work
-from vipetsc.cli.verbs.sweep_verb import simulate_members
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies import linear_run
-from vipetsc.studies import sweep as studies_sweep
 from vipetsc.studies.ensemble import FAILED
 from vipetsc.studies.pool import TaskPool
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.sweep import SweepResult, run_sweep
+from vipetsc.studies.sweep import run_sweep
 
 TABLE = """
 name = "small"
@@ -84,7 +79,7 @@ def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
     assert result.status.size == 6
     assert len(result.busy) == comm.size
     assert_same_bits(datasets(folder / "ensemble.h5"), whole)
-    assert {path.name for path in folder.glob("[!.]*")} == {"case.toml", "members.jsonl", "ensemble.h5", "index.json"}
+    assert {path.name for path in folder.glob("[!.]*")} == {"case.toml", "members.jsonl", "ensemble.h5"}
     comm.Barrier()
 
 
@@ -140,8 +135,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
             run_sweep(plan, folder / "out", comm)
     else:
         result = run_sweep(plan, folder / "out", comm)
-        failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
-        (reason,) = {row["reason"] for row in failed}
+        (reason,) = {row["reason"] for row in result.failures}
         expected = {"exception": "a fault at analyse", "memory": "MemoryError: Unable to allocate"}
         assert expected[kind] in reason
         assert not result.complete
@@ -173,8 +167,7 @@ def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monk
         result = run_sweep(sweep("sweep.ranks=2"), folder / "out", comm)
 
     assert result.count(FAILED) == 6
-    failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
-    assert {row["reason"] for row in failed} == {"MemoryError: Unable to allocate 1.00 TiB"}
+    assert {row["reason"] for row in result.failures} == {"MemoryError: Unable to allocate 1.00 TiB"}
 
     comm.Barrier()
     assert run_sweep(sweep("sweep.ranks=2"), folder / "out", comm).complete
@@ -272,21 +265,3 @@ def test_blocks_of_jobs_hold_every_job_once():
     if comm.size == 1:
         # One rank does the jobs in their order.
         assert done == list(range(1007))
-
-
-@pytest.mark.parallel([2])
-def test_one_rank_reads_the_index_that_a_table_is_made_of(monkeypatch, tmp_path):
-    """The table of a sweep is made on rank 0, where the index is: another rank need not see that file."""
-    comm = MPI.COMM_WORLD
-    folder = tmp_path / f"seen-by-{comm.rank}"
-    if comm.rank == 0:
-        folder.mkdir()
-        (folder / "index.json").write_text('{"failed": [{"place": "amplitude = 1", "reason": "too large"}]}')
-    result = SweepResult(np.array([FAILED]), 1, 0.0, (1.0, 1.0), folder, warnings=[])
-    monkeypatch.setattr(studies_sweep, "run_sweep", lambda *arguments, **keywords: result)
-    work = Work(Namespace(force=False, resume=False), folder, comm, StopRequest())
-
-    reports: list[str] = []
-    monkeypatch.setattr(Work, "report", lambda self, text: reports.append(text))
-    assert not simulate_members(sweep(), work).complete
-    assert "member amplitude = 1: too large" in reports[0]

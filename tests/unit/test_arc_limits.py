@@ -175,7 +175,7 @@ def test_a_branch_that_is_stopped_within_an_arc_goes_on_to_the_same_bits(tmp_pat
     endings = []
     for looks in (20, 0.4 * never.seen, 0.3 * never.seen):
         stopped = followed(tmp_path / "parts", StopWithin(looks), **bounds)
-        endings.append(stopped.ending)
+        endings.append(stopped.ended.sentence)
         assert not stopped.complete
         # The second request comes in the branch, whose points are kept.
         if len(endings) == 2:
@@ -185,7 +185,7 @@ def test_a_branch_that_is_stopped_within_an_arc_goes_on_to_the_same_bits(tmp_pat
     assert all(ending.startswith("stopped on request after point") for ending in endings[1:])
     resumed = followed(tmp_path / "parts", **bounds)
 
-    assert resumed.ending == whole.ending
+    assert resumed.ended.sentence == whole.ended.sentence
     names = {path.name for path in (tmp_path / "whole").iterdir()}
     assert names == {path.name for path in (tmp_path / "parts").iterdir()}
     (name,) = (name for name in names if name.endswith("h5"))

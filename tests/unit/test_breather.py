@@ -225,7 +225,7 @@ def whole(tmp_path_factory) -> tuple[Branch, Path]:
 def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(whole, tmp_path):
     """A branch of two points that is resumed has the bits of the whole branch, in memory and in its file."""
     (part,) = followed(chain_case(points=2), tmp_path / "part")
-    assert "resume" in part.ending
+    assert "resume" in part.ended.sentence
 
     (resumed,) = followed(chain_case(), tmp_path / "part", resume=True)
 
@@ -267,7 +267,7 @@ def test_a_stopped_branch_is_resumed_to_the_same_energies(whole, tmp_path):
     # The stop is requested before the branch begins: the first point is kept, and no other one follows.
     stop.requested = True
     (begun,) = followed(chain_case(), tmp_path / "stopped", stop=stop)
-    assert begun.ending.startswith("stopped on request after point 1")
+    assert begun.ended.sentence.startswith("stopped on request after point 1")
 
     (resumed,) = followed(chain_case(), tmp_path / "stopped", resume=True)
     branch, _ = whole
@@ -280,9 +280,9 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
     # With 61 harmonics the truncation exceeds 4.4e-7 after some points.
     more = "harmonics = 61\ntruncation = 4.4e-7\ndirection = 'up'\nsmallest_step = 1e-4"
     (failed,) = followed(chain_case("3700.0", points=60, more=more), tmp_path)
-    assert failed.ending.startswith("failed: step below")
-    assert "nnm.harmonics or nnm.truncation" in failed.ending
-    assert "E = " in failed.ending
+    assert failed.ended.sentence.startswith("failed: step below")
+    assert "nnm.harmonics or nnm.truncation" in failed.ended.sentence
+    assert "E = " in failed.ended.sentence
     stored = read_branch(tmp_path / "branch-breather-3700.h5")
     assert len(stored.points) == len(failed.points) > 0
 

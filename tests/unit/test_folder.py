@@ -20,7 +20,7 @@ from vipetsc.io.lock import locked
 
 ROOT = Path(__file__).parents[2]
 # A file by which the kind of a folder is recognised.
-SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
+SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "ensemble.h5", PAPER: "plan.json"}
 # The case of the results in a folder, and the case of a later command.
 OLD = "a = 1\n"
 NEW = "a = 2\n"
@@ -196,7 +196,7 @@ def test_the_folder_in_which_one_works_is_replaced_too(run, monkeypatch):
 def test_folders_in_the_folder_of_a_sweep_are_its_members(tmp_path):
     folder = tmp_path / "sweep"
     with claim(folder, SWEEP, OLD):
-        (folder / "index.json").touch()
+        (folder / "ensemble.h5").touch()
         (folder / "000-amplitude").mkdir()
     with claim(folder, SWEEP, OLD, force=True):
         assert names_in(folder) == {"case.toml", ".lock"}
@@ -220,7 +220,7 @@ def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
 def test_verbs_without_results_of_their_own_remove_such_files_too(tmp_path):
     """``analyse`` and ``plot`` lock a folder that they do not claim: leftovers go, also in the folders of members."""
     (tmp_path / "member").mkdir()
-    for name in (".index.json.host-7-ab.part", "member/.analysis.h5.host-7-cd.part", "member/.lock"):
+    for name in (".ensemble.h5.host-7-ab.part", "member/.analysis.h5.host-7-cd.part", "member/.lock"):
         (tmp_path / name).touch()
     with locked(MPI.COMM_SELF, tmp_path):
         assert names_in(tmp_path) == {".lock", "member"}

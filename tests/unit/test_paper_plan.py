@@ -102,9 +102,9 @@ def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
         assert step.failures(root) == len(failing)
         assert set(plan.left(root)) == ({TRANSFER} if failing else set())
 
-    # As after a kill behind the ensemble: the sweep has to be called again, which writes the index.
+    # As after a kill before the ensemble: the sweep has to be called again, which writes the ensemble.
     assert step.state(root) == DONE
-    (step.folder(root) / "index.json").unlink()
+    (step.folder(root) / "ensemble.h5").unlink()
     assert step.state(root) == BEGUN
 
 

@@ -85,5 +85,5 @@ def test_waves_around_a_ring_are_refused_before_anything_is_written(tmp_path):
 def test_a_branch_in_memory_ends_with_the_same_reason(method):
     """A branch that is followed in memory ends with the reason for which a folder would be refused."""
     alone, shared = follow_all(ring(modes=[4, 3], method=method), None, MPI.COMM_SELF)
-    assert "2 points reached" in alone.ending
-    assert "mode 3 has the frequency of mode 2" in shared.ending
+    assert "2 points reached" in alone.ended.sentence
+    assert "mode 3 has the frequency of mode 2" in shared.ended.sentence

@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 
 from vipetsc.case.nnm import NnmCase
+from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
 from vipetsc.modes.branches.files import read_branch, table, to_dataset, write_branch
@@ -35,8 +36,7 @@ def branch(short_branch) -> Branch:
         dofs=2,
         points=points,
         next_step=0.1,
-        complete=True,
-        ending="done",
+        ended=Ending.CLOSED.with_numbers(),
         findings=["a", "b"],
         extra=sampled(short_branch.problem, points[-1:]),
     )
@@ -81,7 +81,7 @@ def test_a_branch_file_is_read_back(branch, tmp_path):
             assert same, name
     assert restored.next_step == branch.next_step
     assert table_of(restored) == table_of(branch)
-    assert restored.ending == "done"
+    assert restored.ended == branch.ended
     assert restored.complete
     assert restored.findings == ["a", "b"]
 
@@ -157,7 +157,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
     periods = branch.extra["orbits/period"].values[-4:]
     assert energies == pytest.approx([0.028] * 3 + [0.0316], rel=1e-12)
     assert len(set(periods)) == 4
-    assert branch.findings == ["the branch has no orbit of 9 J"]
+    assert branch.missing == ["the branch has no orbit of 9 J"]
 
 
 BOTH = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
@@ -169,7 +169,7 @@ def files_of(folder: Path) -> dict[str, str]:
     for path in sorted(folder.glob("branch-*")):
         if path.suffix == ".h5":
             branch = read_branch(path)
-            found[path.name] = f"{branch.ending}{branch.complete}{branch.findings}{table_of(branch)}"
+            found[path.name] = f"{branch.ended}{branch.findings}{branch.missing}{table_of(branch)}"
         else:
             found[path.name] = path.read_text()
     return found
@@ -199,7 +199,7 @@ def test_both_directions_are_two_branches(tmp_path, killed):
     else:
         follow(parts, fail_below, **BOTH)
         failed = read_branch(parts / f"{NAME}-down.h5")
-        assert failed.ending == "failed: the flow ends here"
+        assert failed.ended.sentence == "failed: the flow ends here"
         assert not failed.complete
     follow(parts, resume=True, **BOTH)
     assert files_of(parts) == files_of(tmp_path / "whole")
@@ -226,7 +226,7 @@ def test_a_step_whose_point_cannot_be_assessed_is_repeated_as_a_whole(tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(ShootingMethod, "assess", fail_at_2)
         failed = follow(parts, **nnm)
-    assert failed.ending == "failed: the loss is not found"
+    assert failed.ended.sentence == "failed: the loss is not found"
     assert [(point.index, point.kind) for point in failed.points] == [
         (0, "regular"),
         (1, "period-doubling"),

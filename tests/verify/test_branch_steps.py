@@ -10,6 +10,7 @@ import pytest
 
 from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
 from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch_checks import BranchMonitor
 from vipetsc.modes.continuation.arclength import Continuation, half_trace_change
 from vipetsc.modes.flow import MAPS, Dop853Flow
@@ -48,7 +49,7 @@ def test_a_branch_ends_with_the_first_point_beyond_a_range(name, bound, sentence
 
     points = list(continuation)
 
-    assert continuation.ending == sentence
+    assert continuation.ended.sentence == sentence
     assert continuation.finished
     unit = {"energy": 1.0, "frequency": 2 * np.pi}[name]  # frequencies of points are in Hz
     outside = [number for number, point in enumerate(points, 1) if unit * getattr(point, name) > bound[1]]
@@ -63,7 +64,7 @@ def test_a_branch_that_has_used_up_its_points_is_not_finished():
     points = list(continuation)
 
     assert len(points) == 3
-    assert continuation.ending == "3 points reached: increase nnm.points and resume to continue"
+    assert continuation.ended.sentence == "3 points reached: increase nnm.points and resume to continue"
     assert not continuation.finished
 
 
@@ -99,7 +100,7 @@ def in_phase_hertz(**control) -> tuple[Shooting, list[Point]]:
 def findings(problem: Shooting, points: list[Point]) -> list[str]:
     """Return what the monitor of a growing branch reports at its points."""
     monitor = BranchMonitor(problem, Guards())
-    return [text for text in map(monitor.check, points) if text]
+    return [ended.sentence for ended in map(monitor.check, points) if ended]
 
 
 # The tip of the in-phase Hertz branch's 3:1 tongue lies on the out-of-phase branch. A step too long for the turn at the
@@ -139,4 +140,4 @@ def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
         assert monitor._returned(SimpleNamespace(episodes=2, frequency=4.0)) is None
         assert monitor._returned(SimpleNamespace(episodes=0, frequency=5.1)) is None
         found = monitor._returned(SimpleNamespace(episodes=0, frequency=5.0 + 1e-12, energy=2.0, index=7))
-    assert found == "returned to linear mode 3 at E = 2 J (point 7)"
+    assert found == Ending.LINEAR_MODE.with_numbers(mode=3, energy=2.0, point=7)

@@ -57,7 +57,7 @@ AT_END = third_mode_of(
 def ending(table: dict[str, Any], **nnm: Any) -> str:
     """The sentence that says how the branch of a case ends; ``nnm`` updates the table [nnm]."""
     (branch,) = follow_all(NnmCase.from_table(table | {"nnm": table["nnm"] | nnm}), None, MPI.COMM_SELF)
-    return branch.ending
+    return branch.ended.sentence
 
 
 @pytest.mark.parametrize("table", [AT_START, AT_END])

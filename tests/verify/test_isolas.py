@@ -20,6 +20,7 @@ from tests.rigs import period_map, rate_of
 from tests.steady_states import CUBIC_OSCILLATOR, motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.endings import Ending
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
@@ -69,8 +70,8 @@ def state_of(states: SteadyStates, point: Response) -> np.ndarray:
 def test_an_isolated_curve_is_closed_and_has_a_file_of_its_own(curves):
     """The isolated curve ends at its first state, lies apart from the main curve, and has a file and a picture."""
     folder, (main, isola) = curves
-    assert main.ending.startswith("reached the end")
-    assert (isola.name, isola.ending) == (f"{main.name}-isola-1", "closed: it has come back to its first state")
+    assert main.ended.ending is Ending.END_OF_RANGE
+    assert (isola.name, isola.ended.ending) == (f"{main.name}-isola-1", Ending.CLOSED)
     np.testing.assert_array_equal(isola.points[0].xi, isola.points[-1].xi)
     # The elongations of the isolated curve are all larger than those of the main one, so that they do not meet.
     assert measure(main, "largest_elongation")[:, 0].max() < 1.0 < measure(isola, "largest_elongation")[:, 0].min()

@@ -126,7 +126,7 @@ def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map
     found = branches(own_case(sides, map=map_name))
     assert list(found) == list(HALF)
     for name, branch in found.items():
-        assert "energy range" in branch.ending, branch.ending
+        assert "energy range" in branch.ended.sentence, branch.ended.sentence
         episodes = [point.episodes for point in branch.regular()]
         assert episodes[0] == 0
         assert episodes[-1] >= 2
@@ -138,7 +138,7 @@ def test_so_do_those_of_condensed_motions():
     """Contacts of a mirrored lattice begin in pairs in condensed motions too, with the exact period."""
     found = branches(own_case(["plus", "plus"], method="condensed", truncation=1e-4, first_step=0.05, largest_step=0.2))
     for branch in found.values():
-        assert "energy range" in branch.ending, branch.ending
+        assert "energy range" in branch.ended.sentence, branch.ended.sentence
         assert branch.regular()[-1].episodes == 2
     assert_halves(found["in-phase"], sides=1, rtol=1e-5)
 
@@ -150,7 +150,7 @@ def test_so_do_those_of_orbits_shot_without_matrices():
     """
     table = CHAIN | {"nnm": CHAIN["nnm"] | {"shooting": "krylov"}}
     (branch,) = branches(table).values()
-    assert "points reached" in branch.ending, branch.ending
+    assert "points reached" in branch.ended.sentence, branch.ended.sentence
     touching = [point for point in branch.regular() if point.episodes]
     assert len(touching) > 2
     assert all(point.episodes == 2 for point in touching)

@@ -126,7 +126,7 @@ def test_a_branch_is_stored_with_its_multipliers_and_resumed(tmp_path):
     whole.mkdir()
     (branch,) = follow_all(breather_case(multipliers=2), short, MPI.COMM_SELF)
     assert branch.name == "breather-1600"
-    assert branch.ending.startswith("2 points reached")
+    assert branch.ended.sentence.startswith("2 points reached")
 
     stored = read_branch(short / "branch-breather-1600.h5")
     assert [point.multiplier for point in stored.points] == [point.multiplier for point in branch.points]
@@ -145,8 +145,8 @@ def test_a_frequency_without_breather_fails_and_names_the_key(tmp_path):
     # Newton's method does not converge at this frequency, which lies in a pass band.
     case = breather_case(start_frequency=[700.0], max_newton=2)
     (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)
-    assert branch.ending.startswith("failed: no ")
-    assert "nnm.start_frequency" in branch.ending
+    assert branch.ended.sentence.startswith("failed: no ")
+    assert "nnm.start_frequency" in branch.ended.sentence
 
 
 @pytest.mark.slow
@@ -185,7 +185,7 @@ def test_where_slepc_fails_the_branch_continues_without_multipliers(tmp_path, mo
     monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(73))
     with caplog.at_level(logging.WARNING):
         (branch,) = follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
-    assert branch.ending.startswith("2 points reached")
+    assert branch.ended.sentence.startswith("2 points reached")
     assert len(branch.points) == 3
     assert np.isnan([point.multiplier for point in branch.points]).all()
     assert caplog.text.count("has no multipliers: SLEPc") == 3

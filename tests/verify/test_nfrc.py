@@ -158,7 +158,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
     """The curve folds at amplitude/clearance 1.0014 and is unstable beyond; the shares of the energy sum to one."""
     for curve in follow_all(nfrc_case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
         assert curve.complete
-        assert curve.ending == "reached the end of nfrc.range, 0.996"
+        assert curve.ended.sentence == "reached the end of nfrc.range, 0.996"
 
         parameter = measure(curve, "amplitude")
         (fold,) = (number for number, point in enumerate(curve.points) if point.kind == "fold")
@@ -201,7 +201,7 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
         largest_step=1.0,
     )
     curve = curve_of(case, tmp_path)
-    assert curve.complete, curve.ending
+    assert curve.complete, curve.ended.sentence
 
     last = curve.points[-1]
     assert last.measures.episodes == 2
@@ -326,7 +326,7 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
 
     (first,) = follow_all(varied(case, points=3), parts, MPI.COMM_SELF)
     assert not first.complete
-    assert "increase nfrc.points" in first.ending
+    assert "increase nfrc.points" in first.ended.sentence
 
     (second,) = follow_all(case, parts, MPI.COMM_SELF, resume=True)
     assert second.complete

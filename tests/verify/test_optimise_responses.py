@@ -16,6 +16,7 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.endings import Ending
 from vipetsc.figures.optimum import compared_curves, convergence
 from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
@@ -217,9 +218,10 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     case = absorber(0.05, 0.01, largest_step=0.3)
     [curve] = follow_all(case, None, MPI.COMM_SELF)
     # A complete curve is taken there and back: turning back by itself would need impacts.
-    there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ending="reached the end")
+    ended = Ending.CLOSED.with_numbers()
+    there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ended=ended)
     monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
-    with pytest.raises(RuntimeError, match=r"r1-1: turned back and reached the end, without states up to 1\.2"):
+    with pytest.raises(RuntimeError, match=r"r1-1: turned back and closed.*, without states up to 1\.2"):
         measured(case)
 
 

@@ -118,7 +118,7 @@ def test_a_branch_that_begins_beside_its_range_of_energies_comes_into_it(directi
     (branch,) = follow_all(NnmCase.from_table({"contacts": contacts, "nnm": nnm}), None, MPI.COMM_SELF)
 
     energies = [point.energy for point in branch.regular()]
-    assert branch.ending == f"left the energy range {low:g} to {high:g} J"
+    assert branch.ended.sentence == f"left the energy range {low:g} to {high:g} J"
     if direction == "up":
         assert energies[0] < low
         assert energies[-1] > high

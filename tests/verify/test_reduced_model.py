@@ -11,6 +11,7 @@ import pytest
 from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_contact, reduced_model
 from tests.verify.conftest import follow
 from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.endings import Ending
 from vipetsc.lattice import Chain, four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch_checks import BranchMonitor
@@ -157,7 +158,7 @@ def test_both_directions_give_the_same_curve():
         if report:
             break
 
-    assert "returned to linear mode 2" in report
+    assert report.ending is Ending.LINEAR_MODE
     turns = np.sum(np.diff(np.sign(np.diff(energies))) != 0)
     assert turns == 2
     assert energies[-1] == pytest.approx(GRAZING_ENERGY[OUT_OF_PHASE], rel=0.02)

@@ -68,7 +68,7 @@ def by_frequency(tmp_path_factory):
 def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, by_frequency, tmp_path):
     """A curve over a key and one over the frequency end in the same state, at the key's upper value and 1.5 rad/s."""
     (by_key,) = follow_all(over(key, low, high, CLOSER, **STEPS), tmp_path, MPI.COMM_SELF)
-    assert by_key.ending.startswith("reached the end")
+    assert by_key.ended.sentence.startswith("reached the end")
 
     # The upper value of each key is that of the lattice of the curve over the frequency.
     case = NfrcCase.from_table(CLOSER)
@@ -136,7 +136,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
 def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp_path):
     case = over(key, low, high, CLOSER, first_step=0.2, largest_step=1.0)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
-    assert curve.ending == f"reached the end of nfrc.range, {high:g}"
+    assert curve.ended.sentence == f"reached the end of nfrc.range, {high:g}"
     assert parameter_values(curve)[[0, -1]].tolist() == [low, high]
 
     # At a restitution of 1 the state is that of the elastic contact.

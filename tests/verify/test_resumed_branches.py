@@ -46,7 +46,7 @@ def stopped_at(folder: Path, index: int, **nnm: Any) -> Branch[Any]:
         stop.requested = point.index == index
 
     branch = follow(folder, listener, stop, **nnm)
-    assert branch.ending == f"stopped on request after point {index}; continue with --resume"
+    assert branch.ended.sentence == f"stopped on request after point {index}; continue with --resume"
     return branch
 
 
@@ -65,7 +65,7 @@ def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
     stopped_at(tmp_path / "parts", 3, **nnm)
     resumed = follow(tmp_path / "parts", **nnm)
 
-    assert (resumed.ending, resumed.findings) == (whole.ending, whole.findings)
+    assert (resumed.ended, resumed.findings, resumed.missing) == (whole.ended, whole.findings, whole.missing)
     assert len(resumed.points) == len(whole.points)
 
 
@@ -90,11 +90,11 @@ def test_a_branch_that_goes_on_has_the_orbits_that_it_lacked(tmp_path):
     """A branch of few points, continued, says of each energy once that it is missing, and only of those that are."""
     nnm = {"orbits_at": [10.0, 100.0], "locate": False}
     first = follow(tmp_path, points=3, **nnm)
-    assert first.findings == ["the branch has no orbit of 10 J", "the branch has no orbit of 100 J"]
+    assert first.missing == ["the branch has no orbit of 10 J", "the branch has no orbit of 100 J"]
 
     follow(tmp_path, **nnm)
 
-    assert file_of(tmp_path).findings == ["the branch has no orbit of 100 J"]
+    assert file_of(tmp_path).missing == ["the branch has no orbit of 100 J"]
 
 
 @pytest.fixture

@@ -238,7 +238,7 @@ def test_a_curve_that_has_used_up_its_points_tells_their_number():
     case = NfrcCase.from_table(TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"points": 3}})
     (curve,) = follow_all(case, None, MPI.COMM_SELF)
     assert len(curve.regular()) == 3
-    assert curve.ending == "3 points reached: increase nfrc.points and resume to continue"
+    assert curve.ended.sentence == "3 points reached: increase nfrc.points and resume to continue"
 
 
 def test_a_drive_that_moves_no_contact_has_no_unit_of_amplitude_and_a_motion_at_rest():

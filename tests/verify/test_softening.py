@@ -51,7 +51,7 @@ def test_a_branch_ends_at_the_saddle(method, law, last, period):
     """The energy of the saddle ends the branch, its points are orbits, and their periods are elliptic integrals."""
     branch = softening(method, **{law: -1.0})
     assert branch.complete
-    assert "equilibrium" in branch.ending
+    assert "equilibrium" in branch.ended.sentence
     assert branch.points[-1].energy == pytest.approx(last, rel=1e-6)
     assert {p.kind for p in branch.points} == {"regular"}
 
@@ -74,6 +74,6 @@ def test_a_branch_ends_at_the_saddle(method, law, last, period):
 )
 def test_other_saddles_end_branches(change, saddle):
     branch = softening("shooting", **change)
-    assert "equilibrium" in branch.ending
+    assert "equilibrium" in branch.ended.sentence
     assert branch.points[-1].energy == pytest.approx(saddle, rel=1e-6)
     assert max(p.residual for p in branch.points) < 1e-8

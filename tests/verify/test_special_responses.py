@@ -160,7 +160,7 @@ def test_a_curve_whose_start_has_no_unique_tangent_fails_with_the_reason(tmp_pat
 
     monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
     (curve,) = follow_all(case_of(FLIP), tmp_path, MPI.COMM_SELF)
-    assert curve.ending == "failed: Singular matrix"
+    assert curve.ended.sentence == "failed: Singular matrix"
 
 
 def labels_in(path: Path) -> list[str]:

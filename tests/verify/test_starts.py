@@ -66,7 +66,7 @@ def test_a_mode_with_a_node_where_it_could_touch_begins_no_condensed_branch(own)
         del table["contacts"]
     (branch,) = follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)
     assert not branch.points
-    assert "node" in branch.ending
+    assert "node" in branch.ended.sentence
     # Shooting follows the linear motion.
     table["nnm"]["method"] = "shooting"
     (branch,) = follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)

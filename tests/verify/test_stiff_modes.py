@@ -56,7 +56,7 @@ def test_a_pressed_contact_beside_a_smooth_spring_has_a_branch():
     """The branch of the slow mode begins near it, and its orbits, in which the contact is closed, return by SciPy."""
     case = NnmCase.from_table(CASE)
     (branch,) = follow_all(case, None, MPI.COMM_SELF)
-    assert branch.ending.startswith("6 points reached")
+    assert branch.ended.sentence.startswith("6 points reached")
     first, *_, last = branch.regular()
     assert first.period == pytest.approx(2 * np.pi * np.sqrt(2.0), rel=1e-4)
     # The mean force of the soft spring and Hertz's law make the motion differ from the linear one.

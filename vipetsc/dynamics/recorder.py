@@ -215,25 +215,33 @@ class Recorder(Observer):
             self.flush(last=True)
 
     def statistics(self) -> dict[str, Any]:
-        """Number of contact episodes logged, and the deepest indentation in m."""
-        return {"episodes": self.episodes, "deepest_indentation": self.deepest}
+        """Return the number of contact episodes logged, the deepest indentation in m, and a note if there were none."""
+        statistics: dict[str, Any] = {"episodes": self.episodes, "deepest_indentation": self.deepest}
+        if note := self._note_on_contacts():
+            statistics["contact_note"] = note
+        return statistics
+
+    def _note_on_contacts(self) -> str:
+        """Return a sentence on sites none of which made contact; empty if one did, or without sites."""
+        sites = len(self.setup.model.chain.sites)
+        if self.episodes or not sites:
+            return ""
+
+        touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
+        if touching > 1:
+            return f"no contact: nothing pressed any of the {touching} sites that touch their stops at rest"
+        if touching:
+            return "no contact: nothing pressed the site that touches its stop at rest"
+        if sites > 1:
+            return f"no contact: nothing reached any of the {sites} sites"
+        return "no contact: nothing reached the site"
 
     def warnings(self) -> list[str]:
         """Sentences on sites without contact, and on indentations beyond the range of Hertz's theory."""
-        sites = len(self.setup.model.chain.sites)
-        radius = self.setup.case.contact_radius
-        if sites and not self.episodes:
-            touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
-            reached = "the site"
-            if sites > 1:
-                reached = f"any of the {sites} sites"
-            pressed = "the site that touches its stop"
-            if touching > 1:
-                pressed = f"any of the {touching} sites that touch their stops"
-            if touching:
-                return [f"no contact: nothing pressed {pressed} at rest"]
-            return [f"no contact: nothing reached {reached}"]
+        if note := self._note_on_contacts():
+            return [note]
 
+        radius = self.setup.case.contact_radius
         is_hertz = any(law.law == "hertz" for law in self.setup.model.used_laws)
         if radius is None or not is_hertz or self.deepest <= radius:
             return []

@@ -29,6 +29,7 @@ from vipetsc.dynamics.result import Result
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.dynamics.subnormals import subnormals_as_zero
 from vipetsc.dynamics.ts.integrator import Integrator
+from vipetsc.endings import Ended, Ending
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
@@ -36,10 +37,6 @@ from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Propagator, Integrator)}
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
-# How a run ends.
-COMPLETE = "complete"
-STOPPED = "stopped"
-FAILED = "failed"
 
 
 class Failure(NamedTuple):
@@ -188,12 +185,12 @@ class Simulation:
                 layout = run.setup.layout
                 set_in_motion(run.setup, initial_fields(self.model, range(layout.start, layout.stop), layout.comm))
             with log.SAMPLES:
-                ending, sentence = run.advance()
+                ended = run.advance()
             note = {}
             if self.engine.refused:
                 note["engine_note"] = self.engine.refused
             with log.ENDING:
-                return run.finish(ending, sentence, begin, note)
+                return run.finish(ended, begin, note)
 
 
 @contextmanager
@@ -243,8 +240,8 @@ class Run:
             prefix = f"{observer.name}/"
             observer.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
-    def advance(self) -> tuple[str, str]:
-        """Advance to the end, or until the run stops or fails; returns how it ended, and a sentence about it."""
+    def advance(self) -> Ended:
+        """Advance to the end, or until the run stops or fails; returns how it ended."""
         setup = self.setup
         engine = self.setup.engine
         total = setup.model.samples
@@ -264,13 +261,14 @@ class Run:
                 good = "none"
                 if self.last is not None:
                     good = f"t = {self.last:.6g} s"
-                where = f"at t = {failure.time:.6g} s ({failing_place(setup)})"
-                return FAILED, f"{failure.reason}, {where}; last good sample: {good}"
+                return Ending.BROKEN_OFF.with_numbers(
+                    reason=failure.reason, time=failure.time, place=failing_place(setup), good=good
+                )
             if filled.stopped and self.samples < total:
-                return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
+                return Ending.STOPPED.with_numbers(where=f"at t = {engine.time:.6g} s")
             if any(observer.due for observer in self.observers):
                 self.checkpoint()
-        return COMPLETE, f"complete: {total} samples to t = {self.last:.6g} s"
+        return Ending.COMPLETE.with_numbers(samples=total, end=self.last)
 
     def _observe(self, samples: Samples, filled: FillResult) -> tuple[Block, Failure | None]:
         """Show the filled samples to the observers; returns the block of good ones, and a failure that ends the run."""
@@ -313,12 +311,15 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.save_state(state)
 
-    def finish(self, ending: str, sentence: str, begin: Begin, note: dict[str, str]) -> Result:
+    def finish(self, ended: Ended, begin: Begin, note: dict[str, str]) -> Result:
         """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
         engine = self.setup.engine
         output = self.setup.output
         comm = self.setup.output.comm
-        if ending == STOPPED:
+        sentence = ended.sentence
+        is_stopped = ended.ending is Ending.STOPPED
+        is_complete = ended.ending is Ending.COMPLETE
+        if is_stopped:
             self.checkpoint(stopped=True)
             sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
@@ -326,24 +327,24 @@ class Run:
 
         warnings = self.setup.case.warnings()
         for observer in self.observers:
-            observer.finish(ending == STOPPED)
+            observer.finish(is_stopped)
             statistics |= observer.statistics()
-            if ending != STOPPED:
+            if not is_stopped:
                 warnings += observer.warnings()
-        if ending == FAILED:
+        if ended.ending is Ending.BROKEN_OFF:
             warnings.append(f"the record ends at sample {self.samples} of {self.setup.model.samples}: {sentence}")
 
         wall = time.perf_counter() - begin.wall
         cpu = comm.allreduce(time.process_time() - begin.cpu)
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
 
-        about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
+        about = {"status": sentence, "complete": is_complete, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 states counts
 
         # The dataset of a run in memory also has the motion of its cells at the end.
-        if ending == COMPLETE and isinstance(output, RunMemory):
+        if is_complete and isinstance(output, RunMemory):
             motions = comm.gather(self.setup.layout.motion(engine.state.array_r))
             output.end = np.concatenate(motions) if motions else None
-        if ending != STOPPED:
+        if not is_stopped:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
-        return Result.from_attributes(attributes, resumable=ending == STOPPED, folder=output.folder)
+        return Result.from_attributes(attributes, resumable=is_stopped, folder=output.folder)

@@ -37,7 +37,7 @@ MOST_NAMED = 6  # keys of another case that a message names: more do not help to
 REPLACED = ".replaced"
 # What verbs leave beside the results themselves in a folder of any kind, as patterns of ``Path.glob``.
 ACCOMPANYING = (
-    "figures", "curves", "law", "summary.json", "analysis.h5", "run.xdmf", "branch-*.csv", "ensemble.h5", "backbone.h5",
+    "figures", "curves", "law", "summary.json", "analysis.h5", "run.xdmf", "branch-*.csv", "backbone.h5",
     "best*.toml", "identified.toml",
 )  # fmt: skip
 
@@ -69,12 +69,16 @@ class FolderKind:
     marker: str = "case.toml"
     free: str = ""
 
+    def is_in(self, folder: Path) -> bool:
+        """Return whether ``folder`` holds results of this kind."""
+        return any(any(folder.glob(pattern)) for pattern in self.results)
+
 
 RUN = FolderKind(noun="run", results=("run.h5", "parts"), free="analysis")
 BRANCHES = FolderKind(noun="branch", results=("branch-*.h5",))
 SEARCH = FolderKind(noun="search", results=("design.h5",))
 LAW = FolderKind(noun="law", results=("law.h5", "law-runs*.jsonl"))
-SWEEP = FolderKind(noun="sweep", results=("index.json", "members*.jsonl"), has_folders=True)
+SWEEP = FolderKind(noun="sweep", results=("ensemble.h5", "members*.jsonl"), has_folders=True)
 PREDICTION = FolderKind(noun="prediction", results=("prediction.h5", "prediction-runs*.jsonl"))
 OPTIMUM = FolderKind(noun="optimum", results=("optimum.h5", "optimum-runs*.jsonl"))
 IDENTIFIED = FolderKind(noun="identification", results=("identified.h5", "identified-runs*.jsonl"))
@@ -211,8 +215,7 @@ def _set_aside(path: Path, kind: FolderKind) -> None:
 
 def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
     """Return whether ``path`` holds results of a kind other than ``kind``."""
-    patterns = [pattern for other in KINDS if other is not kind for pattern in other.results]
-    return any(any(path.glob(pattern)) for pattern in patterns)
+    return any(other.is_in(path) for other in KINDS if other is not kind)
 
 
 def _results(folder: Path) -> list[Path]:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Continuation, Verdict, locate
 from vipetsc.modes.continuation.crossing import crossing_row
 from vipetsc.modes.continuation.turning import BoundedTurn
@@ -191,11 +192,11 @@ class UserSteps(BoundedTurn[Response]):
         self.first = first
         self.ends = ends
 
-    def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
+    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
         """The first point, to which the curve comes back, or that on the end of the range, where it passes that."""
         if returned(self.first, before, point):
             first = replace(self.first, index=point.index, step=point.step, next_step=point.next_step)
-            return first, "closed: it has come back to its first point"
+            return first, Ending.CLOSED.with_numbers()
         p = point.xi[-1]
         bound = np.clip(p, *self.ends)
         if p == bound:
@@ -203,7 +204,7 @@ class UserSteps(BoundedTurn[Response]):
         place = (bound - before.xi[-1]) / (p - before.xi[-1])
         xi = self.problem.at(before.xi + place * (point.xi - before.xi), float(bound))
         last = replace(point, xi=xi, tangent=self.problem.frame(point).tangent_at(xi))
-        return last, f"reached p = {bound * self.problem.scales[-1]:g}"
+        return last, Ending.END_OF_PARAMETER.with_numbers(end=bound * self.problem.scales[-1])
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Where and why the curve cannot go on."""
@@ -295,7 +296,7 @@ def _followed(problem: UserProblem, first: list[Response], rule: UserSteps) -> t
         return solutions, f"failed: {error}"
     if not curve.finished:
         return solutions, f"{rule.points} points reached"
-    return solutions, curve.ending
+    return solutions, curve.ended.sentence
 
 
 def _halves(problem: UserProblem, point: Response, largest_step: float) -> Iterator[Response]:

@@ -22,6 +22,7 @@ import numpy as np
 import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.case.predict import PredictCase
+from vipetsc.endings import Ending
 from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
@@ -177,15 +178,14 @@ class PaperStep:
     def _is_complete(self, path: Path) -> bool:
         """Whether the file ``path`` is a finished result of this step, and of its case.
 
-        A branch is finished when it has ended, also in a failure that it names; a sweep when it has an index as well.
+        A branch is finished when it has ended, also in a failure that it names; a sweep when its
+        ensemble has all records.
         """
         with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
             if "ending" in file.attrs:
-                return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
-            if isinstance(self.case, Sweep):
-                folder = path.parent
-                if not (folder / "index.json").exists() or not has_all_records(folder):
-                    return False
+                return bool(file.attrs["complete"]) or file.attrs["ended"] == Ending.FAILED.name
+            if isinstance(self.case, Sweep) and not has_all_records(path.parent):
+                return False
             return self._is_same_case(file.attrs["case"])
         return False
 
@@ -366,6 +366,7 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
     """
     residuals: list[float] = []
     endings: list[str] = []
+    failed = 0
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
             # Special points are located to their own tolerance; the residual of the branch is that of its steps.
@@ -375,9 +376,9 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
             if branch.attrs.get("tongues"):
                 remarks.append(f"{branch.attrs['tongues']} tongues")
             remarks += json.loads(branch.attrs.get("warnings", "[]"))
+            failed += branch.attrs["ended"] == Ending.FAILED.name
             endings.append(f"{branch.attrs['name']}: {', '.join(remarks)}")
 
-    failed = sum("failed" in ending for ending in endings)
     return {"points": len(residuals), "residual": max(residuals, default=0.0), "endings": endings, "failed": failed}
 
 

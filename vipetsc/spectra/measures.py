@@ -28,7 +28,6 @@ PERIODS = 10
 TOLERANCE = 0.01
 QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
 PART = "part"  # the dimension of parts of the frequency axis: pass bands, gaps, what is above
-UNSETTLED = "steady amplitude"  # how sentences begin about one that is not
 JOINT = "-"  # between the names of a pair
 
 Group = Literal["statistics", "entropy", "transfer", "motion"]
@@ -92,7 +91,7 @@ class RunRecord:
 
     def _unsettled(self, point: str, drift: float) -> str:
         """The sentence about a ``point`` whose amplitude is not steady."""
-        about = f"{UNSETTLED} at {point}: three windows of {self.periods} periods of the drive"
+        about = f"steady amplitude at {point}: three windows of {self.periods} periods of the drive"
         if not np.isnan(drift):
             return (
                 f"{about} differ by {drift:.2g} of it, more than {self.tolerance:g}; a later time.end, or more damping"

@@ -120,6 +120,7 @@ def analyse(
     }
     # On one rank, since they include measures of a user's module.
     numbers = on_root(comm, lambda: _numbers(run, case, options, measures))
+    about["unsettled"] = json.dumps(numbers.warnings)
     if "velocity" not in run:
         left_out = "all measures of fields: the velocity was not recorded"
         about |= {"left_out": left_out, "warnings": json.dumps(numbers.warnings)}

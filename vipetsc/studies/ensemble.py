@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 import xarray as xr
@@ -64,6 +64,14 @@ class LinearSource(NamedTuple):
     factor: float
 
 
+class FailedMember(TypedDict):
+    """A member that failed: its ``place`` over the axes of the sweep, its name ``id``, and the ``reason``."""
+
+    place: list[int]
+    id: str
+    reason: str
+
+
 class Results:
     """Content of the records of the sweep ``plan`` in ``folder``, without those of other versions and sweeps.
 
@@ -118,6 +126,17 @@ class Results:
             self.lines[str(key)] = line
         return sources
 
+    def failures(self, most: int | None = None) -> list[FailedMember]:
+        """Return the members that have failed, the first ``most`` of them if that is given."""
+        return [
+            FailedMember(
+                place=[int(i) for i in np.unravel_index(number, self.plan.shape)],
+                id=self.ids[number],
+                reason=self.reasons[int(self.first[number])],
+            )
+            for number in np.flatnonzero(self.status == FAILED)[:most]
+        ]
+
     def _enter(self, number: int, record: Record) -> None:
         """Take the ``record`` of a member."""
         self.status[number] = COMPLETE
@@ -141,7 +160,7 @@ class Results:
         # Scaled members have no measures of their own: they get those of their linear run at the end.
         self._put(number, row | record.get("measures", {}))
         # An amplitude sweep goes below the onset on purpose.
-        self.warnings[number] = [text for text in record["warnings"] if not text.startswith("no contact")]
+        self.warnings[number] = [text for text in record["warnings"] if text != statistics.get("contact_note")]
         self.cpu_seconds[number] = record["cpu_seconds"]
         self.used["rtol"].add(record["rtol"])
         self.used["engine"].add(statistics["engine"])
@@ -222,16 +241,10 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     data = _coordinates(plan) | _member_variables(results) | _measured_variables(results)
     data |= _fit_variables(results, data)
 
-    positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
-    numbers = results.first[results.status == FAILED]
     about = origin()
     # Sorted, since the file must not depend on the order in which members were simulated.
     about |= {name: sorted(values) for name, values in results.used.items()}
-    about |= {
-        "case": plan.to_toml(),
-        "failed": [f"{tuple(at)}: {results.reasons[n]}" for at, n in zip(positions, numbers, strict=True)],
-        "warnings": json.dumps(warnings),
-    }
+    about |= {"case": plan.to_toml(), "failed": json.dumps(results.failures()), "warnings": json.dumps(warnings)}
     write_netcdf(results.folder / "ensemble.h5", xr.Dataset(data, attrs=about))
 
 

@@ -28,7 +28,7 @@ from vipetsc.io.store import RunMemory
 from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import MEASURES as REGISTRY
-from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
+from vipetsc.spectra.measures import PART, group_of, is_measure, row_of
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded_runs import RecordPaths, completed
 
@@ -208,8 +208,7 @@ def measured(analysis: xr.Dataset) -> Record:
     if "bands/modal_energy" in row:
         # Of a history the ensemble has the last value: what the run leaves.
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
-    warnings = json.loads(analysis.attrs.get("warnings", "[]"))
-    unsettled = [text for text in warnings if text.startswith(UNSETTLED)]
+    unsettled = json.loads(analysis.attrs.get("unsettled", "[]"))
     if unsettled:
         row["unsettled"] = unsettled
     if "entropy/history" in row:

@@ -23,8 +23,8 @@ PATIENCE = 5.0
 Job = TypeVar("Job", bound=Hashable)
 
 
-class Ending(IntEnum):
-    """Ending of a job; where the ranks of a team differ, the largest counts."""
+class JobEnding(IntEnum):
+    """JobEnding of a job; where the ranks of a team differ, the largest counts."""
 
     DONE = 0
     FAILED = 1
@@ -34,9 +34,9 @@ class Ending(IntEnum):
 
 
 class JobEnd(NamedTuple):
-    """Ending of a job, and the reason if it was not done."""
+    """JobEnding of a job, and the reason if it was not done."""
 
-    ending: Ending
+    ending: JobEnding
     reason: str = ""
 
 
@@ -78,16 +78,16 @@ class TaskPool:
         module is wrong.
         """
         reports = self.comm.allgather(self._draw_jobs(jobs, work, progress, fail))
-        self.stopped = any(report.last.ending == Ending.STOPPED for report in reports)
+        self.stopped = any(report.last.ending == JobEnding.STOPPED for report in reports)
         if progress:
             progress.close()
 
         def check() -> None:
             for report in reports:
-                if report.last.ending == Ending.PART:
+                if report.last.ending == JobEnding.PART:
                     raise PartError(report.last.reason)
             for report in reports:
-                if report.last.ending == Ending.FATAL and report.last.reason:
+                if report.last.ending == JobEnding.FATAL and report.last.reason:
                     raise OSError(report.last.reason)
 
         on_root(self.comm, check)
@@ -109,14 +109,14 @@ class TaskPool:
         # Many small jobs are drawn together: a draw and its broadcast may take longer than one of them.
         block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)
         leads = self.team.rank == 0
-        last = JobEnd(Ending.DONE)
+        last = JobEnd(JobEnding.DONE)
         done = 0
         number = 0
         block_end = 0
 
         while True:
             if self.stopped or self.stop.agreed(self.team):
-                last = JobEnd(Ending.STOPPED)
+                last = JobEnd(JobEnding.STOPPED)
                 break
             if number == block_end:
                 # One rank draws for its team, whose ranks must work on the same job.
@@ -130,18 +130,18 @@ class TaskPool:
             begin = time.perf_counter()
             last = self._do(jobs[number], work, fail, meeting)
             self.busy += time.perf_counter() - begin
-            if last.ending > Ending.FAILED:
+            if last.ending > JobEnding.FAILED:
                 break
 
             number += 1
-            if leads and last.ending == Ending.DONE:
+            if leads and last.ending == JobEnding.DONE:
                 done += 1
             # Every rank asks for the count, which moves the bar of rank 0 also when another team has ended a job.
             count = ended.draw(int(leads))
             if progress:
                 progress.update(count + 1)
 
-        if last.ending > Ending.FAILED:
+        if last.ending > JobEnding.FAILED:
             drawn.draw(len(jobs))  # so that no team begins another block
         # No team may draw any more when the counters go. Ranks that wait here sleep: the others need the cores.
         wait_for_all(self.comm)
@@ -155,13 +155,13 @@ class TaskPool:
 
         A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
         """
-        end = JobEnd(Ending.DONE)
+        end = JobEnd(JobEnding.DONE)
         failure = None
         try:
             sys.audit("vipetsc.member", str(job))
             work(job)
         except StoppedError:
-            end = JobEnd(Ending.STOPPED)
+            end = JobEnd(JobEnding.STOPPED)
         except Exception as error:
             failure = error
             end = self._judge(error)
@@ -175,24 +175,24 @@ class TaskPool:
             time.sleep(1e-3)
 
         end = max(meeting.allgather(end))
-        if end.ending == Ending.FAILED:
+        if end.ending == JobEnding.FAILED:
             try:
                 on_root(self.team, lambda: fail(job, end.reason))
             except OSError as error:  # the failure could not be recorded
-                return JobEnd(Ending.FATAL, of_system(error))
+                return JobEnd(JobEnding.FATAL, of_system(error))
         return end
 
     def _judge(self, error: Exception) -> JobEnd:
         """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
         is_failure = isinstance(error, self.failures) and not isinstance(error, PROGRAMMING)
         if isinstance(error, PartError) and not (isinstance(error, PartFailure) and is_failure):
-            return JobEnd(Ending.PART, str(error))
+            return JobEnd(JobEnding.PART, str(error))
         # A file that cannot be read or written says nothing about the job, which may succeed in the next call.
         if isinstance(error, OSError):
-            return JobEnd(Ending.FATAL, of_system(error))
+            return JobEnd(JobEnding.FATAL, of_system(error))
         if is_failure:
-            return JobEnd(Ending.FAILED, reason_of(error))
-        return JobEnd(Ending.FATAL, reason_of(error))
+            return JobEnd(JobEnding.FAILED, reason_of(error))
+        return JobEnd(JobEnding.FATAL, reason_of(error))
 
 
 def reason_of(error: Exception) -> str:

@@ -15,7 +15,7 @@ import xarray as xr
 from vipetsc.case import Case, Sweep
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import FolderError, origin
+from vipetsc.io.folder import SWEEP, FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import RecordFile
@@ -53,7 +53,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
     """
 
     def look() -> tuple[list[MeasurableRun], list[Path]]:
-        sweeps = [path for path in paths if (path / "index.json").exists()]
+        sweeps = [path for path in paths if SWEEP.is_in(path)]
         for override in overrides:
             if sweeps or not override.startswith("analysis."):
                 raise FolderError(f"{override}: for an existing run only [analysis] can change, for a sweep nothing")
@@ -96,7 +96,7 @@ def _reassemble(folder: Path) -> Path:
 def _measurable(path: Path) -> Iterator[MeasurableRun]:
     """The runs in ``path`` that can be measured, all checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
-    sweep = (folder / "index.json").exists()
+    sweep = SWEEP.is_in(folder)
     if not sweep and not (folder / "run.h5").exists():
         raise FolderError(f"{path}: contains no run.h5; give the folder of a finished run or sweep")
 

@@ -10,6 +10,7 @@ import numpy as np
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import MeasuredTable
 from vipetsc.case.response_measures import ResponseMeasure, response_measures
+from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ISOLA
@@ -39,8 +40,8 @@ def measured_responses(
 def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
     """The record of ``measured_responses`` from the ``branches`` of a case; raises as it does."""
     for branch in branches:
-        if branch.ending.startswith("stopped"):
-            raise StoppedError(branch.ending)
+        if branch.ended.ending is Ending.STOPPED:
+            raise StoppedError(branch.ended.sentence)
         reason = _why_incomplete(case, branch)
         if reason:
             raise RuntimeError(f"curve {branch.name}: {reason}")
@@ -74,14 +75,14 @@ def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[Me
 def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
     """Why a curve has no states in a part of its range; empty if it has."""
     if not branch.complete:
-        return branch.ending
+        return branch.ended.sentence
     # An isolated part covers what it covers.
     if ISOLA in branch.name:
         return ""
     high = case.nfrc.range[1]
     last = parameter_values(branch)[-1]
     if last < high - ROUNDING * abs(high):
-        return f"turned back and {branch.ending}, without states up to {high:g}"
+        return f"turned back and {branch.ended.sentence}, without states up to {high:g}"
     return ""
 
 

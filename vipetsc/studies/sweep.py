@@ -4,7 +4,6 @@ The linear runs come first, since members without contact are scaled from them. 
 first. A sweep goes on after members that fail, and can be resumed after an interruption.
 """
 
-import json
 import re
 import sys
 import tempfile
@@ -13,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from mpi4py import MPI
 
@@ -21,14 +20,13 @@ import numpy as np
 
 from vipetsc.case import Case, CaseError, Problem, Sweep
 from vipetsc.case.html import html_table
-from vipetsc.io.atomic import discard, write_text
+from vipetsc.io.atomic import discard
 from vipetsc.io.folder import SWEEP, claimed
 from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.plugins import announce_parts
 from vipetsc.progress import say
-from vipetsc.sources import source_key
-from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Results, assemble
+from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, FailedMember, Results, assemble
 from vipetsc.studies.linear_run import MEMBERS, LinearRun, first_site_cell, linear_name
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.study import is_whole
@@ -38,6 +36,7 @@ from vipetsc.wording import counted
 if TYPE_CHECKING:
     import xarray as xr
 
+MOST_FAILURES = 10  # failed members that every rank gets, and that messages name
 MOST_SURVEYED = 10_000  # members whose cases are resolved beforehand, for their linear runs and what they will cost
 
 
@@ -47,8 +46,9 @@ class SweepResult:
 
     ``status`` (member,) says how each member ended, as an index of ``studies.ensemble.STATUS``. ``computed`` is the
     number of members that this call simulated or scaled, ``seconds`` its wall time, ``busy`` (rank) the fraction of it
-    in which each rank worked on members. ``warnings`` are sentences about lost results and about the members. A sweep
-    without a ``folder`` has its ensemble in memory, ``held`` by rank 0.
+    in which each rank worked on members. ``warnings`` are sentences about lost results and about the members,
+    ``failures`` the first members that failed (at most ``MOST_FAILURES``; the attribute ``failed`` of the ensemble, in
+    JSON, has all). A sweep without a ``folder`` has its ensemble in memory, ``held`` by rank 0.
     """
 
     status: np.ndarray
@@ -57,6 +57,7 @@ class SweepResult:
     busy: tuple[float, ...]
     folder: Path | None
     warnings: list[str]
+    failures: list[FailedMember]
     held: "xr.Dataset | None" = field(default=None, repr=False, compare=False)
 
     @cached_property
@@ -76,7 +77,12 @@ class SweepResult:
     @property
     def complete(self) -> bool:
         """Whether every member has measures: none has failed, and none is missing."""
-        return not self.count(FAILED) and not self.count(MISSING)
+        return not self.failed and not self.count(MISSING)
+
+    @property
+    def failed(self) -> int:
+        """The number of members that have failed."""
+        return self.count(FAILED)
 
     @property
     def resumable(self) -> bool:
@@ -98,7 +104,7 @@ def run_sweep(
     stop: StopRequest | None = None,
     progress: bool = False,
 ) -> SweepResult:
-    """Simulate every member of ``plan`` in ``folder``, then write ``ensemble.h5`` and ``index.json``.
+    """Simulate every member of ``plan`` in ``folder``, then write ``ensemble.h5``.
 
     The ensemble is ``result.dataset``, an xarray dataset. Without a folder it is held in memory; a sweep that is
     stopped then stays in a temporary folder, which ``result.folder`` names.
@@ -145,8 +151,7 @@ def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: 
         return result
 
     def read() -> "xr.Dataset":
-        index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-        ensemble = open_ensemble(folder).assign_attrs(failed=json.dumps(index["failed"]))
+        ensemble = open_ensemble(folder)
         # The folder is removed below.
         del ensemble.attrs["folder"]
         discard(folder)
@@ -191,18 +196,27 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(runs.recorded.pool.busy / seconds))
 
-    def put_together() -> tuple[np.ndarray, list[str]]:
+    def put_together() -> tuple[np.ndarray, list[str], list[FailedMember]]:
         survey = surveys[0]
         results = survey.results
         if needed or order:
             results = Results(plan, folder)
         status, warnings = conclude(results, afresh=bool(order))
-        return status, [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
+        warnings = [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
+        return status, warnings, results.failures(MOST_FAILURES)
 
-    status, warnings = on_root(comm, put_together)
+    status, warnings, failures = on_root(comm, put_together)
     # MPI has a limited number of communicators, and a process may run many sweeps.
     runs.recorded.team.Free()
-    return SweepResult(status=status, computed=computed, seconds=seconds, busy=busy, folder=folder, warnings=warnings)
+    return SweepResult(
+        status=status,
+        computed=computed,
+        seconds=seconds,
+        busy=busy,
+        folder=folder,
+        warnings=warnings,
+        failures=failures,
+    )
 
 
 class DrawnMember(NamedTuple):
@@ -300,40 +314,24 @@ def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) ->
 
 
 def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:
-    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns ``status`` (member,) and warnings.
+    """Write ``ensemble.h5`` once no member is missing; returns ``status`` (member,) and warnings.
 
-    Files of the same results stay as they are, unless ``afresh``.
+    An ensemble that has all records stays as it is, unless ``afresh``.
     """
-    plan = results.plan
     folder = results.folder
-    status = results.status
     sys.audit("vipetsc.conclude", str(folder))
-
-    count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
-    index = {
-        "source": source_key(),
-        "sweep": plan.name,
-        "members": count,
-        "failed": [_failed_member(results, number) for number in np.flatnonzero(status == FAILED)],
-    }
     warnings = summarise([text for first in results.first for text in results.warnings.get(int(first), ())])
     warnings += results.gaps()
+    if (results.status == MISSING).any():
+        return results.status, warnings
 
-    path = folder / "index.json"
-    text = json.dumps(index, indent=1, default=int) + "\n"
-    is_current = not afresh and path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    # Records first, then the ensemble, then the index, each whole before it replaces the one before: after a kill the
-    # folder can be read, and an ensemble that is older than its records is made again.
-    if not count[STATUS[MISSING]]:
-        lost: list[str] = []
-        results.merge_files()
-        is_current = is_current and has_all_records(folder)
-        if not is_current or not is_whole(folder / "ensemble.h5", lost):
-            assemble(results, warnings)
-        warnings += lost
-    if not is_current:
-        write_text(path, text)
-    return status, warnings
+    # Records first, then the ensemble, each whole before it replaces the one before: after a kill the folder can be
+    # read, and an ensemble that is older than its records is made again.
+    lost: list[str] = []
+    results.merge_files()
+    if afresh or not has_all_records(folder) or not is_whole(folder / "ensemble.h5", lost):
+        assemble(results, warnings)
+    return results.status, warnings + lost
 
 
 def has_all_records(folder: Path) -> bool:
@@ -341,15 +339,6 @@ def has_all_records(folder: Path) -> bool:
     ensemble = folder / "ensemble.h5"
     records = RecordPaths(folder, MEMBERS).existing()
     return ensemble.exists() and all(file.stat().st_mtime_ns <= ensemble.stat().st_mtime_ns for file in records)
-
-
-def _failed_member(results: Results, number: int) -> dict[str, Any]:
-    """The entry of the index for a member that failed: its ``place`` over the axes, its name ``id`` and the reason."""
-    return {
-        "place": np.unravel_index(number, results.plan.shape),
-        "id": results.ids[number],
-        "reason": results.reasons[results.first[number]],
-    }
 
 
 def summarise(sentences: Sequence[str]) -> list[str]:

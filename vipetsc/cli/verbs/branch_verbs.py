@@ -20,6 +20,7 @@ from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.messages import echo_warnings
 from vipetsc.cli.tables import first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.endings import Ending
 from vipetsc.io.folder import BRANCHES
 from vipetsc.parallel import on_root
 from vipetsc.wording import counted, with_unit
@@ -46,7 +47,7 @@ def follow_modes(case: NnmCase, work: Work) -> Outcome:
 
     def report(branch: "Branch") -> None:
         work.report(branch_table(branch))
-        echo_warnings(work.comm, [f"{branch.name}: {finding}" for finding in branch.findings])
+        echo_warnings(work.comm, [f"{branch.name}: {finding}" for finding in [*branch.findings, *branch.missing]])
 
     return follow_branches(case, work, report, show_point=branch_log())
 
@@ -82,7 +83,7 @@ def follow_branches(
             claim.publish()
 
     # Only rank 0 has the branches; all ranks must agree on how the verb ends.
-    failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
+    failures = [f"{b.name}: {b.ended.sentence}" for b in branches if b.ended.ending is Ending.FAILED]
     return Outcome(drawable=has_branches, failures=comm.bcast(failures))
 
 
@@ -188,7 +189,7 @@ def branch_table(branch: "Branch") -> str:
     from vipetsc.modes.branches.regions import slope_laws, tongues
 
     regular = branch.regular()
-    lines = [f"{branch.name}: {len(regular)} points; {branch.ending}"]
+    lines = [f"{branch.name}: {len(regular)} points; {branch.ended.sentence}"]
     if regular:
         energy = branch.column("energy")
         frequency = branch.column("frequency")
@@ -233,7 +234,7 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     from vipetsc.modes.branches.sweeps import measure, parameter_values, sweep_down, sweep_up
 
     options = case.nfrc
-    rows = [("curve", curve.name), ("points", f"{len(curve.points)}; {curve.ending}")]
+    rows = [("curve", curve.name), ("points", f"{len(curve.points)}; {curve.ended.sentence}")]
     if not curve.points:
         return rows
 

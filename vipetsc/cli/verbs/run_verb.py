@@ -236,7 +236,7 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
     The table is empty if the case names no points.
     """
     from vipetsc.io.netcdf import open_netcdf
-    from vipetsc.spectra.measures import MEASURES, UNSETTLED, measures_of
+    from vipetsc.spectra.measures import MEASURES, measures_of
 
     points = [point.name for point in case.output.points or []]
     if not points:
@@ -258,8 +258,8 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
             if "parts" in item.attrs:
                 text += f" ({', '.join(np.atleast_1d(item.attrs['parts']))})"
             rows.append((name, text))
-        warnings = json.loads(analysis.attrs["warnings"])
-    return table(rows), [warning for warning in warnings if warning.startswith(UNSETTLED)]
+        unsettled = json.loads(analysis.attrs["unsettled"])
+    return table(rows), unsettled
 
 
 def measure_where_missing(folders: Sequence[Path]) -> None:

@@ -1,6 +1,5 @@
 """The verb ``sweep``: every combination in the section [sweep] of a case."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +10,9 @@ from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import SWEEP, FolderError
-from vipetsc.parallel import on_root
 
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
-
-MOST_FAILURES = 10  # failed members that are printed; the index of the sweep has all
 
 
 def simulate_members(plan: Sweep, work: Work) -> Outcome:
@@ -25,20 +21,16 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
     result = run_sweep(plan, work.folder, work.comm, **work.keywords)
     work.warn(result.warnings)
-    # The table is made where the index was written: other ranks may not see the file.
-    work.report(on_root(work.comm, lambda: sweep_table(result)))
-    return Outcome(complete=result.complete, failures=on_root(work.comm, lambda: failure_of(result)))
+    work.report(sweep_table(result))
+    return Outcome(complete=result.complete, failures=failure_of(result))
 
 
 def failure_of(result: "SweepResult") -> list[str]:
     """Return the sentence of a sweep of which members failed, with the first of them; nothing where none did."""
-    assert result.folder
-    index = result.folder / "index.json"
-    failures = json.loads(index.read_text(encoding="utf-8"))["failed"]
-    if not failures:
+    if not result.failures:
         return []
-    first = failures[0]
-    return [f"{len(failures)} of {result.status.size} members failed, first {first['place']}: {first['reason']}"]
+    first = result.failures[0]
+    return [f"{result.failed} of {result.status.size} members failed, first {first['place']}: {first['reason']}"]
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
@@ -68,9 +60,7 @@ def sweep_table(result: "SweepResult") -> str:
     else:
         rows.append(("leaves", str(result.folder / "ensemble.h5")))
 
-    # The result has statuses only; the reasons are in the index.
-    failures = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["failed"]
-    rows += [("failed", f"member {row['place']}: {row['reason']}") for row in failures[:MOST_FAILURES]]
+    rows += [("failed", f"member {row['place']}: {row['reason']}") for row in result.failures]
     return table(rows)
 
 

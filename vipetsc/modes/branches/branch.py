@@ -5,6 +5,7 @@ from typing import Any, Generic
 
 import numpy as np
 
+from vipetsc.endings import NOT_FINISHED, Ended
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.io.netcdf import Variables
 from vipetsc.modes.problem import S
@@ -18,11 +19,11 @@ class Branch(Generic[S]):
     step after the last point, 0 without points. ``about`` are further attributes of its file, ``extra`` further
     variables: orbits.
 
-    ``ending`` says in a sentence how the branch has ended, or that it has failed ("failed: ...") or was stopped
-    ("stopped ..."). ``complete`` says that there is nothing left to follow: the branch has left its range or met
-    itself. A branch that failed, was stopped or has used up its points is not complete. ``findings`` are further
-    sentences: retracing, return to the linear mode, special points that are not located. They are the attribute
-    ``warnings`` of the file.
+    ``ended`` is how the branch has ended: it is ``complete`` if nothing is left to follow, since it has left its range
+    or met itself. One that failed, was stopped or has used up its points is not complete. ``findings`` are further
+    sentences: retracing, return to the linear mode, special points that are not located. ``missing`` are
+    sentences about orbits that the case asks for and the branch does not have. Both are the attribute ``warnings`` of
+    the file.
     """
 
     name: str
@@ -31,11 +32,16 @@ class Branch(Generic[S]):
     kind: str = ORBITS
     points: list[S] = field(default_factory=list)
     next_step: float = 0.0
-    complete: bool = False
-    ending: str = "not finished"
+    ended: Ended = NOT_FINISHED
     findings: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
     about: dict[str, Any] = field(default_factory=dict)
     extra: Variables = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to follow."""
+        return self.ended.ending.is_final
 
     def regular(self) -> list[S]:
         """The points of the continuation itself."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from vipetsc.case.nnm_table import Guards
+from vipetsc.endings import Ended, Ending
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.point import Point
 from vipetsc.modes.shooting import Shooting, repetitions, sample_orbit
@@ -44,23 +45,23 @@ class BranchMonitor:
         self._touched = False
         self._repeats = False
 
-    def check(self, point: Point) -> str | None:
-        """A sentence on the first check that the branch fails at ``point``; None if it passes all."""
+    def check(self, point: Point) -> Ended | None:
+        """Return the ending by the first check that the branch fails at ``point``; None if it passes all."""
         size = np.abs(point.x).max()
         here = np.array([*(point.x / size), np.log(size), np.log(point.period)])
         track = self._track
         self._track = np.vstack([track, here])
-        sentence = self._returned(point)
-        if sentence is None:
-            sentence = self._stands_still(point)
-        if sentence is None:
-            sentence = self._repeats_another(point)
-        if sentence is None:
-            sentence = self._retraces(point, track, here)
-        return sentence
+        ended = self._returned(point)
+        if ended is None:
+            ended = self._stands_still(point)
+        if ended is None:
+            ended = self._repeats_another(point)
+        if ended is None:
+            ended = self._retraces(point, track, here)
+        return ended
 
-    def _returned(self, point: Point) -> str | None:
-        """A sentence if the branch is back on a linear mode after it has touched a contact; else None."""
+    def _returned(self, point: Point) -> Ended | None:
+        """Return the ending if the branch is back on a linear mode after it has touched a contact; else None."""
         if point.episodes > 0:
             self._touched = True
             return None
@@ -68,19 +69,19 @@ class BranchMonitor:
         detuning = np.abs(self._linear / point.frequency - 1)
         if not self._touched or detuning.min() >= LINEAR:
             return None
-        return f"returned to linear mode {detuning.argmin() + 1} at E = {point.energy:.6g} J (point {point.index})"
+        return Ending.LINEAR_MODE.with_numbers(mode=detuning.argmin() + 1, energy=point.energy, point=point.index)
 
-    def _stands_still(self, point: Point) -> str | None:
-        """A sentence if the latest points are one; else None."""
+    def _stands_still(self, point: Point) -> Ended | None:
+        """Return the ending if the latest points are one; else None."""
         places = self._guards.standstill
         if not 0 < places <= len(self._track) - 1:
             return None
         if np.ptp(self._track[-places:], axis=0).max() > self._guards.advance:
             return None
-        return f"does not advance: {places} points up to {point.index} are one, at E = {point.energy:.9g} J"
+        return Ending.STANDSTILL.with_numbers(places=places, point=point.index, energy=point.energy)
 
-    def _repeats_another(self, point: Point) -> str | None:
-        """A sentence if two checks in a row find orbits of another branch, passed several times; else None.
+    def _repeats_another(self, point: Point) -> Ended | None:
+        """Return the ending if two checks in a row find orbits of another branch, passed several times; else None.
 
         A single such orbit may lie at the tip of a tongue.
         """
@@ -91,10 +92,10 @@ class BranchMonitor:
         self._repeats = times > 1
         if not twice:
             return None
-        return f"left its branch: the orbit of point {point.index} is another one passed {times} times"
+        return Ending.OTHER_BRANCH.with_numbers(point=point.index, times=times)
 
-    def _retraces(self, point: Point, track: np.ndarray, here: np.ndarray) -> str | None:
-        """A sentence if the branch, which is ``here`` now, lies on its earlier ``track``; else None."""
+    def _retraces(self, point: Point, track: np.ndarray, here: np.ndarray) -> Ended | None:
+        """Return the ending if the branch, which is ``here`` now, lies on its earlier ``track``; else None."""
         # Without contact a branch is its linear mode at every energy.
         if len(track) < FEWEST or not self._touched:
             return None
@@ -120,8 +121,8 @@ class BranchMonitor:
             return None
         where = f"point {point.index} lies on the step after point {near[i] + 1}"
         if along < 0:
-            return f"retraces itself: {where}, backwards"
-        return f"closed on itself: {where}"
+            return Ending.RETRACED.with_numbers(where=where)
+        return Ending.CLOSED_ON_ITSELF.with_numbers(where=where)
 
 
 def sampled(problem: Shooting, points: list[Point]) -> Variables:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from vipetsc.endings import Ended, Ending
 from vipetsc.io.atomic import write_text
 from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
@@ -89,8 +90,10 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
         "case": branch.case,
         "branch_kind": branch.kind,
         "complete": int(branch.complete),
-        "ending": branch.ending,
-        "warnings": json.dumps(branch.findings),
+        "ending": branch.ended.sentence,
+        "ended": branch.ended.ending.name,
+        "warnings": json.dumps(branch.findings + branch.missing),
+        "missing": json.dumps(branch.missing),
         **branch.about,
     }
     if branch.kind == RESPONSES:
@@ -115,6 +118,8 @@ def read_branch(path: Path) -> Branch[Any]:
     with open_netcdf(path, "branch", form.needs) as file:
         data = file.load()
     about = data.attrs
+    warnings = json.loads(about["warnings"])
+    missing = json.loads(about["missing"])
     next_step = about.get("next_step")
     if next_step is None:
         # Files of responses have the next step at each point, and none for the branch.
@@ -126,9 +131,9 @@ def read_branch(path: Path) -> Branch[Any]:
         kind=kind,
         points=list(form.points(data)),
         next_step=float(next_step),
-        complete=bool(about["complete"]),
-        ending=str(about["ending"]),
-        findings=json.loads(about.get("warnings", "[]")),
+        ended=Ended(Ending[str(about["ended"])], str(about["ending"])),
+        findings=warnings[: len(warnings) - len(missing)],
+        missing=missing,
         about={name: str(about[name]) for name in ("over", "unit") if name in about},
     )
 

@@ -55,13 +55,12 @@ def follow_all(
     branches r, r + n, r + 2n and so on. Where a lattice is shot without dense matrices, all ranks follow one branch
     together, and then the next one.
 
-    A branch that fails, by one of ``Method.failures``, is written as far as it came and says why in its ``ending``, and
-    the others go on. A ``stop`` ends
-    each branch at its next point, or earlier if an orbit's search takes long (``ArcLimits``), with an ending that
-    begins with "stopped"; of branches that are not begun yet each still computes its start, unless that takes long or
-    has steps of its own, and one point. With ``resume`` branches that were stopped go on to the same bits, and branches
-    that failed or have used up their points, go on from their last point. Returns all
-    branches on rank 0, in the order of the case; an empty list on the others.
+    A branch that fails, by one of ``Method.failures``, is written as far as it came and says why (``Branch.ended``),
+    and the others go on. A ``stop`` ends each branch at its next point, or earlier if an orbit's search takes long
+    (``ArcLimits``); of branches that are not begun yet each still computes its start, unless that takes long or has
+    steps of its own, and one point. With ``resume`` branches that were stopped go on to the same bits, and branches
+    that failed or have used up their points go on from their last point. Returns all branches on rank 0, in the order
+    of the case; an empty list on the others.
 
     Any other error of one rank, as where a file cannot be written, is raised on all ranks once the others have followed
     their branches. Where all ranks follow one branch together, an error that one of them has alone leaves the others

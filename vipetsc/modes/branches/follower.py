@@ -17,7 +17,7 @@ and ``<name>-down`` towards smaller ones. Both begin with the start.
 and where it ends, a growing branch is written whole. A resumed command reads a branch that is complete, and goes on
 from the last point of one that was stopped, failed, or has used up its points; one that failed at its start is tried
 again. In between the steps, the bounds, and the numbers of points and of Newton steps in the case may have been
-changed, but not the physics. ``Branch`` explains ``ending``, ``complete`` and ``findings``.
+changed, but not the physics. ``Branch`` explains ``ended``, ``complete`` and ``findings``.
 
 **Branches that cross** a branch at its special points, or are isolated near it, are followed after it, each with files
 of its own. They have the variables of their points alone (``Method.finish`` is not called for them). Their names have
@@ -39,6 +39,7 @@ from mpi4py import MPI
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.endings import Ended, Ending
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed import CondensedMethod
@@ -115,15 +116,15 @@ class Follower:
         return branches
 
     def _follow_and_write(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
-        """Call ``follow`` for a branch, and write it; its ending says why if it is stopped or fails."""
+        """Call ``follow`` for a branch, and write it; how it ``ended`` says why it was stopped or failed."""
         try:
             follow()
         except StoppedError as stopped:
-            branch.ending = str(stopped)
+            branch.ended = Ended(Ending.STOPPED, str(stopped))
         except self.method.failures as error:
-            branch.ending = f"failed: {error}"
+            branch.ended = Ending.FAILED.with_numbers(reason=error)
         # A branch that was stopped before its first point has nothing to say, and is begun when it is resumed.
-        if branch.points or (self.method.keeps_empty and not branch.ending.startswith("stopped")):
+        if branch.points or (self.method.keeps_empty and branch.ended.ending is not Ending.STOPPED):
             self.write(branch)
 
     def write(self, branch: Branch[Any]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from vipetsc.endings import Ended, Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method, Monitor
 from vipetsc.modes.continuation.arclength import Continuation, StepRule, locate
@@ -44,7 +45,7 @@ class Growth:
     def run(
         self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any, rule_of: RuleOf, direction: int = 1
     ) -> None:
-        """Continue ``branch`` from the motion ``start`` until it ends, and set its ``ending`` and ``complete``.
+        """Continue ``branch`` from the motion ``start`` until it ends, and set how it ``ended``.
 
         Special points are located between the regular ones.
 
@@ -76,14 +77,14 @@ class Growth:
 
         try:
             with self.method.stopped_by(problem, self.stop):
-                why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
+                seen = self._steps(branch, problem, continuation, rule.chart, monitor)
         except StoppedError:
             # A step in which the branch was stopped is left out, and repeated by a resumed branch.
             self.write(branch)
             last = branch.regular()[-1]
-            raise StoppedError(f"stopped on request after point {last.index}; continue with --resume") from None
-        branch.ending = why_ended or continuation.ending
-        branch.complete = why_ended is not None or continuation.finished
+            stopped = Ending.STOPPED.with_numbers(where=f"after point {last.index}; continue with --resume")
+            raise StoppedError(stopped.sentence) from None
+        branch.ended = seen or continuation.ended
 
     def _steps(
         self,
@@ -92,8 +93,8 @@ class Growth:
         continuation: Continuation[Any],
         chart: str,
         monitor: Monitor[Any],
-    ) -> str | None:
-        """Add all points to the ``branch``; returns why the ``monitor`` has ended it, or None if it has not.
+    ) -> Ended | None:
+        """Add all points to the ``branch``; returns its ending if the ``monitor`` has ended it, else None.
 
         ``chart`` is the name of the unknowns in which steps are taken (``Continuation``).
         """
@@ -133,10 +134,10 @@ class Growth:
             assessed = new_points[-1]
             branch.next_step = continuation.step
             self._show(branch, assessed)
-            why_ended = monitor(assessed)
-            if why_ended is not None:
-                branch.findings.append(why_ended)
-                return why_ended
+            ended = monitor(assessed)
+            if ended is not None:
+                branch.findings.append(ended.sentence)
+                return ended
 
             # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
             if self.stop.agreed(self.comm) and not continuation.finished:

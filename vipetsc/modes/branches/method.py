@@ -9,12 +9,13 @@ from mpi4py import MPI
 
 import numpy as np
 
+from vipetsc.endings import Ended
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem, S, SpecialKind
 from vipetsc.parallel import StopRequest
 
-Monitor = Callable[[S], str | None]
+Monitor = Callable[[S], Ended | None]
 
 
 def value_kind(
@@ -111,7 +112,7 @@ class Method(ABC, Generic[S]):
         return []
 
     def monitor(self, problem: PeriodicProblem[S]) -> Monitor[S]:
-        """A check of every new point: a sentence ends the branch, None lets it go on."""
+        """A check of every new point: an ending ends the branch, None lets it go on."""
         return lambda point: None
 
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:

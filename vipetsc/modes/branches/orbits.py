@@ -37,9 +37,6 @@ NONLINEAR_FORCE = 1e-4
 LINEAR_ENERGY = 1e-3
 # How far above the lowest energy asked for a branch begins at least.
 ABOVE_LOWEST = 1.001
-# Beginnings of the findings about orbits that were asked for.
-NOT_PASSED = "the branch has no orbit of"
-NOT_FOUND = "the orbit of"
 
 
 class NnmMethod(Method[Point]):
@@ -88,10 +85,10 @@ class NnmMethod(Method[Point]):
     def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
         """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one.
 
-        Findings of the ``branch`` say which are missing.
+        The ``branch`` says which are ``missing``.
         """
-        # A branch that was stopped or had used up its points has such findings already, which may no longer be true.
-        branch.findings = [finding for finding in branch.findings if not finding.startswith((NOT_PASSED, NOT_FOUND))]
+        # A branch that was stopped or had used up its points has such sentences already, which may no longer be true.
+        branch.missing = []
         for energy in self.options.orbits_at:
             passed = False
             for left, right in itertools.pairwise(branch.regular()):
@@ -102,9 +99,9 @@ class NnmMethod(Method[Point]):
                     yield at_energy(problem, left, right, energy, self.options.chart)
                 # The branch itself is complete; what it lacks stands in its file as a finding.
                 except NoMotionError as error:
-                    branch.findings.append(f"{NOT_FOUND} {energy:g} J after point {left.index} is not found: {error}")
+                    branch.missing.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
             if not passed:
-                branch.findings.append(f"{NOT_PASSED} {energy:g} J")
+                branch.missing.append(f"the branch has no orbit of {energy:g} J")
 
 
 def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:

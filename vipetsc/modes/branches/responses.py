@@ -12,6 +12,7 @@ import numpy as np
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.response_measures import FRACTIONS, WALLS, response_measures, value_of
+from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
@@ -21,7 +22,7 @@ from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import PeriodicProblem, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
-from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
+from vipetsc.modes.response.isolated import ClosingSteps, over_amplitudes, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
@@ -123,7 +124,7 @@ class ResponseMethod(Method[Response]):
                 yield self._isola(states, first, f"{branch.name}{ISOLA}{number}")
                 if not followed[-1].complete:
                     return  # states on what is left of it would be found again
-                if followed[-1].ending != CLOSED:
+                if followed[-1].ended.ending is not Ending.CLOSED:
                     back = replace(first, tangent=-first.tangent)
                     yield self._isola(states, back, f"{branch.name}{ISOLA}{number}-back")
 

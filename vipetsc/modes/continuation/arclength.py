@@ -41,6 +41,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.case.nnm_table import NnmTable
+from vipetsc.endings import NOT_FINISHED, Ended, Ending
 from vipetsc.modes.departures import Departure, changed_families
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import (
@@ -233,7 +234,7 @@ class StepRule(Protocol[S]):
     def judge(self, before: S, after: S, geometry: Geometry) -> Verdict:
         """The verdict on a step from the point ``before`` to ``after`` that has converged."""
 
-    def end(self, before: S, point: S) -> tuple[S, str] | None:
+    def end(self, before: S, point: S) -> tuple[S, Ended] | None:
         """The last point of the branch and how it ended, if it ends at ``point``, the one after ``before``; else None.
 
         The last point may differ from ``point``, as where a rule moves it to the end of a range that it has passed.
@@ -296,22 +297,19 @@ class GuardedSteps:
         why, remedy = GUARDED[guard]
         return Verdict(accepted=False, step=after.step * factor, why=why, remedy=remedy)
 
-    def end(self, before: Point, point: Point) -> tuple[Point, str] | None:
+    def end(self, before: Point, point: Point) -> tuple[Point, Ended] | None:
         """The point itself, where it has left the range of energies or of frequencies, or is almost an equilibrium."""
         if self.problem.acceleration(point) < NEAR_EQUILIBRIUM:
-            return point, (
-                f"ends at an equilibrium: at E = {point.energy:.9g} J, f = {point.frequency:.6g} Hz the motion begins "
-                "where the forces almost balance"
-            )
+            return point, Ending.EQUILIBRIUM.with_numbers(energy=point.energy, frequency=point.frequency)
         low, high = self.control.energy
         # The first motion has the energy asked for by its linear mode alone: springs and pressed contacts that are not
         # linear change it. A branch may therefore begin outside the range and come into it.
         comes_nearer = before.energy < point.energy < low or high < point.energy < before.energy
         if not (low <= point.energy <= high or comes_nearer):
-            return point, f"left the energy range {low:g} to {high:g} J"
+            return point, Ending.OUT_OF_ENERGIES.with_numbers(low=low, high=high)
         low, high = self.control.frequency
         if not low <= 2 * np.pi * point.frequency <= high:
-            return point, f"left the frequency range {low:g} to {high:g} rad/s"
+            return point, Ending.OUT_OF_FREQUENCIES.with_numbers(low=low, high=high)
         return None
 
     def stuck(self, last: Point, attempt: Attempt | None, verdict: Verdict) -> str:
@@ -355,8 +353,8 @@ class Continuation(Generic[S]):
     ``direction`` is not used.
 
     Each point is yielded when it has been accepted. ``point`` is the last one; ``passed`` is the same point as it was
-    before the rule's ``end`` may have moved it to the end of a range. ``ending`` says in a sentence how the branch
-    ended, and ``finished`` whether it did so by the rule's ``end``.
+    before the rule's ``end`` may have moved it to the end of a range. ``ended`` is how the
+    branch ended, and ``finished`` whether it did so by the rule's ``end``.
 
     The whole state is the last point and the next ``step``: a stored branch can be resumed, and ``points`` then counts
     from there; the ending tells their number together with the ``points_before``. Raises ContinuationError if the step
@@ -381,8 +379,12 @@ class Continuation(Generic[S]):
         self.step = self.rule.first_step
         if step is not None:
             self.step = step
-        self.ending = "not finished"
-        self.finished = False
+        self.ended = NOT_FINISHED
+
+    @property
+    def finished(self) -> bool:
+        """Whether the branch has come to its end, as the rule has it."""
+        return self.ended.ending.is_final
 
     def __iter__(self) -> Iterator[S]:
         for _ in range(self.rule.points):
@@ -390,13 +392,12 @@ class Continuation(Generic[S]):
             self.point = self.passed = self._next()
             end = self.rule.end(before, self.point)
             if end is not None:
-                self.point, self.ending = end
-                self.finished = True
+                self.point, self.ended = end
             yield self.point
             if self.finished:
                 return
         total = self.points_before + self.rule.points
-        self.ending = f"{total} points reached: increase {self.rule.points_key} and resume to continue"
+        self.ended = Ending.POINTS_USED.with_numbers(points=total, key=self.rule.points_key)
 
     def _next(self) -> S:
         """The next point; raises ContinuationError where no step is short enough."""

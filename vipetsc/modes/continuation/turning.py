@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import Generic
 
+from vipetsc.endings import Ended
 from vipetsc.modes.continuation.arclength import Geometry, Verdict
 from vipetsc.modes.problem import Attempt, S
 
@@ -58,7 +59,7 @@ class BoundedTurn(ABC, Generic[S]):
         return Verdict(accepted=True, step=min(after.step * max(growth, 0.5), self.largest_step))
 
     @abstractmethod
-    def end(self, before: S, point: S) -> tuple[S, str] | None:
+    def end(self, before: S, point: S) -> tuple[S, Ended] | None:
         """The last point of the curve and how it ended, if it ends at ``point``; else None."""
 
     @abstractmethod

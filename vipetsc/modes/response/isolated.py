@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.over_key import StatesOverKey
@@ -143,15 +144,12 @@ class ClosingSteps(TurningSteps):
         super().__init__(states, points)
         self.first = first
 
-    def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
+    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
         """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
         if returned(self.first, before, point):
             first = self.first
             last = Response(
                 xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
             )
-            return last, CLOSED
+            return last, Ending.CLOSED.with_numbers()
         return super().end(before, point)
-
-
-CLOSED = "closed: it has come back to its first state"

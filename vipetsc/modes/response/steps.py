@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vipetsc.endings import Ended, Ending
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.continuation.arclength import Continuation, Verdict
 from vipetsc.modes.continuation.turning import BoundedTurn
@@ -40,7 +41,7 @@ class TurningSteps(BoundedTurn[Response]):
         super().__init__(points, options.first_step, options.smallest_step, options.largest_step)
         self.states = states
 
-    def end(self, before: Response, point: Response) -> tuple[Response, str] | None:
+    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
         """The state on the end of the range, where ``point`` has passed it."""
         states = self.states
         scale = states.parameter.scale
@@ -57,7 +58,7 @@ class TurningSteps(BoundedTurn[Response]):
         xi = states.at(before.xi + place * (point.xi - before.xi), bound)
         tangent = states.frame(point).tangent_at(xi)
         last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
-        return last, f"reached the end of nfrc.range, {bound * scale:g}"
+        return last, Ending.END_OF_RANGE.with_numbers(end=bound * scale)
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Message where and why the curve cannot go on, and which key to change."""
