@@ -66,7 +66,7 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
         ([0.3 * (1 + 1e-12), 1.0, 0.0], (0.3, 0.3), 1.2, 0.0),
         # A motion from rest at a clearance to the other side, and one almost at rest just before a clearance.
         ([0.3, 0.0, -1.0], (0.3, 0.3), 1.0, 0.6**0.5),
-        ([0.3 - 1e-11, 1e-9, 1.0], (0.3, 0.3), 1.0, 0.0),
+        ([0.3 - 1e-13, 1e-11, 1.0], (0.3, 0.3), 1.0, 0.0),
         # The motion w = 4 s^3 - s goes away first and returns faster and faster.
         ([0.0, -1.0, 0.0, 4.0], (0.3, 0.3), 1.0, np.roots([4.0, 0.0, -1.0, -0.3]).real.max()),
         # A motion of high curvature; motions that turn just before the clearance, or just beyond it.
@@ -78,5 +78,5 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
 def test_the_first_onset_is_met_to_rounding(series, clearances, length, onset):
     """The first onset of a polynomial motion is its first root at a clearance, in closed form."""
     site = create_contacts(small_case().model().contact, [clearances])[0]
-    # A distance from the clearance below LANDED_W, 1e-10 of it, counts as an onset.
+    # A distance from the clearance below the tolerance of a landing, 2e-13 here, counts as an onset.
     assert first_onset(np.array(series), site, length) == pytest.approx(onset, rel=2e-10, abs=1e-14)

@@ -27,12 +27,12 @@ sigma w - D (onset), D - sigma w (separation), -g and g (clipping begins and end
 pressed at rest, or in which the masses of two cells touch, is permanent: its force is that of max(x, 0) at all times,
 kink included, and its mode never changes.
 
-**Rest.** A site whose stop has no clearance may touch it at rest. As the front of a wave arrives, the motion grows
-from below the tolerance of a landing, where it has many roots on each of which a landing would be useless. A site that
-would land again without having left the tolerance therefore rests: its force is that of max(x, 0), without loss, and
-nothing is landed on until it is a hundred tolerances away. There it becomes free or closed. A contact that closes from
-rest has no approach velocity: w'_minus is the floor. Contacts with loss and without a floor do not rest, since their
-force has no limit as w'_minus vanishes.
+**Rest.** Motion within the tolerance of a landing is not resolved. The front of a wave grows from below it where a stop
+has no clearance, and a mass may creep onto a stop, where impacts fade: both have many roots there, on each of which a
+landing would be useless. A site therefore rests if its impact ends within the tolerance, by its energy, or if it would
+land again without having left the tolerance: its force is that of max(x, 0), without loss, and nothing is landed on
+until it is a hundred tolerances away. There it becomes free or closed. The approach velocity of a contact that begins
+at an indentation x > 0 is the speed with which two masses alone come there from x = 0 without loss.
 
 **Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein
 form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial. Its roots in the step are as many as the

@@ -25,19 +25,17 @@ from vipetsc.contact.law import (
     contact_force,
     gap_of,
     impact_time,
-    resting_side,
+    landed_side,
     side_of,
 )
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
-# A site has landed on its clearance when |side w - D| is within this fraction of its ``scale``, which is D. The
-# rounding of w is 1e-16 of the displacements: they may be 1e5 times D, and a landing is still reached.
-LANDED_W = 1e-10
-# A site has landed on g = 0 when |g| is within this.
+# A site has landed on its clearance when |side w - D| is within its ``tolerance`` (``contact.law``), and on g = 0 when
+# |g| is within this.
 LANDED_G = 1e-9
-# A site at rest in contact has opened or closed when it is this fraction of its scale away from D. So far beyond the
-# tolerance a return to D is a motion of its own, on which the site may land again.
-MOVED_W = 100 * LANDED_W
+# A site at rest in contact has opened or closed when it is so many tolerances away from D. A return to D from there is
+# a motion of its own, on which the site may land again.
+MOVED = 100.0
 
 # The largest force in a step is sampled at the ends of so many intervals, then sought by golden sections between the
 # neighbours of the largest sample. These are a quarter of the step apart; 24 sections leave 2e-6 of the step, over
@@ -96,7 +94,7 @@ class Extremes(NamedTuple):
 def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
     """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) in its mode."""
     site = contacts[i]
-    tolerance = LANDED_W * site.scale
+    tolerance = site.tolerance
     if site.mode == FREE:
         # Function 0 is the onset on the side 1, function 1 that on the side -1.
         side = 1 - 2 * function
@@ -108,12 +106,12 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
     if abs(site.mode) == PERMANENT:
         # Its force has a kink at D, where the masses meet (function 0) or part (function 1).
         rises = 1 - 2 * function
-        near = MOVED_W * site.scale
+        near = MOVED * site.tolerance
         return AffineForm(order=0, factor=float(rises * side), offset=-rises * gap, tolerance=near, mode=site.mode)
 
     if abs(site.mode) == RESTING:
         # Not on D itself, where the motion has as many roots as before the site came to rest.
-        moved = MOVED_W * site.scale
+        moved = MOVED * site.tolerance
         if function == 0:
             return AffineForm(order=0, factor=float(-side), offset=gap - moved, tolerance=tolerance, mode=FREE)
         return AffineForm(order=0, factor=float(side), offset=-gap - moved, tolerance=tolerance, mode=side * CLOSED)
@@ -151,8 +149,8 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
     """
     if site.mode != FREE:
         return False
-    plus = site.clearance - LANDED_W * site.scale
-    minus = site.clearance_minus - LANDED_W * site.scale
+    plus = site.clearance - site.tolerance
+    minus = site.clearance_minus - site.tolerance
     within = True
     for w in b:
         within &= -minus < w < plus
@@ -161,16 +159,17 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> bool:
-    """Whether a site that can rest stays within the tolerance of a landing in the step from ``start`` to ``end`` (3,).
+    """Whether a site stays within the tolerance of a landing on one stop in the step from ``start`` to ``end`` (3,).
 
-    The step has ``h`` seconds; ``b`` (6,) is overwritten. A site that can rest has its stop at w = 0.
+    The step has ``h`` seconds; ``b`` (6,) is overwritten.
     """
-    if resting_side(site) == 0:
+    side = landed_side(site, start[0])
+    if side == 0:
         return False
     bernstein(start, end, h, b)
     stays = True
     for w in b:
-        stays &= abs(w) <= LANDED_W * site.scale
+        stays &= abs(side * w - gap_of(site, side)) <= site.tolerance
     return stays
 
 
@@ -179,7 +178,7 @@ def _passes_kink(site: Any, b: np.ndarray) -> bool:
     """Whether a permanent ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
     side = side_of(site.mode)
     gap = gap_of(site, side)
-    near = MOVED_W * site.scale
+    near = MOVED * site.tolerance
     lowest = np.inf
     highest = -np.inf
     for w in b:
@@ -198,7 +197,7 @@ def _next_kink(site: Any, motion: np.ndarray) -> int:
     """
     side = side_of(site.mode)
     depth = side * motion[0] - gap_of(site, side)
-    near = MOVED_W * site.scale
+    near = MOVED * site.tolerance
     if depth > near or (depth >= -near and side * motion[1] > 0.0):
         return 1
     return 0
@@ -310,7 +309,7 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
 def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
     """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
 
-    A contact closes if |side w - D| is at most ``MOVED_W`` of its scale and w approaches; inf if none does.
+    A contact closes if |side w - D| is at most ``MOVED`` tolerances and w approaches; inf if none does.
     """
     shortest = np.inf
     for i in range(contacts.size):
@@ -318,7 +317,7 @@ def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
         if abs(site.mode) == PERMANENT:
             side = side_of(site.mode)
             rate = side * motion[i, 1]
-            if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED_W * site.scale:
+            if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED * site.tolerance:
                 shortest = min(shortest, impact_time(site, rate))
     return shortest
 

@@ -21,6 +21,13 @@ from vipetsc.register import MOST_PARAMETERS
 # Smallest approach speed in m/s for an impact's duration. Squares below 1e-154 m/s underflow: this is far from it, so
 # that masses and stiffnesses of any size may multiply the square.
 SLOWEST = 1e-100
+# The tolerance of a landing on a clearance is this fraction of the site's scale: more than the rounding of w, also
+# where displacements are 1e5 times as large.
+LANDED = 1e-10
+# Where there is a clearance it need not be more than so many roundings of w, relative to the clearance or to the scale
+# of displacements: contacts that are less deep than the tolerance have no onset and no separation of their own. A stop
+# without clearance keeps the larger tolerance, below which the front of a wave passes through w = 0 again and again.
+ROUNDINGS = 1000 * float(np.finfo(float).eps)
 # Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. Modes from
 # PERMANENT on have the force of max(x, 0), without loss.
 FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4
@@ -47,6 +54,7 @@ SITE = np.dtype(
         ("clearance", np.float64),
         ("clearance_minus", np.float64),
         ("scale", np.float64),
+        ("tolerance", np.float64),
         ("approach", np.float64),
         ("elastic", ELASTIC),
         ("damping", np.float64),
@@ -57,10 +65,11 @@ SITE = np.dtype(
     ],
     align=True,
 )
-"""A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the ``scale`` in m to
-which tolerances of landings are relative, the signed ``approach`` velocity w'_minus in m/s; its elastic law, the
-damping c of the factor g, the ``floor`` of |w'_minus| in m/s, whether g is kept from becoming negative; the reduced
-mass of its two masses in kg. ``preload`` in N is the force of a permanent contact at w = 0: a static load balances it.
+"""A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the ``scale`` of w in
+m, the ``tolerance`` in m of a landing on a clearance, the signed ``approach`` velocity w'_minus in m/s; its elastic
+law, the damping c of the factor g, the ``floor`` of |w'_minus| in m/s, whether g is kept from becoming negative; the
+reduced mass of its two masses in kg. ``preload`` in N is the force of a permanent contact at w = 0: a static load
+balances it.
 """
 
 
@@ -104,6 +113,10 @@ def create_contacts(
     # The smaller clearance asks for the more exact landing. A stop without clearance has no length of its own.
     sizes = np.where((gaps != 0) & np.isfinite(gaps), np.abs(gaps), np.inf).min(axis=1)
     sites["scale"] = np.where(np.isfinite(sizes), sizes, scale)
+    sites["tolerance"] = LANDED * sites["scale"]
+    apart = gaps.min(axis=1) > 0
+    rounded = ROUNDINGS * np.maximum(sites["scale"], scale)
+    sites["tolerance"][apart] = np.minimum(sites["tolerance"], rounded)[apart]
     sites["approach"] = 1.0
     sites["elastic"] = elastic_records(per_site)
     sites["damping"] = [dampings[law] for law in per_site]
@@ -149,18 +162,11 @@ def gap_of(site: Any, side: int) -> float:
 
 
 @kernel
-def resting_side(site: Any) -> int:
-    """The side on which a ``SITE`` may rest in contact, that of a stop without clearance; 0 if it cannot rest.
-
-    A contact with loss that closes from rest needs a floor of the approach velocity, without which its force has no
-    limit.
-    """
-    if site.damping != 0.0 and site.floor == 0.0:
-        return 0
-    if site.clearance == 0.0:
-        return 1
-    if site.clearance_minus == 0.0:
-        return -1
+def landed_side(site: Any, w: float) -> int:
+    """The side, 1 or -1, of a ``SITE`` on whose clearance ``w`` in m has landed, within the tolerance; 0 if on none."""
+    for side in (1, -1):
+        if abs(side * w - gap_of(site, side)) <= site.tolerance:
+            return side
     return 0
 
 

@@ -11,15 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import (
-    LANDED_G,
-    LANDED_W,
-    Extremes,
-    extremes,
-    shortest_beginning,
-    shortest_impact,
-    switching,
-)
+from vipetsc.contact.changes import LANDED_G, Extremes, extremes, shortest_beginning, shortest_impact, switching
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -31,7 +23,7 @@ from vipetsc.contact.law import (
     elastic_energy,
     elastic_force,
     gap_of,
-    resting_side,
+    landed_side,
     side_of,
 )
 
@@ -105,7 +97,7 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
     # that pulls, which is the error of the landing. Only a larger one counts: at x = -tolerance the pull is at most
     # f(tolerance) (1 + c), since g is at most 1 + c; at g = -tolerance it is at most f(depth) times that.
     pull = -reached.smallest_force
-    before_onset = (1.0 + site.damping) * elastic_force(site.elastic, LANDED_W * site.scale)
+    before_onset = (1.0 + site.damping) * elastic_force(site.elastic, site.tolerance)
     beyond_clipping = LANDED_G * elastic_force(site.elastic, episode.indentation)
     if pull > 0.0 and not track.pulls and pull > before_onset + beyond_clipping:
         track.pulls = True
@@ -135,6 +127,12 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
 
 
 @kernel
+def _is_unresolved(site: Any, rate: float) -> bool:
+    """Whether an impact on a ``site`` with the speed ``rate`` in m/s ends within the tolerance of its landing."""
+    return 0.5 * site.reduced_mass * rate * rate <= elastic_energy(site.elastic, site.tolerance)
+
+
+@kernel
 def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
@@ -158,6 +156,8 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
                 if contacts[i].mode == FREE:
                     tracks.sites[i].counts.grazes += 1
                 continue
+            if contacts[i].mode == FREE and _is_unresolved(contacts[i], rate):
+                mode = side_of(mode) * RESTING
             _set_mode(contacts, tracks, i, mode, motion[i], energies, t)
             switched += 1
             break
@@ -166,29 +166,29 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 
 @kernel
 def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
-    """Let site ``i`` rest in contact if it touches a stop without clearance; returns whether it does.
+    """Let site ``i`` rest in contact if it has landed on a stop; returns whether it does.
 
     ``contacts`` (site,) are of dtype ``SITE``; ``motion`` (site, 3) has w, w' and w'' at the time ``t`` in s, and
     ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``. The log must have room. Why sites
     rest: see the package's docstring.
     """
     site = contacts[i]
-    side = resting_side(site)
-    if side == 0 or abs(site.mode) >= PERMANENT or abs(motion[i, 0]) > LANDED_W * site.scale:
+    side = landed_side(site, motion[i, 0])
+    if side == 0 or abs(site.mode) >= PERMANENT:
         return False
     _set_mode(contacts, tracks, i, side * RESTING, motion[i], energies, t)
     return True
 
 
 @kernel
-def _resolved_speed(site: Any, w: float) -> float:
-    """Return the approach speed in m/s below which the landing of a ``site`` at ``w`` in m does not resolve an impact.
+def _approach_speed(site: Any, side: int, w: float, rate: float) -> float:
+    """The speed in m/s with which two masses alone come from the clearance of a ``site`` to ``w`` at ``rate``.
 
-    A site may land up to a tolerance beyond its clearance, and then begins its contact with elastic energy. A slower
-    impact has less energy than that, and a damping divided by its speed would make the contact stiff without bound.
+    They do so without loss, so that mu (w'_minus^2 - w'^2)/2 is the elastic energy at w, mu the reduced mass. A contact
+    begins where it has landed, within the tolerance, or beyond it: after rest, or at the beginning of a run.
     """
-    side = side_of(site.mode)
-    return np.sqrt(2.0 * elastic_energy(site.elastic, side * w - gap_of(site, side)) / site.reduced_mass)
+    stored = elastic_energy(site.elastic, side * w - gap_of(site, side))
+    return np.sqrt(rate * rate + 2.0 * stored / site.reduced_mass)
 
 
 @kernel
@@ -197,17 +197,11 @@ def _begin_episode(site: Any, track: Any, w: float, rate: float, t: float, reste
 
     ``rested`` says that it closes from rest.
     """
-    # A contact that closes from rest has no approach velocity. With rate = 0 the floor takes its place below. A law
-    # without loss does not use it: there w' serves for the duration of the impact.
-    if rested and site.damping != 0.0:
-        rate = 0.0
     side = side_of(site.mode)
+    speed = _approach_speed(site, side, w, rate)
     # Without the floor a grazing onset would make the factor g unbounded.
-    floor = site.floor
-    if site.damping != 0.0 and not rested:
-        floor = max(floor, _resolved_speed(site, w))
-    track.counts.floored += abs(rate) < floor
-    site.approach = side * max(abs(rate), floor)
+    track.counts.floored += speed < site.floor
+    site.approach = side * max(speed, site.floor)
 
     episode = track.episode
     episode.site = track.number
@@ -230,7 +224,7 @@ def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float)
     track.pulls = False
     episode = track.episode
     # A site that comes to rest where it had landed has had no impact.
-    if site.mode != FREE and episode.indentation <= LANDED_W * site.scale:
+    if site.mode != FREE and episode.indentation <= site.tolerance:
         return
     episode.separation = t
     episode.loss += energy
@@ -293,8 +287,7 @@ class ImpactTracker:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices (closed site,).
 
         ``motion`` (site, 2) has w in m and w' in m/s of all sites by their numbers in the log. The onsets of these
-        contacts lie before the run: w'_minus is the speed with which two masses alone come to w at w' without loss, so
-        that mu (w'_minus^2 - w'^2)/2 is the elastic energy, mu the reduced mass.
+        contacts lie before the run.
         """
         self._may_be_open = True
         sites = self.contacts
@@ -307,17 +300,16 @@ class ImpactTracker:
         deep = np.maximum(plus, minus)
 
         # On the clearance itself, to the tolerance of a landing, w' decides.
-        near = LANDED_W * sites["scale"][numbered]
+        near = sites["tolerance"][numbered]
         touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
         closing = touching & (sites["mode"][numbered] == FREE)
         closed = numbered[closing]
         side = side[closing]
-        deep = np.maximum(deep[closing], 0.0)
         rate = rate[closing]
 
         law = sites[closed]
-        stored = np.array([elastic_energy(site["elastic"], x) for site, x in zip(law, deep, strict=True)])
-        speed = np.sqrt(rate**2 + 2 * stored / law["reduced_mass"])
+        motions = zip(law, side.tolist(), w[closing].tolist(), rate.tolist(), strict=True)
+        speed = np.array([_approach_speed(*motion) for motion in motions])
         sites["approach"][closed] = side * np.maximum(speed, law["floor"])
         sites["mode"][closed] = side * CLOSED
         # Where g < 0 the law would pull.

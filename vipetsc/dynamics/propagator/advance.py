@@ -17,9 +17,9 @@ landed, though its switching function does not rise there. That is no change, bu
 would find it again. The next substep is therefore taken without a search, and so short (``BLIND``) that a site which
 does change in it is found beyond its switching point at the start of the one after.
 
-**Rest.** A site whose stop has no clearance can come to the stop again before it has left the tolerance of its last
-landing: the front of a wave passes through all magnitudes below that tolerance, and each of its roots would be landed
-on and switched. Such a site is to rest: the advance ends with ``RESTS`` in place of ``CHANGED``. So is one with a
+**Rest.** A site can come to its stop again before it has left the tolerance of its last landing: the front of a wave
+passes through all magnitudes below that tolerance, and each of its roots would be landed on and switched. Such a site
+is to rest: the advance ends with ``RESTS`` in place of ``CHANGED``. So is one with a
 change at the very start of a substep, but the first in a step may be an accident of rounding: it rests from the second
 one on (``may_rest``). ``vipetsc.contact`` says what force a site at rest has and when it leaves.
 """
@@ -82,14 +82,14 @@ LEAST_GROWTH = 0.2
 MOST_GROWTH = 2.0
 # A substep that could not be collocated is repeated at this fraction of its length.
 CUT = 0.4
-# A landing is good within its tolerance, 1e-10 of the clearance. Newton's steps go on as long as they help, to this
-# fraction of the tolerance, which is the rounding of w.
-LANDING_GOAL = 1e-4
+# A landing is good within its tolerance. Newton's steps go on as long as they help, to this fraction of the tolerance,
+# which for a site with a clearance is fifty times the rounding of w.
+LANDING_GOAL = 0.05
 
 
 @kernel
 def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
-    """Whether a ``site`` that can rest has stayed within the tolerance of a landing in a substep of that ``length``."""
+    """Whether a ``site`` has stayed within the tolerance of a landing in a substep of that ``length``."""
     # Without a length nothing was tried: the site is where it was.
     end = cluster.site_motion[site]
     if length > 0.0:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import LANDED_W
 from vipetsc.contact.law import gap_of
 
 # Lengths below this fraction of the step are rounding: positions in a step are numbers from 0 to 1 with a rounding of
@@ -58,7 +57,7 @@ def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, l
     ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
     meets the clearance nothing can have happened.
     """
-    tolerance = LANDED_W * site.scale
+    tolerance = site.tolerance
     clearance = gap_of(site, side)
     # No stop on this side.
     if clearance == np.inf:
@@ -106,7 +105,7 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
         scale *= length
 
     # Most sites keep away from both clearances: no search.
-    tolerance = LANDED_W * site.scale
+    tolerance = site.tolerance
     if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
 
