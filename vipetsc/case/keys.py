@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, get_args
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
@@ -23,6 +24,7 @@ from vipetsc.wording import with_unit
 TITLE = "Every key of a case file"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INDEX = re.compile(r"\[\d+\]")  # of an entry of a list in a path
+FURTHER_AMPLITUDE = re.compile(r"drive\.more\[(\d+)\]\.amplitude")
 Schema = dict[str, Any]
 
 
@@ -32,8 +34,8 @@ def unit_of(path: str, case: Table) -> str:
     An amplitude of a drive has the unit of its waveform, or m for a wall. The unit is empty for keys without one, and
     where it depends on other keys.
     """
-    drive = case.get("drive", {})
-    if path == "drive.amplitude":
+    drive = _drive_of(path, case)
+    if drive is not None:
         if "end" in drive:
             return "m"
         return _unit_of_waveform(drive.get("waveform") or DEFAULT)
@@ -51,6 +53,18 @@ def unit_of(path: str, case: Table) -> str:
     if " of " in unit or " or " in unit:
         return ""
     return unit
+
+
+def _drive_of(path: str, case: Table) -> Table | None:
+    """Return the table of the drive, or of one of the further drives, whose amplitude has that ``path``; else None."""
+    drive = case.get("drive", {})
+    if path == "drive.amplitude":
+        return drive
+    further = FURTHER_AMPLITUDE.fullmatch(path)
+    if not further:
+        return None
+    drives: list[Table] = drive["more"]
+    return drives[int(further[1]) - 1]
 
 
 def _unit_of_waveform(name: str) -> str:
@@ -78,18 +92,29 @@ def _parameter_of(path: str, case: Table) -> Parameter | None:
 
 def _unit_in(table: type[BaseModel], key: str) -> str:
     """Return the unit of a ``key`` of a ``table``; empty for one without, or for a key that it does not have."""
-    for name, about in table.model_fields.items():
-        if key == (about.alias or name) and isinstance(about.json_schema_extra, dict):
-            return str(about.json_schema_extra.get("unit", ""))
+    about = _field_of(table, key)
+    if about and isinstance(about.json_schema_extra, dict):
+        return str(about.json_schema_extra.get("unit", ""))
     return ""
 
 
+def _field_of(table: type[BaseModel], key: str) -> FieldInfo | None:
+    """Return the field of a ``table`` that a case file writes as ``key``; None for a key that it does not have."""
+    for name, about in table.model_fields.items():
+        if key == (about.alias or name):
+            return about
+    return None
+
+
 def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
-    """The class of the table that ``key`` of a ``table`` is; None where it is no table."""
-    if table is None or key not in table.model_fields:
+    """Return the class of the table that ``key`` of a ``table`` is; None where it is not a table."""
+    if not table:
+        return None
+    about = _field_of(table, key)
+    if not about:
         return None
     # The types within a type, as in ``list[X] | None``, are appended while the loop runs.
-    choices = [table.model_fields[key].annotation]
+    choices = [about.annotation]
     for choice in choices:
         choices += get_args(choice)
         if isinstance(choice, type) and issubclass(choice, BaseModel):
