@@ -95,7 +95,9 @@ class NfrcCase(Case):
         if nfrc.infinite is None:
             update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
-            update["symmetric"] = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
+            is_odd = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
+            # Of a motion with w(t + T/2) = -w(t) and an even number of the drive's periods the drive is none.
+            update["symmetric"] = is_odd and nfrc.subharmonic % 2 == 1
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
@@ -179,11 +181,16 @@ class NfrcCase(Case):
             yield from check_open_ends(sections)
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
-        if nfrc.over == "amplitude" and nfrc.isolas:
+        if nfrc.over == "amplitude" and nfrc.isolas and nfrc.subharmonic == 1:
             remedy = (
                 "looked for over other amplitudes, along which this curve runs itself; omit it, or vary the frequency"
             )
             yield Problem("nfrc.isolas", nfrc.isolas, remedy)
+        if nfrc.harmonics < nfrc.subharmonic:
+            remedy = f"the drive is harmonic {nfrc.subharmonic} of a motion with nfrc.subharmonic periods; increase it"
+            yield Problem("nfrc.harmonics", nfrc.harmonics, remedy)
+        if nfrc.symmetric and nfrc.subharmonic % 2 == 0:
+            yield Problem("nfrc.symmetric", True, "motions of an even number of periods have even harmonics; omit it")
         if not nfrc.smallest_step < nfrc.largest_step:
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
 

@@ -62,8 +62,15 @@ class NfrcTable(Section):
         "further keys of the case with their values (lists or ranges, as in `[sweep]`); curves for each combination",
         None,
     )
-    harmonics: int = described("number of the last harmonic", 41, ge=1, le=2000)
+    harmonics: int = described("number of the last harmonic of the motion", 41, ge=1, le=2000)
     symmetric: bool | None = described("odd harmonics only: w(t + T/2) = -w(t)", None)
+    subharmonic: int = described(
+        "period of the motion over that of the drive; above 1 subharmonic motions are looked for at the places of"
+        " `isolas`",
+        1,
+        ge=1,
+        le=20,
+    )
     isolas: int = described(
         "number of places within the range at which isolated curves (isolas) are looked for; 0: none", 0, ge=0, le=1000
     )

@@ -136,7 +136,8 @@ def lag_of(branch: xr.Dataset) -> np.ndarray:
     """
     name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
     # The mean is harmonic 0.
-    fundamental = branch[name].values[:, 0, 1] + 1j * branch[f"{name}_imaginary"].values[:, 0, 1]
+    order = NfrcCase.of(branch).nfrc.subharmonic
+    fundamental = branch[name].values[:, 0, order] + 1j * branch[f"{name}_imaginary"].values[:, 0, order]
     lag = -np.degrees(np.angle(fundamental))
     # Above -180 by more than rounding: of the two angles of antiphase it is 180.
     return panels.continuous_phase(lag, begin=panels.ROUNDING - 180)

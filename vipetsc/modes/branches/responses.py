@@ -22,7 +22,13 @@ from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import PeriodicProblem, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
-from vipetsc.modes.response.isolated import ClosingSteps, over_amplitudes, places_of, unknown_states
+from vipetsc.modes.response.isolated import (
+    ClosingSteps,
+    over_amplitudes,
+    places_of,
+    subharmonic_states,
+    unknown_states,
+)
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
@@ -116,7 +122,10 @@ class ResponseMethod(Method[Response]):
         places = places_of(states, self.case.nfrc.isolas)
         number = 0
         for p in places.tolist():
-            candidates = over_amplitudes(states, curves_so_far(), p)
+            if states.periods > 1:
+                candidates = subharmonic_states(states, p)
+            else:
+                candidates = over_amplitudes(states, curves_so_far(), p)
             for xi in unknown_states(states, curves_so_far, candidates):
                 number += 1
                 start = Response(xi=xi, next_step=states.options.first_step)
@@ -178,7 +187,7 @@ def _axes(case: NfrcCase) -> Variables:
     orders = np.arange(case.nfrc.harmonics + 1)
     axes = {
         "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
-        "order": variable("order", orders, "1", "harmonic"),
+        "order": variable("order", orders, "1", "harmonic of the motion"),
         "way": variable("way", np.array(FRACTIONS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }

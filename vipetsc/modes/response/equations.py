@@ -128,7 +128,8 @@ class SteadyEquations(ABC):
     """The equations of steady states, for ``Continuation``; a subclass gives the ``linear_motion`` of the drive.
 
     ``balance`` are the equations of the harmonics, ``clearance`` in m is the unit of these, ``parameter`` says what
-    varies. Newton's method ends at a residual of ``tolerance``, over the clearance, or after ``max_newton`` steps.
+    varies. Newton's method ends at a residual of ``tolerance``, over the clearance, or after ``max_newton`` steps. The
+    period of the motion is that of ``periods`` periods of the drive: harmonics are those of Om/periods.
     """
 
     # Hill's determinant tells the stability, and ``TurningSteps`` judges the turn and the correction of a step alone.
@@ -141,8 +142,10 @@ class SteadyEquations(ABC):
         parameter: ContinuationParameter,
         tolerance: float,
         max_newton: int,
+        periods: int = 1,
     ) -> None:
         self.balance = balance
+        self.periods = periods
         self.clearance = clearance
         self.parameter = parameter
         self.tolerance = tolerance
@@ -161,8 +164,12 @@ class SteadyEquations(ABC):
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
         """The stiffnesses (orders, 1, 1) in N/m by which the compliance is shifted for states near ``xi`` (n + 1,)."""
+        return self.balance.shift(self.motion_frequency(xi))
+
+    def motion_frequency(self, xi: np.ndarray) -> float:
+        """The frequency in rad/s of the motion in ``xi`` (n + 1,), of which all others are multiples."""
         omega, _ = self.drive(xi[-1])
-        return self.balance.shift(omega)
+        return omega / self.periods
 
     def drive(self, p: float) -> tuple[float, float]:
         """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
@@ -182,13 +189,14 @@ class SteadyEquations(ABC):
             raise FlowError("the frequency is not positive")
         x = xi[:-1] * self.clearance
         linear = amplitude * self.linear_motion(omega).harmonics
-        return self.balance.residual(x, omega, shift, linear) / self.clearance
+        return self.balance.residual(x, omega / self.periods, shift, linear) / self.clearance
 
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """The derivative (n, n + 1) of the ``residual``."""
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
-        jacobian = self.balance.jacobian(x, omega, shift)
+        base = omega / self.periods
+        jacobian = self.balance.jacobian(x, base, shift)
         if self.parameter.over == "amplitude":
             # The residual is linear in the amplitude: the drive's term for the amplitude 1.
             key = omega, shift.tobytes()
@@ -196,12 +204,12 @@ class SteadyEquations(ABC):
         else:
             ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
             after, before = (self._drive_term(end, amplitude, shift) for end in ends)
-            column = self.balance.rate(x, omega, shift) + (after - before) / (ends[0] - ends[1])
+            column = self.balance.rate(x, base, shift) / self.periods + (after - before) / (ends[0] - ends[1])
         return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
 
     def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
         """The part (n,) of the residual that is due to the drive, in m."""
-        return self.balance.drive_term(omega, shift, amplitude * self.linear_motion(omega).harmonics)
+        return self.balance.drive_term(omega / self.periods, shift, amplitude * self.linear_motion(omega).harmonics)
 
     def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
         """The frame at a state; there is one ``chart``."""

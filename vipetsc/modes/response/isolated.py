@@ -29,6 +29,12 @@ MOST_STATES = 1000
 # Difference of unknowns, over their size, above which two states are not the same. Newton's method leaves a residual of
 # 1e-11 (``nfrc.tolerance``), which near a fold is a much larger error of the unknowns.
 DIFFERENT = 1e-6
+# Sizes, over the unit of displacements, and number of phases within a period of the drive of the subharmonic motions at
+# which Newton's method begins.
+SIZES = np.geomspace(0.1, 10, 9)
+PHASES = 8
+# A state is subharmonic if harmonics of this size, over the motion, are no multiples of the drive's frequency.
+LEAST_SUBHARMONIC = 1e-4
 
 Equations = SteadyStates | StatesOverKey
 Curves = Sequence[Sequence[Response]]
@@ -48,7 +54,8 @@ def unknown_states(
     The curves are asked for before each state, since curves may be added between two states.
     """
     for xi in candidates:
-        if not _is_among(xi, states_on(states, curves_so_far(), float(xi[-1]))):
+        on_curves = states_on(states, curves_so_far(), float(xi[-1]))
+        if not any(_is_among(shifted, on_curves) for shifted in shifted_in_time(states, xi)):
             yield xi
 
 
@@ -63,6 +70,48 @@ def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndar
         if not _is_among(begin, states_found):
             states_found += _states_over_amplitude(states, begin)
     return states_found
+
+
+def subharmonic_states(states: Equations, p: float) -> list[np.ndarray]:
+    """Unknowns (n + 1,) of subharmonic states at the scaled parameter ``p``, of which no shift in time is another one.
+
+    Newton's method begins at the linear motion, and a motion of 1/n of the drive's frequency with each of several sizes
+    and phases, in which the places move as under forces of that frequency.
+    """
+    omega, amplitude = states.drive(p)
+    # Along a curve over a key each value has a lattice of its own.
+    lattice = states if isinstance(states, SteadyStates) else states.states_at(p * states.parameter.scale)
+    linear = amplitude * lattice.linear_motion(omega).harmonics
+    compliance = lattice.compliance.at(np.array([omega / states.periods]))[0]
+    shape = np.linalg.svd(compliance[: len(linear), : len(linear)])[0][:, 0]
+    shape = shape / np.abs(shape).max()
+
+    states_found: list[np.ndarray] = []
+    for size in SIZES * states.clearance:
+        for phase in 2 * np.pi / (PHASES * states.periods) * np.arange(PHASES):
+            guess = linear.copy()
+            guess[:, 1] += size * np.exp(1j * phase) * shape
+            with suppress(*FAILURES):
+                xi = states.at(np.append(states.balance.pack(guess) / states.clearance, p), p)
+                shifted = [other for one in states_found for other in shifted_in_time(states, one)]
+                if _is_subharmonic(states, xi) and not _is_among(xi, shifted):
+                    states_found.append(xi)
+    return states_found
+
+
+def shifted_in_time(states: Equations, xi: np.ndarray) -> list[np.ndarray]:
+    """The unknowns (n + 1,) of a state shifted by 0, 1, 2 ... periods of the drive: all are states as well."""
+    orders = np.arange(states.balance.order + 1)
+    shifts = [np.exp(2j * np.pi * orders * count / states.periods) for count in range(states.periods)]
+    z = states.balance.unpack(xi[:-1])
+    return [np.append(states.balance.pack(z * shift), xi[-1]) for shift in shifts]
+
+
+def _is_subharmonic(states: Equations, xi: np.ndarray) -> bool:
+    """Whether a state has harmonics that are no multiples of the drive's frequency."""
+    z = np.abs(states.balance.unpack(xi[:-1]))
+    z[:, :: states.periods] = 0
+    return bool(np.linalg.norm(z) > LEAST_SUBHARMONIC * np.linalg.norm(xi[:-1]))
 
 
 def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:

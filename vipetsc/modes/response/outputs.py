@@ -32,15 +32,18 @@ SAMPLES_AN_EPISODE = 129
 
 
 class HarmonicMotion(NamedTuple):
-    """A steady state in harmonics: ``omega`` in rad/s, the drive's ``amplitude`` in its unit.
+    """A steady state in harmonics of ``omega`` in rad/s; the drive has the ``amplitude`` in its unit.
+
+    Its frequency is ``drive_order`` times omega.
 
     ``relative`` (pairs, K + 1) are the displacements of the pairs in m, ``forces`` (pairs, K + 1) those on them in N,
     without the static load of contacts that are pressed at rest, and without that of a spring which the linear lattice
-    has in the place of such a contact; ``driving`` (driven masses,) are forces in N at Om; ``episodes`` are the contact
+    has in the place of such a contact; ``driving`` (driven masses,) are forces in N; ``episodes`` are the contact
     episodes. ``incident`` (cells, dofs) in m is an incident wave at the named cells.
     """
 
     omega: float
+    drive_order: int
     amplitude: float
     relative: np.ndarray
     forces: np.ndarray
@@ -101,7 +104,10 @@ class ResponseOutputs:
             ]
             # The forces of a motion leave out the springs of the linear lattice in the place of pressed contacts.
             springs = np.array([stops.spring for stops in self.contacts])
-            first = motion.forces[: len(springs), 1] + springs * motion.relative[: len(springs), 1]
+            first = (
+                motion.forces[: len(springs), motion.drive_order]
+                + springs * motion.relative[: len(springs), motion.drive_order]
+            )
             values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
         if self.walls:
             values |= self._on_walls(motion, field)
@@ -113,12 +119,12 @@ class ResponseOutputs:
         field = np.zeros((orders, len(self.cells), self.compliance.chain.cell.dofs), complex)
         for order in range(orders):
             acting = motion.forces[:, order]
-            if order == 1:
+            if order == motion.drive_order:
                 acting = np.append(acting, motion.driving)
             # Even orders of a symmetric motion have no force, and need no solution.
             if np.any(acting):
                 field[order] = self.compliance.field(order * motion.omega, acting, self.cells)
-        field[1] += motion.incident
+        field[motion.drive_order] += motion.incident
         return field
 
     def _motion(self, motion: HarmonicMotion, harmonics: np.ndarray) -> dict[str, np.ndarray]:
@@ -129,8 +135,8 @@ class ResponseOutputs:
         for power, quantity in enumerate(QUANTITIES):
             series = harmonics * rate**power
             values[f"peak_{quantity}"] = peaks(series)
-            values[f"first_{quantity}"] = magnitude(series[:, 1])
-        values["lag"] = lag(harmonics[:, 1])
+            values[f"first_{quantity}"] = magnitude(series[:, motion.drive_order])
+        values["lag"] = lag(harmonics[:, motion.drive_order])
         if self.pairs:
             # The mean square of a velocity is the sum of those of its harmonics. At rest a quotient is 0/0: NaN.
             speed = magnitude(harmonics * rate)
@@ -138,7 +144,7 @@ class ResponseOutputs:
             source, receiver = np.array(self.pairs).T
             with np.errstate(divide="ignore", invalid="ignore"):
                 values["transmission"] = rms[receiver] / rms[source]
-                values["steady_transmission"] = speed[receiver, 1] / speed[source, 1]
+                values["steady_transmission"] = speed[receiver, motion.drive_order] / speed[source, motion.drive_order]
         return values
 
     def _on_walls(self, motion: HarmonicMotion, field: np.ndarray) -> dict[str, np.ndarray]:
@@ -158,13 +164,13 @@ class ResponseOutputs:
             # A wall that moves by w stretches its springs by u - w.
             for moved, ratio in self._moved:
                 if name == moved:
-                    force[1] -= wall.stiffness.sum() * ratio * motion.amplitude
+                    force[motion.drive_order] -= wall.stiffness.sum() * ratio * motion.amplitude
             forces.append(force)
         harmonics = np.array(forces)
         return {
             "largest_wall_force": peaks(harmonics),
-            "first_wall_force": magnitude(harmonics[:, 1]),
-            "wall_force_lag": lag(harmonics[:, 1]),
+            "first_wall_force": magnitude(harmonics[:, motion.drive_order]),
+            "wall_force_lag": lag(harmonics[:, motion.drive_order]),
         }
 
 

@@ -58,6 +58,7 @@ class StatesOverKey(SteadyEquations):
             parameter=ContinuationParameter(over, amplitude, (high - low) / 2),
             tolerance=options.tolerance,
             max_newton=options.max_newton,
+            periods=first.periods,
         )
 
     def states_at(self, value: float) -> SteadyStates:

@@ -105,6 +105,7 @@ class SteadyStates(SteadyEquations):
             parameter=ContinuationParameter(options.over, fixed, self._scale(clearance)),
             tolerance=options.tolerance,
             max_newton=options.max_newton,
+            periods=options.subharmonic,
         )
 
     def _unit(self) -> float:
@@ -163,14 +164,14 @@ class SteadyStates(SteadyEquations):
         z = np.zeros((pairs, self.options.harmonics + 1), complex)
         if not self.wave:
             # Columns beyond the pairs are those of the driven masses.
-            z[:, 1] = self.compliance.response(omega)[0, :, pairs:] @ self.weights
+            z[:, self.options.subharmonic] = self.compliance.response(omega)[0, :, pairs:] @ self.weights
             return LinearMotion(z, None)
         assert isinstance(self.compliance, WaveCompliance)
         try:
             wave = self.compliance.incident(omega, self.options.band or 0, self.options.towards)
         except ComplianceError as error:
             raise FlowError(str(error)) from None
-        z[:, 1] = wave.relative * self._unit()
+        z[:, self.options.subharmonic] = wave.relative * self._unit()
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
@@ -181,7 +182,8 @@ class SteadyStates(SteadyEquations):
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         z = self.balance.unpack(x)
-        series = self.balance.series(x, omega)
+        base = self.motion_frequency(xi)
+        series = self.balance.series(x, base)
 
         unstable, fastest = perturbations or self._perturbations(xi, series)
         rate = complex(np.nan, np.nan)
@@ -199,7 +201,7 @@ class SteadyStates(SteadyEquations):
             sideband=rate.imag,
             closed=series.closed[:sites],
             episodes=len(series.episodes),
-            truncation=self.balance.truncation(x, omega),
+            truncation=self.balance.truncation(x, base),
             harmonics=z[:sites],
             outputs=self.outputs.of(self._harmonic_motion(omega, amplitude, z, series)),
         )
@@ -212,7 +214,8 @@ class SteadyStates(SteadyEquations):
             # A wave's amplitude counts in clearances of the first site.
             incident = wave.field(self.outputs.cells) * (amplitude * self.clearance)
         return HarmonicMotion(
-            omega=omega,
+            omega=omega / self.periods,
+            drive_order=self.periods,
             amplitude=amplitude,
             relative=z,
             forces=series.forces[:, : z.shape[1]],
@@ -228,10 +231,13 @@ class SteadyStates(SteadyEquations):
         """
         return self._stabilities.get(xi.tobytes(), lambda: self._evaluate_stability(xi))
 
+    def _series(self, xi: np.ndarray) -> ForceSeries:
+        """The forces of the motion in ``xi`` (n + 1,)."""
+        return self.balance.series(xi[:-1] * self.clearance, self.motion_frequency(xi))
+
     def _evaluate_stability(self, xi: np.ndarray) -> Stability:
-        omega, _ = self.drive(xi[-1])
-        series = self.balance.series(xi[:-1] * self.clearance, omega)
-        return self.hill(omega).stability(series)
+        series = self._series(xi)
+        return self.hill(self.motion_frequency(xi)).stability(series)
 
     def _perturbations(self, xi: np.ndarray, series: ForceSeries) -> Perturbations:
         """How many perturbations of a state ``xi`` grow, and which the fastest; ``series`` are its forces."""
@@ -239,32 +245,27 @@ class SteadyStates(SteadyEquations):
         unstable = self.stability(xi).unstable
         if not unstable:
             return Perturbations(unstable, 0j)
-        omega, _ = self.drive(xi[-1])
-        return Perturbations(unstable, self.hill(omega).fastest(series))
+        return Perturbations(unstable, self.hill(self.motion_frequency(xi)).fastest(series))
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
         """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
-        omega, _ = self.drive(xi[-1])
-        series = self.balance.series(xi[:-1] * self.clearance, omega)
-        return float(self.hill(omega).determinants(series, np.array([exponent]))[0].real)
+        hill = self.hill(self.motion_frequency(xi))
+        return float(hill.determinants(self._series(xi), np.array([exponent]))[0].real)
 
     def growing_pairs(self, xi: np.ndarray) -> list[complex]:
         """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
-        omega, _ = self.drive(xi[-1])
-        return self.hill(omega).pairs(self.balance.series(xi[:-1] * self.clearance, omega))
+        return self.hill(self.motion_frequency(xi)).pairs(self._series(xi))
 
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
         """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
 
         Raises NoMotionError without one.
         """
-        omega, _ = self.drive(xi[-1])
-        return self.hill(omega).near(self.balance.series(xi[:-1] * self.clearance, omega), guess)
+        return self.hill(self.motion_frequency(xi)).near(self._series(xi), guess)
 
     def least_growth(self, xi: np.ndarray) -> float:
         """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
-        omega, _ = self.drive(xi[-1])
-        return self.hill(omega).least
+        return self.hill(self.motion_frequency(xi)).least
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
         """Folds, and where the number of growing perturbations changes otherwise."""
@@ -298,7 +299,7 @@ class SteadyStates(SteadyEquations):
         U are NaN unless the lattice is infinite; all four are NaN where nothing comes in.
         """
         wave = self.linear_motion(omega).wave
-        first = forces[:, 1]
+        first = forces[:, self.periods]
         if wave is not None:
             # A wave's amplitude counts in clearances of the first site.
             amplitude = amplitude * self.clearance
@@ -322,12 +323,12 @@ class SteadyStates(SteadyEquations):
                 outgoing = outgoing[::-1]
             powers[:2] = outgoing
             powers[2] = 0.0
-            for k in range(2, forces.shape[1]):
+            for k in [k for k in range(1, forces.shape[1]) if k != self.periods]:
                 # Even orders of a symmetric motion have no force, and need no solution for their waves.
                 if np.any(forces[:, k]):
-                    powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
+                    powers[2] += self.compliance.outgoing(k * omega / self.periods, forces[:, k]).sum()
         # From J a period to W.
-        powers[3] = loss * (omega / (2 * np.pi))
+        powers[3] = loss * (omega / self.periods / (2 * np.pi))
         if not given > 0:
             return np.full(4, np.nan)
         return powers / given

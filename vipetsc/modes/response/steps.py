@@ -107,7 +107,7 @@ def first_state(
     # A stop that touches at rest acts at every amplitude: no small one is linear.
     if any(0 in (stops.plus, stops.minus) for stops in states.forces.contacts):
         guess = _by_weights(states, omega, amplitude, stop)
-    elif _touches(states, amplitude * linear[:, 1]) and not is_ramp:
+    elif _touches(states, amplitude * linear[:, states.periods]) and not is_ramp:
         guess = _by_amplitudes(states, omega, amplitude, stop)
 
     return _begun(states, np.append(guess, low))
