@@ -55,28 +55,29 @@ def refined(few: SteadyStates, many: SteadyStates, xi: np.ndarray) -> np.ndarray
 
 
 def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: float | np.ndarray = 0.0):
-    """Displacement in m and velocity in m/s of a steady state at the ``phase`` (...) of its drive: (cell, dof, ...)."""
+    """Displacement in m and velocity in m/s of a state at the ``phase`` (...) of its period: (cell, dof, ...)."""
     omega, amplitude = states.drive(xi[-1])
     unknowns = xi[:-1] * states.clearance
     # Motions that are symmetric about zero have no mean.
     first = 1 if states.options.symmetric else 0
     orders = np.arange(first, states.balance.unpack(unknowns).shape[1])
 
-    # Contacts act on the lattice with every harmonic, the drive with the first one only.
-    forces = states.balance.series(unknowns, omega).forces
+    # Contacts act on the lattice with every harmonic, the drive with one of them only.
+    base = omega / states.periods
+    forces = states.balance.series(unknowns, base).forces
     displacement = 0.0
     velocity = 0.0
     for order in orders:
         acting = forces[:, order]
-        if order == 1 and not states.wave:
+        if order == states.periods and not states.wave:
             acting = np.append(acting, amplitude * states.weights)
-        field = states.compliance.field(order * omega, acting, cells)
-        if order == 1 and states.wave:
+        field = states.compliance.field(order * base, acting, cells)
+        if order == states.periods and states.wave:
             field = field + states.linear_motion(omega).wave.field(cells) * amplitude * states.clearance
 
         field = np.multiply.outer(field, np.exp(1j * order * phase))
         displacement = displacement + field.real
-        velocity = velocity + (1j * order * omega * field).real
+        velocity = velocity + (1j * order * base * field).real
     return displacement, velocity
 
 

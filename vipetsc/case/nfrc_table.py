@@ -77,6 +77,9 @@ class NfrcTable(Section):
     isola_reach: float = described(
         "factor up to which amplitudes are larger or smaller that are followed to isolated curves", 10.0, gt=1, le=1e3
     )
+    switch: Annotated[list[Literal["branch-point", "period-doubling"]], AfterValidator(once)] = described(
+        "kinds of special points at which the curves that cross are followed, with the harmonics that they need", []
+    )
     special_points: Literal["stability", "all"] = described(
         "special points other than folds: where states become stable or unstable, or all where the number"
         " of growing perturbations changes",

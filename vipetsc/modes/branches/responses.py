@@ -1,6 +1,7 @@
 """Curves of steady states under a drive: the verb ``nfrc``."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -10,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case.keys import unit_of
-from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.nfrc import NfrcCase, ResponseCurve
 from vipetsc.case.response_measures import FRACTIONS, WALLS, response_measures, value_of
 from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
@@ -20,10 +21,12 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import CrossingBranch, Method, value_kind
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import PeriodicProblem, SpecialKind
+from vipetsc.modes.response.branch_switching import crossing_case, first_crossing
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.isolated import (
     ClosingSteps,
+    is_on,
     over_amplitudes,
     places_of,
     subharmonic_states,
@@ -31,6 +34,7 @@ from vipetsc.modes.response.isolated import (
 )
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
+from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
@@ -64,13 +68,22 @@ class ResponseMethod(Method[Response]):
         return list(range(len(case.every_curve())))
 
     def new_branch(self, name: str) -> Branch[Response]:
-        """A curve without states, or an isolated one near it."""
-        base, isola, number = name.partition(ISOLA)
+        """A curve without states, an isolated one near it, or one that crosses it."""
+        base = name
+        case_of = None
+        for kind in self.case.nfrc.switch:
+            base, crosses, _ = base.partition(f"-{kind}-")
+            if crosses:
+                case_of = kind
+        base, isola, number = base.partition(ISOLA)
         curve = next(curve for curve in self.curves if curve.name == base)
+        case = curve.case
+        if case_of is not None:
+            case = crossing_case(case, case_of)
 
-        about: dict[str, Any] = {"over": curve.case.nfrc.over, "restitution": curve.restitution}
-        if curve.case.nfrc.varies_key:
-            about["unit"] = unit_of(curve.case.nfrc.over, curve.case.model_dump(by_alias=True, exclude_none=True))
+        about: dict[str, Any] = {"over": case.nfrc.over, "restitution": curve.restitution}
+        if case.nfrc.varies_key:
+            about["unit"] = unit_of(case.nfrc.over, case.model_dump(by_alias=True, exclude_none=True))
         if isola:
             about["isola"] = number
         if curve.values:
@@ -78,11 +91,11 @@ class ResponseMethod(Method[Response]):
 
         return Branch(
             name=name,
-            case=curve.case.to_toml(),
-            dofs=len(curve.case.model().chain.sites),
+            case=case.to_toml(),
+            dofs=len(case.model().chain.sites),
             kind=self.kind,
             about=about,
-            extra=_axes(curve.case),
+            extra=_axes(case),
         )
 
     def name(self, job: int) -> str:
@@ -91,14 +104,17 @@ class ResponseMethod(Method[Response]):
 
     def problem(self, job: int) -> SteadyStates | StatesOverKey:
         """The equations of a curve."""
-        curve = self.curves[job]
-        options = curve.case.nfrc
+        return self._equations(self.curves[job], self.curves[job].case)
+
+    def _equations(self, curve: ResponseCurve, case: NfrcCase) -> SteadyStates | StatesOverKey:
+        """The equations of a ``curve``, with the harmonics of a ``case``."""
+        options = case.nfrc
         if options.varies_key:
-            keyed = KeyedCase(curve.case, curve.restitution, curve.fixed)
+            keyed = KeyedCase(case, curve.restitution, curve.fixed)
             return StatesOverKey(keyed.at, options.over, curve.fixed, options)
         if self._compliance is None or self._compliance[0] != curve.member:
-            self._compliance = curve.member, compliance_of(curve.case)
-        return SteadyStates(curve.case, curve.restitution, curve.fixed, compliance=self._compliance[1])
+            self._compliance = curve.member, compliance_of(case)
+        return SteadyStates(case, curve.restitution, curve.fixed, compliance=self._compliance[1])
 
     def start(self, problem: PeriodicProblem[Response], job: int, stop: StopRequest | None = None) -> Response:
         """The state at the beginning of the range."""
@@ -111,6 +127,44 @@ class ResponseMethod(Method[Response]):
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
     def further(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
+        """The isolated curves near a curve, and those that cross it or one of these at ``nfrc.switch``."""
+        yield from self._isolas(branch, followed)
+        curve = next(curve for curve in self.curves if curve.name == branch.name)
+        for other in [branch, *followed]:
+            for kind in self.case.nfrc.switch:
+                for number, point in enumerate((p for p in other.points if p.kind == kind), 1):
+                    yield from self._crossing(curve, point, f"{other.name}-{kind}-{number}", followed)
+
+    def _crossing(
+        self, curve: ResponseCurve, point: Response, name: str, followed: Sequence[Branch[Response]]
+    ) -> Iterator[CrossingBranch]:
+        """The curve that crosses at a special ``point``, in both directions unless they are the same motions.
+
+        Those are shifted by a period of the drive at a period doubling, mirror images where a symmetry is lost. A curve
+        that crosses a second time is not followed again.
+        """
+        old = self._equations(curve, curve.case)
+        case = crossing_case(curve.case, point.kind)
+
+        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> ClosingSteps:
+            assert isinstance(problem, SteadyStates | StatesOverKey)
+            return ClosingSteps(problem, max(self.case.nfrc.points - 1 - done, 0), start)
+
+        def start(side: int) -> tuple[SteadyStates | StatesOverKey, Response]:
+            return first_crossing(old, point, self._equations(curve, case), side)
+
+        names = {1: name}
+        if point.kind == BRANCH_POINT and not curve.case.nfrc.symmetric:
+            names[-1] = f"{name}-back"
+        for side, of_side in names.items():
+            # Where no state is found the curve's file says why.
+            with suppress(*FAILURES):
+                states, first = start(side)
+                if is_on(states, [other.points for other in followed], first.xi):
+                    continue
+            yield CrossingBranch(of_side, partial(start, side), rule)
+
+    def _isolas(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
         """The isolated curves that are found near a curve, in both directions where they are not closed."""
         if not (self.case.nfrc.isolas and branch.complete):
             return

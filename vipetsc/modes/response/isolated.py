@@ -54,8 +54,7 @@ def unknown_states(
     The curves are asked for before each state, since curves may be added between two states.
     """
     for xi in candidates:
-        on_curves = states_on(states, curves_so_far(), float(xi[-1]))
-        if not any(_is_among(shifted, on_curves) for shifted in shifted_in_time(states, xi)):
+        if not is_on(states, curves_so_far(), xi):
             yield xi
 
 
@@ -93,18 +92,33 @@ def subharmonic_states(states: Equations, p: float) -> list[np.ndarray]:
             guess[:, 1] += size * np.exp(1j * phase) * shape
             with suppress(*FAILURES):
                 xi = states.at(np.append(states.balance.pack(guess) / states.clearance, p), p)
-                shifted = [other for one in states_found for other in shifted_in_time(states, one)]
-                if _is_subharmonic(states, xi) and not _is_among(xi, shifted):
+                others = [image for one in states_found for image in images(states, one)]
+                if _is_subharmonic(states, xi) and not _is_among(xi, others):
                     states_found.append(xi)
     return states_found
 
 
-def shifted_in_time(states: Equations, xi: np.ndarray) -> list[np.ndarray]:
-    """The unknowns (n + 1,) of a state shifted by 0, 1, 2 ... periods of the drive: all are states as well."""
+def images(states: Equations, xi: np.ndarray) -> list[np.ndarray]:
+    """The unknowns (n + 1,) of a state, and of all others that a symmetry makes of it.
+
+    These are shifts in time by 1, 2, ... periods of the drive. Where all forces are odd a shift by half a period with
+    the opposite sign gives a state, too.
+    """
     orders = np.arange(states.balance.order + 1)
-    shifts = [np.exp(2j * np.pi * orders * count / states.periods) for count in range(states.periods)]
     z = states.balance.unpack(xi[:-1])
-    return [np.append(states.balance.pack(z * shift), xi[-1]) for shift in shifts]
+    is_odd = states.balance.forces.odd
+    moved = []
+    for halves in range(0, 2 * states.periods, 2 - is_odd):
+        factor = (-1) ** halves * np.exp(1j * np.pi * orders * halves / states.periods)
+        moved.append(np.append(states.balance.pack(z * factor), xi[-1]))
+    return moved
+
+
+def is_on(states: Equations, curves: Curves, xi: np.ndarray) -> bool:
+    """Whether a state, or one that a symmetry makes of it, is on one of the ``curves`` with the same unknowns."""
+    of_same = [points for points in curves if points and len(points[0].xi) == len(xi)]
+    on_curves = states_on(states, of_same, float(xi[-1]))
+    return any(_is_among(image, on_curves) for image in images(states, xi))
 
 
 def _is_subharmonic(states: Equations, xi: np.ndarray) -> bool:
@@ -195,8 +209,8 @@ class ClosingSteps(TurningSteps):
 
     def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
         """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
-        if returned(self.first, before, point):
-            first = self.first
+        first = self.first
+        if returned(first, before, point):
             last = Response(
                 xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
             )
