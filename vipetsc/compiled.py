@@ -9,6 +9,7 @@ in the user's cache where these cannot be written, or in NUMBA_CACHE_DIR.
 import hashlib
 import logging
 import os
+import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -114,18 +115,27 @@ def sources(room: str) -> str:
 def clear_if_changed(folder: Path, room: str) -> None:
     """Remove the code in a ``folder`` of the cache that was compiled from other sources of a ``room``; once a process.
 
-    So is an empty file, which numba could not read: a machine that lost its power leaves such files.
+    So is a file that is cut off, which numba could not read: a machine that lost its power leaves such files.
     """
     note = folder / NOTE
     # Other processes may do the same at the same time, and a folder of another user cannot be written.
     with suppress(OSError):
         is_current = note.exists() and note.read_text() == sources(room)
         for code in folder.glob("*.nb[ci]"):
-            if not is_current or code.stat().st_size == 0:
+            if not is_current or not _is_whole(code):
                 code.unlink(missing_ok=True)
         if not is_current:
             note.write_text(sources(room))
             _announce()
+
+
+def _is_whole(code: Path) -> bool:
+    """Whether a file of the cache has its end: numba writes pickles, and the last byte of a pickle is a full stop."""
+    with code.open("rb") as file:
+        if not file.seek(0, os.SEEK_END):
+            return False
+        file.seek(-1, os.SEEK_END)
+        return file.read() == pickle.STOP
 
 
 @cache

@@ -190,25 +190,46 @@ class Recorder(Observer):
         of_sites = [self._losses[: self._held]]
         if FORCES in self._of_sites:
             of_sites.append(self._forces[: self._held])
-        rank_part = sites, np.array(of_sites), episodes, self._fields[:, : self._rows]
-        gathered: list[Any] | None = [rank_part]
-        if comm.size > 1:
-            gathered = comm.gather(rank_part)
+        gathered = comm.gather((sites, np.array(of_sites), episodes))
+        all_cells = self._gather_fields()
         if gathered is None:
             return {}
 
-        all_sites, all_of_sites, all_episodes, all_fields = zip(*gathered, strict=True)
+        all_sites, all_of_sites, all_episodes = zip(*gathered, strict=True)
         numbers = np.concatenate(all_sites)
         order = np.argsort(numbers)
         log = np.concatenate(all_episodes)
         log["site"] += 1  # counted from 1
-        # One rank's fields may be large: they are not copied.
-        all_cells = all_fields[0]
-        if len(all_fields) > 1:
-            all_cells = np.concatenate(all_fields, axis=3)
         chunk = {"impacts": log}
         chunk |= dict(zip(self._of_sites, np.concatenate(all_of_sites, axis=2)[:, :, order], strict=True))
         return chunk | dict(zip(recording.fields, all_cells, strict=True))
+
+    def _gather_fields(self) -> np.ndarray:
+        """The fields (field, row, dof, cell) of the chunk of all ranks, on rank 0; the others return their own."""
+        comm = self.setup.layout.comm
+        part = self._fields[:, : self._rows]
+        # One rank's fields may be large: they are not copied.
+        if comm.size == 1:
+            return part
+        part = np.ascontiguousarray(part)
+        counts = comm.gather(part.shape[3])
+        if counts is None:
+            comm.Send(part, 0)
+            return part
+
+        # What comes from a rank is put where its cells are, without a copy in between.
+        fields = np.empty((*part.shape[:3], sum(counts)))
+        fields[..., : counts[0]] = part
+        first = counts[0]
+        for rank, count in enumerate(counts[1:], start=1):
+            if fields.size and count:
+                cells = MPI.DOUBLE.Create_subarray(fields.shape, [*part.shape[:3], count], [0, 0, 0, first]).Commit()
+                comm.Recv([fields, 1, cells], source=rank)
+                cells.Free()
+            else:
+                comm.Recv(np.empty(0), source=rank)
+            first += count
+        return fields
 
     def finish(self, stopped: bool) -> None:
         if not stopped:

@@ -164,6 +164,22 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
             file[name] = values
 
 
+def read_arrays(path: Path, wanted: Collection[str]) -> dict[str, np.ndarray]:
+    """Read the arrays ``wanted`` of a file that ``save_arrays`` wrote; raises OSError as ``StoredArrays``."""
+    with _opened(path) as file:
+        return {name: np.asarray(file[name][()]) for name in wanted}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """Open the file to be read; an error of HDF5, or of an array that is missing, becomes an OSError with the path."""
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except (OSError, RuntimeError, KeyError) as error:
+        raise OSError(f"{path} cannot be read: {error}") from error
+
+
 class StoredArrays(Mapping[str, np.ndarray]):
     """The arrays in a file that ``save_arrays`` wrote, each read when it is asked for.
 
@@ -173,32 +189,18 @@ class StoredArrays(Mapping[str, np.ndarray]):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._names: list[str] = []
-        with self._opened() as file:
+        with _opened(path) as file:
             file.visititems(self._note)
 
     def _note(self, name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Dataset):
             self._names.append(name)
 
-    @contextmanager
-    def _opened(self) -> Iterator[h5py.File]:
-        try:
-            with h5py.File(self.path) as file:
-                yield file
-        except (OSError, RuntimeError, KeyError) as error:
-            raise OSError(f"{self.path} cannot be read: {error}") from error
-
     def __getitem__(self, name: str) -> np.ndarray:
-        with self._opened() as file:
-            return np.asarray(file[name][()])
+        return read_arrays(self.path, [name])[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
-
-    def only(self, wanted: Collection[str]) -> dict[str, np.ndarray]:
-        """Read the arrays ``wanted``."""
-        with self._opened() as file:
-            return {name: np.asarray(file[name][()]) for name in wanted}

@@ -180,15 +180,17 @@ def log_columns(log: np.ndarray) -> Arrays:
     return columns
 
 
-def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
-    """Copy the variable ``name``, a field or one over sites, from all chunks to ``dataset``.
+def put_chunks(datasets: Mapping[str, h5py.Dataset], output: Chunks) -> None:
+    """Copy the variables to which ``datasets`` belong, fields or over sites, from all chunks.
 
     A field becomes (sample, cell, dof), what is over sites (sample, site).
     """
-    first = 0
+    first = dict.fromkeys(datasets, 0)
     for number in range(output.count):
-        # Chunks have cells last, as the compiled engine fills them; the file has them after the samples.
-        values = np.moveaxis(output.read(number, [name])[name], -1, 1)
-        if values.size:
-            dataset[first : first + len(values)] = values
-        first += len(values)
+        arrays = output.read(number, datasets)
+        for name, dataset in datasets.items():
+            # Chunks have cells last, as the compiled engine fills them; the file has them after the samples.
+            values = np.moveaxis(arrays[name], -1, 1)
+            if values.size:
+                dataset[first[name] : first[name] + len(values)] = values
+            first[name] += len(values)

@@ -26,7 +26,16 @@ import h5py
 import numpy as np
 
 from vipetsc.io import chunks
-from vipetsc.io.atomic import Arrays, StoredArrays, atomic_write, discard, hdf5_file, save_arrays, write_text
+from vipetsc.io.atomic import (
+    Arrays,
+    StoredArrays,
+    atomic_write,
+    discard,
+    hdf5_file,
+    read_arrays,
+    save_arrays,
+    write_text,
+)
 from vipetsc.io.chunks import Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
@@ -115,7 +124,7 @@ class RunFolder:
 
     def read(self, number: int, wanted: Collection[str]) -> Arrays:
         """Return the arrays ``wanted`` of chunk ``number``."""
-        return StoredArrays(self._chunk(number)).only(wanted)
+        return read_arrays(self._chunk(number), wanted)
 
     def save_state(self, state: Arrays) -> None:
         """Store this rank's checkpoint after the last chunk, and keep the one before; all ranks must call it.
@@ -202,6 +211,7 @@ class RunFolder:
         put_dataset(file, small)
         columns = chunks.log_columns(log)
         sizes = {**small.sizes, "episode": len(log)}
+        in_chunks = {}
         for name in (*columns, *self.recording.of_sites, *self.recording.fields):
             description = chunks.described(name, small)
             dtype = np.dtype(float)
@@ -211,9 +221,10 @@ class RunFolder:
             shape = [sizes[dim] for dim in description.dims]
             dataset = add_variable(file, name, description.dims, shape, dtype, about)
             if name not in columns:
-                chunks.put_chunks(dataset, self, name)
+                in_chunks[name] = dataset
             elif len(log):
                 dataset[...] = columns[name]
+        chunks.put_chunks(in_chunks, self)
 
 
 class FieldMemory:
