@@ -10,7 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.conftest import small_case
 from tests.faults.scenarios import PLAIN, SCENARIOS, TEAM, prepare, words_of
+from vipetsc.dynamics import simulate
 from vipetsc.figures import style
 from vipetsc.figures.registry import draw, figure_names
 from vipetsc.figures.sweep_members import Files
@@ -101,3 +103,18 @@ def test_figures_of_spoilt_results_are_drawn_or_refused_in_a_sentence(in_process
             found.append(f"{figure} with {kind} in {file} {name}: {type(error).__name__}: {error}")
         shutil.copy(whole / file, folder / file)
     assert found == []
+
+
+@pytest.mark.parametrize("kind", ["nan", "all nan"])
+@pytest.mark.parametrize("words", ["analyse", "plot", "plot --fig spacetime", "plot --movie --format gif"])
+def test_a_run_with_nan_in_its_field_is_measured_or_refused_in_a_sentence(in_process, tmp_path, words, kind):
+    """A refusal names the file and the variable; what can be drawn or measured of the rest is."""
+    out = tmp_path / "out"
+    simulate(small_case(), out)
+    spoil(out / "run.h5", "velocity", kind)
+    verb, *options = words.split()
+    ended = in_process(verb, out, *options)
+    assert "Traceback" not in ended.stderr
+    assert ended.returncode == 0 or (ended.returncode == 2 and "run.h5 holds numbers" in ended.stderr)
+    if kind == "all nan" and "--movie" not in words:
+        assert ended.returncode == 2

@@ -18,13 +18,11 @@ from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.swept_axes import SweptAxis, in_pi
-from vipetsc.io.errors import ResultFileError
-from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.netcdf import naming_spoilt, open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
 from vipetsc.lattice import waves_at
 from vipetsc.lattice.chain import cells_between
-from vipetsc.register import PartError
-from vipetsc.wording import counted, shortened
+from vipetsc.wording import counted
 
 AMPLITUDE = "amplitude"
 SITES = "contacts.sites"
@@ -47,24 +45,9 @@ class Files(ExitStack):
             self._opened[path] = self.enter_context(opener(path))
         return cast(T, self._opened[path])
 
-    @contextmanager
-    def naming_spoilt(self) -> Iterator[None]:
-        """Name what is not finite in the results, or empty, where an error in the block may come from it.
-
-        Raises ResultFileError then; errors of other origin stay as they are.
-        """
-        try:
-            yield
-        except (OSError, KeyError, ResultFileError, PartError):
-            raise
-        except Exception as error:
-            reasons = [
-                text for opened in self._opened.values() for data in datasets_of(opened) for text in _spoilt(data)
-            ]
-            if not reasons:
-                raise
-            text = f"{'; '.join(reasons)}: there is no picture of it ({type(error).__name__}: {error})"
-            raise ResultFileError(text) from error
+    def naming_spoilt(self) -> AbstractContextManager[None]:
+        """Name results that are not finite, or empty, where an error in the block may come from them."""
+        return naming_spoilt(lambda: [data for opened in self._opened.values() for data in datasets_of(opened)])
 
 
 def datasets_of(opened: Any) -> list[xr.Dataset]:
@@ -72,20 +55,6 @@ def datasets_of(opened: Any) -> list[xr.Dataset]:
     if isinstance(opened, MemberRun):
         return [opened.run, opened.analysis]
     return [opened]
-
-
-def _spoilt(data: xr.Dataset) -> list[str]:
-    """Return a sentence on variables of ``data`` that hold numbers that are not finite, or nothing; [] if none does."""
-    file = data.encoding.get("source", "the file")
-    floats = [(name, values) for name, values in data.variables.items() if values.dtype.kind in "fc"]
-    infinite = [str(name) for name, values in floats if not np.isfinite(values).all()]
-    empty = [str(name) for name, size in data.sizes.items() if size == 0]
-    sentences = []
-    if infinite:
-        sentences.append(f"{file} holds numbers that are not finite in {shortened(infinite)}")
-    if empty:
-        sentences.append(f"{file} holds no {shortened(empty)}")
-    return sentences
 
 
 class Sweeps(list[xr.Dataset]):

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
+from vipetsc.register import PartError
 from vipetsc.wording import shortened, system_reason
 
 # xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from xarray.backends import CachingFileManager
 
+MAY_BE_EMPTY = ("site", "episode")  # dimensions of runs without sites, or without contact
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
 Node: TypeAlias = "h5py.h5g.GroupID | h5py.h5d.DatasetID"
@@ -252,6 +255,39 @@ def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFile
     if isinstance(error, KeyError):
         reason = "it lacks the coordinate of a dimension of its variables"
     return UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}")
+
+
+@contextmanager
+def naming_spoilt(opened: Callable[[], Iterable[xr.Dataset]]) -> Iterator[None]:
+    """Name what is not finite in results, or empty, where an error in the block may come from it.
+
+    ``opened`` returns the results that the block has opened. Raises ResultFileError then; errors about files, names of
+    figures and users' modules stay as they are, and so does any other where all results are finite.
+    """
+    try:
+        yield
+    except (OSError, KeyError, ResultFileError, PartError):
+        raise
+    except Exception as error:
+        reasons = [text for data in opened() for text in _spoilt(data)]
+        if not reasons:
+            raise
+        remedy = "compute the results again"
+        raise ResultFileError(f"{'; '.join(reasons)} ({type(error).__name__}: {error}); {remedy}") from error
+
+
+def _spoilt(data: xr.Dataset) -> list[str]:
+    """Sentences on variables of ``data`` that hold numbers that are not finite, and on dimensions without entries."""
+    file = data.encoding.get("source", "the file")
+    floats = [(name, values) for name, values in data.variables.items() if values.dtype.kind in "fc"]
+    infinite = [str(name) for name, values in floats if not np.isfinite(values).all()]
+    empty = [str(name) for name, size in data.sizes.items() if size == 0 and name not in MAY_BE_EMPTY]
+    sentences = []
+    if infinite:
+        sentences.append(f"{file} holds numbers that are not finite in {shortened(infinite)}")
+    if empty:
+        sentences.append(f"{file} holds no {shortened(empty)}")
+    return sentences
 
 
 def _refuse_other_kinds(path: str | Path, kind: str, missing: Sequence[str]) -> None:

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, FolderError, origin
-from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.netcdf import naming_spoilt, open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
@@ -153,7 +153,10 @@ def measure_run(
             arrival = linear.arrival_at(first_site_cell(case))
         else:
             arrival = find_arrival()
-        analysis = analyse(run, measures, arrival=arrival, options=options, comm=comm)
+        # Of several ranks one may fail alone: its error has to end them all.
+        alone = comm.size == 1
+        with naming_spoilt(lambda: [run]) if alone else nullcontext():
+            analysis = analyse(run, measures, arrival=arrival, options=options, comm=comm)
 
     def write() -> Path:
         path = folder / "analysis.h5"

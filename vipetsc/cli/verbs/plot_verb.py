@@ -127,7 +127,7 @@ def film(
     """
     from vipetsc.figures import movie, movie_frames
     from vipetsc.figures.style import rc_style
-    from vipetsc.io.netcdf import open_netcdf
+    from vipetsc.io.netcdf import naming_spoilt, open_netcdf
     from vipetsc.io.read import open_run
 
     if pictures.source != "run":
@@ -164,9 +164,10 @@ def film(
         # Only after all options were checked: measuring writes a file, and bad input must write none.
         prepare(pictures, [folder])
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-        stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)
         paths = [folder / "figures" / f"movie-{quantity}.{name}" for name in MOVIE_FORMATS if name in formats]
-        return movie.write_movie(stage, shot.rate, paths), missing
+        with naming_spoilt(lambda: [run, analysis]):
+            stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)
+            return movie.write_movie(stage, shot.rate, paths), missing
 
 
 VERB = PlainVerb(
