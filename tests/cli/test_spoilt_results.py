@@ -28,12 +28,10 @@ SOURCES = {
     "nfrc": "branches",
     "design": "design",
     "law": "law",
-    "predict": "prediction",
-    "optimise": "optimum",
     "identify": "identification",
 }
 SPOILT = ("nan", "all nan", "infinite", "empty")
-TRIALS = 20  # of the results of a source
+TRIALS = 8  # of the results of a source; all variables, kinds and figures take minutes a source
 
 
 def spoil(path: Path, name: str, kind: str) -> None:
