@@ -101,7 +101,7 @@ def record_type(values: Any) -> RecordType:
             kind: Any = record_type(value)
             size = kind.length
         elif isinstance(value, np.ndarray):
-            kind = types.Array(numba.from_dtype(value.dtype), value.ndim, "C")
+            kind = _array_type(value.dtype, value.ndim)
             size = 1 + value.ndim
         else:
             kind = _number_type(value)
@@ -109,7 +109,17 @@ def record_type(values: Any) -> RecordType:
         fields.append(Field(name, kind, length))
         length += size
         _declare(name)
-    return RecordType(type(values).__name__, tuple(fields), length)
+    return _record_type(type(values).__name__, tuple(fields), length)
+
+
+# A run makes some twenty records, and a fit a thousand runs: types are made once.
+_record_type = cache(RecordType)
+
+
+@cache
+def _array_type(dtype: np.dtype, dimensions: int) -> Any:
+    """The type of an array of so many ``dimensions`` in a record."""
+    return types.Array(numba.from_dtype(dtype), dimensions, "C")
 
 
 def _number_type(value: Any) -> Any:

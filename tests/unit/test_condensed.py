@@ -11,13 +11,9 @@ from scipy.integrate import trapezoid
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Chain, Contact, DenseCompliance, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.modes.balance import conservative
-from vipetsc.modes.balance.arcs import arcs
-from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.departures import fraction_closed
-from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
-from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.shifted_compliance import ShiftedCompliance
+from vipetsc.modes.balance.conservative import ConservativeMotions, HarmonicFrame, fraction_closed
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance, ShiftedCompliance
+from vipetsc.modes.balance.harmonics import SiteForces, arcs
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, NoMotionError

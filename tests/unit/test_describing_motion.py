@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vipetsc.lattice.cell import Spring
-from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
+from vipetsc.modes.balance.conservative import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.problem import ContinuationError
 

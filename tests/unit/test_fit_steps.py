@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from vipetsc.identification.least_residuals import _Step, least_residuals
-from vipetsc.identification.precision import FINAL, GROWING, TOLERANCE, Precision
+from vipetsc.identification.growing_windows import FINAL, GROWING, TOLERANCE, Precision, _Step, least_residuals
 
 TIMES = np.linspace(0, 1, 20)
 DATA = 2 * np.exp(-3 * TIMES) + 0.01 * np.random.default_rng(2).standard_normal(20)

@@ -265,7 +265,7 @@ def test_a_table_that_cannot_be_written_costs_no_branch(tmp_path, monkeypatch, c
     def refuse(*_):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr("vipetsc.modes.branches.follower.restore_table", refuse)
+    monkeypatch.setattr("vipetsc.modes.branches.follow.restore_table", refuse)
     followed = []
     branch = follow(tmp_path, lambda *_: followed.append(1), resume=True, **short)
     assert not followed

@@ -11,11 +11,8 @@ from tests.conftest import run_of
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.identification.clearance_search import other_contacts
-from vipetsc.identification.growing_windows import Fit, GrowingWindows, Window
-from vipetsc.identification.precision import Precision
-from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
-from vipetsc.identification.whiteness import ljung_box
+from vipetsc.identification.growing_windows import Fit, GrowingWindows, Precision, Window, other_contacts
+from vipetsc.identification.uncertainty import errors_with_sensor, ljung_box, quantile, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.identification import Identification, read_measured_records, run_identification

@@ -18,11 +18,11 @@ model are nearly right: the fit begins in the right valley. Where a longer windo
 added. A weak prior holds the parameters that a window does not determine near their last values; the fit over the whole
 record has none.
 
-A record that begins while the lattice moves has 2n more unknowns (``initial_state``). They are amplitudes of modes,
+A record that begins while the lattice moves has 2n more unknowns (``misfit``). They are amplitudes of modes,
 with a wide prior about rest that the last fit keeps, since a few sensors may not determine all of them. The first
 window has more data than unknowns.
 
-**3. A clearance that is not reached** (``clearance_search``). The misfit does not depend on the clearance of a stop
+**3. A clearance that is not reached** (``growing_windows``). The misfit does not depend on the clearance of a stop
 that the model does not meet: no derivative leads to a contact that the model lacks, and none leads out of a contact
 that the lattice did not have. Each clearance is therefore tried at some fractions of the motion without its stop,
 within reach and just out of reach, and kept where that explains the record better. At the end, the largest motion
@@ -33,7 +33,7 @@ method of SciPy within the bounds (Branch, Coleman and Li 1999), in the logarith
 not given is estimated from the residuals of each channel, and the fit is repeated with it: repeated until nothing
 changes, this leads to the maximum of the likelihood.
 
-**5. Uncertainty** (``uncertainty``, ``whiteness``). With the Jacobian J of the residuals over the noise, (J^T J)^-1 is
+**5. Uncertainty** (``uncertainty``). With the Jacobian J of the residuals over the noise, (J^T J)^-1 is
 the covariance of all coordinates. Its block for the parameters is their covariance with the initial states left free.
 The singular values s of J are 1 over the standard errors along its right singular vectors. An error of more than half a
 unit of a coordinate, a factor of 1.6, counts as not determined. A profile (``misfit_profile``) holds one parameter at

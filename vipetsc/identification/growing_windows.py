@@ -7,24 +7,258 @@ A window is the beginning of every record up to some time; the last one is all o
 3. all parameters, to the whole records with noise that is estimated from the residuals where none is given, twice;
 4. steps 2 and 3 once more from there.
 
-Section 2 of the package's docstring says why windows grow, section 3 why clearances are also tried.
+Section 2 of the package's docstring says why windows grow.
+
+Each fit is one of least squares by SciPy's trust region within bounds (``least_residuals``). SciPy asks for the
+Jacobian after every step that is taken, and checks only then whether the fit ends with that step. A fit of two or three
+steps computes a third of its Jacobians for nothing, and each costs several times as much as a motion. Here the same
+check comes first, and ends the fit.
+
+**Clearances** (``other_contacts``). The misfit does not depend on a clearance that is larger than the motion, and its
+valley of values without contact is apart from those of values with contact: no derivative leads from one to the other.
+Clearances are therefore tried one by one at some fractions of the largest motion without their stop.
 """
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from vipetsc.case import CaseError
-from vipetsc.identification.clearance_search import other_contacts
-from vipetsc.identification.initial_state import NARROW, WIDTH
-from vipetsc.identification.least_residuals import least_residuals
-from vipetsc.identification.misfit import Misfit
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.case.sought import SoughtParameter, differs_by_side
+from vipetsc.identification.misfit import NARROW, WIDTH, Misfit
 from vipetsc.identification.motion import MotionError
-from vipetsc.identification.precision import FINAL, GROWING, Precision
 
-# While windows grow, parameters that the data do not determine yet stay near their last values: a change of a
-# coordinate by PRIOR weighs as one datum that misses by its noise. The last fit has no such rows.
+# Clearances that are tried, over the largest motion without the stop. The first is out of reach, so that nothing
+# touches. At the second the first impact grazes. The others are further in: a fit that begins at a graze may not reach
+# a valley there.
+OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
+# A contact that lowers the sum of squares over the noise by less than this is not needed: one datum's worth of noise.
+NEEDED = 1.0
+# Sides on which a clearance has its stops: 0 is that of w > 0, 1 that of w < 0.
+SIDES = {"clearance": [0], "clearance_minus": [1]}
+
+
+def reached_by(misfit: Misfit, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
+    """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met.
+
+    ``z`` (coordinate,) are the model's coordinates, ``ends`` (record,) times of the records' clocks in s. Raises
+    CaseError, MotionError.
+    """
+    largest = np.zeros((len(misfit.plan.base.model().chain.sites), 2))
+    for number, (table, end) in enumerate(zip(misfit.plan.options.records, ends, strict=True)):
+        if table.contact and (misfit.records[number].times <= end).any():
+            response = misfit.motion(z, number, end)
+            largest = np.maximum(largest, response.reached)
+            sides = (response.side < 0).astype(int)
+            # It stays NaN, whatever later records reach: the maximum of NaN and a number is NaN.
+            largest[response.site, sides] = np.nan
+    return largest
+
+
+def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.ndarray) -> float:
+    """The largest motion in m towards the stops of a clearance if none of them is met, else NaN.
+
+    ``reached`` (site, 2) is that of ``reached_by``. The result is NaN for other parameters than clearances.
+    """
+    if parameter.quantity not in SIDES:
+        return np.nan
+    base = plan.base
+    gaps = np.array(base.model().gaps or [(gap, gap) for gap in base.model().chain.clearances])
+    sides = SIDES[parameter.quantity]
+    if parameter.quantity == "clearance" and not differs_by_side(base):
+        sides = [0, 1]  # one clearance for both
+
+    # A site with a stop on one side has an infinite gap on the other. The largest of values with a NaN is NaN: one stop
+    # that is met is enough.
+    towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
+    return float(np.max(towards, initial=0.0))
+
+
+def motion_without(misfit: Misfit, z: np.ndarray, number: int, ends: Sequence[float], highest: np.ndarray) -> float:
+    """The largest motion in m towards the stops of a clearance, where the record does not need them; else NaN.
+
+    The record is explained as well with the clearance ``number`` at its upper bound in ``highest`` (coordinate,) as at
+    ``z`` (coordinate,), where a contact may just graze. The result is NaN for other parameters than clearances.
+    """
+    parameter = misfit.plan.parameters[number]
+    if parameter.quantity not in SIDES:
+        return np.nan
+    free = z.copy()
+    free[number] = highest[number]
+    if misfit.cost(free, ends) > misfit.cost(z, ends) + NEEDED:
+        return np.nan
+    return largest_towards(misfit.plan, parameter, reached_by(misfit, free, ends))
+
+
+def other_contacts(misfit: Misfit, z: np.ndarray, ends: Sequence[float], highest: np.ndarray) -> np.ndarray | None:
+    """The coordinates (coordinate,) with those clearances, of the ones tried, that lower the misfit; None if none does.
+
+    The search begins at ``z`` (coordinate,), with windows up to ``ends`` (record,) in s; ``highest`` (coordinate,) are
+    the upper bounds.
+    """
+    best = None
+    least = misfit.cost(z, ends)
+    for number, parameter in enumerate(misfit.plan.parameters):
+        if parameter.quantity not in SIDES:
+            continue
+        # As far away as it may be: the motion without this stop.
+        free = z.copy()
+        free[number] = highest[number]
+        for moved in _clearances_tried(misfit, z, free, number, ends):
+            cost = misfit.cost(moved, ends)
+            if cost < least:
+                best = moved
+                least = cost
+        # The next clearance is tried together with what has lowered the misfit so far.
+        if best is not None:
+            z = best
+    return best
+
+
+def _clearances_tried(
+    misfit: Misfit, z: np.ndarray, free: np.ndarray, number: int, ends: Sequence[float]
+) -> list[np.ndarray]:
+    """The coordinates ``z`` (coordinate,) with other values of the clearance ``number``, a list of arrays.
+
+    The values are fractions of the motion at ``free`` (coordinate,), where the clearance is at its upper bound.
+    """
+    parameter = misfit.plan.parameters[number]
+    # A case or a motion that is impossible without this stop says nothing of other clearances.
+    try:
+        reached = reached_by(misfit, free, ends)
+    except (CaseError, MotionError):
+        return []
+
+    # A stop that is met even at its upper bound has NaN: how far the motion without it would go is unknown. Comparisons
+    # with NaN are false, and nothing is tried.
+    beyond = largest_towards(misfit.plan, parameter, reached)
+    tried = []
+    for fraction in OF_REACH:
+        if parameter.low <= fraction * beyond <= parameter.high:
+            moved = z.copy()
+            moved[number] = parameter.to_coordinate(fraction * beyond)
+            tried.append(moved)
+    return tried
+
+
+TOLERANCE = 1e-12  # relative change of cost or coordinates; a sum of a thousand squares is rounded at 1e-14
+
+
+class Precision(NamedTuple):
+    """How a fit ends.
+
+    It ends after so many ``steps`` (None: those of the case), or where the relative change of the ``cost`` or of the
+    coordinates, ``step``, is less than these. ``has_prior``: a prior holds the coordinates near those at which the fit
+    begins. ``is_rough``: derivatives are one-sided differences.
+    """
+
+    steps: int | None = None
+    cost: float = TOLERANCE
+    step: float = TOLERANCE
+    has_prior: bool = False
+    is_rough: bool = False
+
+
+# While windows grow a fit only has to stay in its valley; the next window goes on from there.
+GROWING = Precision(cost=1e-2, step=1e-3, has_prior=True, is_rough=True)
+FINAL = Precision()
+
+
+# Least reduction of the cost in a step, over the one expected from the Jacobian, for a small reduction to end the fit.
+# SciPy has the same number: below it the linear model of the step is bad, and the next step may reduce the cost more.
+LEAST_RATIO = 0.25
+
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def least_residuals(
+    residuals: Function,
+    jacobian: Function,
+    start: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    precision: Precision,
+    steps: int,
+) -> np.ndarray:
+    """The coordinates (active,) with the least squares of ``residuals`` (datum,), from ``start`` (active,) on.
+
+    ``jacobian`` gives derivatives (datum, active); ``bounds`` are the lowest and the highest coordinates (active,). The
+    residuals are evaluated ``steps`` times at most. Raises what ``residuals`` and ``jacobian`` raise.
+    """
+    latest = np.zeros(0)
+    # The step that SciPy has taken last, by the state in which it began.
+    step: _Step | None = None
+
+    def evaluate(x: np.ndarray) -> np.ndarray:
+        nonlocal latest
+        latest = residuals(x)
+        return latest
+
+    def differentiate(x: np.ndarray) -> np.ndarray:
+        nonlocal step
+        # SciPy calls this at the start and after every step that is taken: the latest residuals are those at x.
+        if step is not None and step.ends_at(x, latest, precision):
+            raise _FitEnd(x.copy())
+        slopes = jacobian(x)
+        step = _Step(x.copy(), latest, slopes)
+        return slopes
+
+    low, high = bounds
+    try:
+        solution = least_squares(
+            evaluate,
+            # SciPy moves a start on a bound inside and refuses one outside, where rounding may have put it.
+            np.clip(start, low, high),
+            jac=differentiate,
+            bounds=bounds,
+            method="trf",
+            x_scale=1.0,
+            xtol=precision.step,
+            ftol=precision.cost,
+            gtol=TOLERANCE,
+            max_nfev=steps,
+        )
+    except _FitEnd as end:
+        return end.solution
+    return np.asarray(solution.x)
+
+
+class _FitEnd(Exception):
+    """A fit that has come to its ``solution`` (active,)."""
+
+    def __init__(self, solution: np.ndarray) -> None:
+        super().__init__("the fit has come to its end")
+        self.solution = solution
+
+
+class _Step(NamedTuple):
+    """Where a step begins: coordinates ``x`` (active,), ``residuals`` (datum,) and their ``slopes`` (datum, active)."""
+
+    x: np.ndarray
+    residuals: np.ndarray
+    slopes: np.ndarray
+
+    def ends_at(self, x: np.ndarray, residuals: np.ndarray, precision: Precision) -> bool:
+        """Whether a fit ends with the step to ``x`` (active,), where the residuals are ``residuals`` (datum,).
+
+        The conditions are SciPy's for a small step, relative to where it begins, and for a small reduction of the cost,
+        the latter without the terms by which its trust region keeps away from the bounds.
+        """
+        moved = x - self.x
+        if np.linalg.norm(moved) < precision.step * (precision.step + np.linalg.norm(self.x)):
+            return True
+
+        cost = float(self.residuals @ self.residuals)
+        gain = cost - float(residuals @ residuals)
+        # The reduction that the Jacobian at the beginning of the step let expect.
+        linear = self.residuals + self.slopes @ moved
+        expected = cost - float(linear @ linear)
+        return gain < precision.cost * cost and gain > LEAST_RATIO * expected
+
+
+# While windows grow, a change of a coordinate by PRIOR from its last value weighs as one datum missed by its noise.
 PRIOR = 1.0
 # Noise that is not given, over the size of a channel, until residuals show it.
 ASSUMED_NOISE = 0.01
@@ -45,8 +279,8 @@ LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown: with one for each, noise would be fitted exactly.
 # In four records that begin in an unknown motion 0.75 and 3 give the same windows, whose ends are those of contacts.
 DATA_EACH = 1.5
-# Number of fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise one such fit
-# comes within 5e-5 standard errors of the values after five, and two come within 2e-6.
+# Fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise two come within 2e-6
+# standard errors of the values after five.
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1

@@ -1,30 +1,107 @@
-"""Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
+r"""Residuals of measured records and their Jacobian, over windows from the beginning of each record.
+
+**An initial state** may be estimated with the parameters (``InitialState``). The state of a lattice of n masses has 2n
+numbers. With the modes phi_k (mass-normalised) and frequencies W_k in rad/s of the lattice without contacts they are
+written as
+
+    u = sqrt(e) sum_k a_k phi_k/W_k,    u' = sqrt(e) sum_k b_k phi_k,
+
+so that e(a_k^2 + b_k^2)/2 is the energy of mode k in J. The coordinates of the fit are the a_k, then the b_k. If they
+were independent and normal with variance 1, the derivative of order r of u_i would have the mean square
+e sum_k (phi_ki W_k^(r-1))^2. Each sensor thus has an e with which this is the mean square that it measured; the scale e
+in J is the largest of them. Coordinates are then numbers of order one wherever in the lattice the energy is.
+
+A few sensors may not determine all coordinates. A weak prior, normal with a standard deviation of ``WIDTH``, keeps the
+others finite: no mode has more than some hundred times e, the energy of a mode that was measured.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.drive import first_built
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured, SensorTable
 from vipetsc.dynamics.drives import create_drives, drive_forces
-from vipetsc.identification.initial_state import WIDTH, InitialState, initial_state
 from vipetsc.identification.motion import MotionError, RecordedMotion, SampledModel, State
+
+# Standard deviation of the prior of a coordinate. It has to be wide: with 1, 3 and 30 the parameters of a chain, from a
+# record with 5 % noise, move by .05, .005 and .0005 standard errors.
+WIDTH = 10.0
+# Standard deviation while windows grow and data are few: that of modes with the energy that was measured.
+NARROW = 1.0
+# A mode without stiffness has W = 0, and 1/W is infinite. This fraction of the lowest elastic frequency takes the place
+# of W: with the same coordinate the mode's displacement is ten times that of the slowest elastic mode.
+SLOW = 0.1
+# Frequencies below this fraction of the highest one are those of modes without stiffness. Squared frequencies are
+# rounded at 1e-16 of the highest one's square: zero comes out as 1e-8 of the highest frequency.
+RIGID = 1e-6
+
+
+class InitialState(NamedTuple):
+    """A state (2n,) that is estimated: ``matrix`` (2n, 2n) times its coordinates.
+
+    Among all coordinates of the fit they have the indices from ``first`` on.
+    """
+
+    first: int
+    matrix: np.ndarray
+
+    @property
+    def stop(self) -> int:
+        """The index behind the last coordinate."""
+        return self.first + len(self.matrix)
+
+    @property
+    def indices(self) -> range:
+        """The indices of the coordinates."""
+        return range(self.first, self.stop)
+
+
+def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, float]]) -> InitialState:
+    """The initial state of ``model`` in coordinates that have the indices from ``first`` on.
+
+    A sensor is the mass (0-based), the order of the derivative of its displacement that is measured, and the root mean
+    square of what was measured.
+    """
+    # Modes of the lattice without contacts.
+    masses = model.chain.masses()
+    stiffness = model.chain.stiffness_matrix().toarray()
+    roots = np.sqrt(masses)
+    squares, vectors = scipy.linalg.eigh(stiffness / np.outer(roots, roots))
+    frequencies = np.sqrt(np.maximum(squares, 0.0))
+
+    # Without any spring the drive sets the scale of the frequencies.
+    elastic = frequencies > RIGID * frequencies[-1]
+    lowest = model.drive.frequency
+    if elastic.any():
+        lowest = frequencies[elastic].min()
+    frequencies = np.maximum(frequencies, SLOW * lowest)
+    shapes = vectors / roots[:, None]
+
+    # sqrt(e), the largest of the sensors'.
+    scale = 0.0
+    for mass, order, size in sensors:
+        deviation = np.sqrt(np.sum((shapes[mass] * frequencies ** (order - 1)) ** 2))
+        scale = max(scale, size / deviation)
+    return InitialState(first, scale * scipy.linalg.block_diag(shapes / frequencies, shapes))
+
 
 # Rows of a motion, by the quantity of a sensor.
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-# Residual of a motion that cannot be computed, in units of the noise: a step that leads there is rejected. It is at
-# least so many times the size of the data, which motions that can be computed do not reach however small the noise is.
-# Of the two the second is the larger one where the noise is below 1e-5 of the data.
+# Residual of a motion that cannot be computed, in units of the noise and, if that is larger, of the size of the data: a
+# step that leads there is rejected.
 REJECTED = 1e8
 REJECTED_SIZE = 1e3
 # Derivatives by a coordinate are differences between runs that are 2 h apart; this is h. Those of the example, by seven
-# coordinates over 44 impacts, have errors of 1e-7 with h = 1e-7, of 8e-6 with 1e-6 and of 8e-4 with 1e-5 (and the last
-# is no better for runs of a smaller tolerance). However many steps it takes, a fit with a relative error e of its
-# derivatives ends e/s standard errors away: with columns of length 1, s is the smallest singular value of the Jacobian,
-# 0.03 for two parameters of correlation 0.999. One-sided differences have errors of 1e-3, and cost half as much.
+# coordinates over 44 impacts, have errors of 1e-7 with h = 1e-7, of 8e-6 with 1e-6 and of 8e-4 with 1e-5. However many
+# steps it takes, a fit with a relative error e of its derivatives ends e/s standard errors away: with columns of length
+# 1, s is the smallest singular value of the Jacobian, 0.03 for two parameters of correlation 0.999. One-sided
+# differences have errors of 1e-3, and cost half as much.
 HALF_WIDTH = 3e-7
 # Motions that are kept: at the end of a fit the residuals, the contacts and the cost are asked for of the same motion.
 KEPT = 8
@@ -33,7 +110,7 @@ Job = Callable[[], np.ndarray]
 
 
 def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
-    """The values of all ``jobs``, arrays (...) each, which this rank computes alone."""
+    """The values (...) of all ``jobs``, which this rank computes alone."""
     return [job() for job in jobs]
 
 

@@ -9,8 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vipetsc.identification.growing_windows import GrowingWindows
-from vipetsc.identification.precision import Precision
+from vipetsc.identification.growing_windows import GrowingWindows, Precision
 from vipetsc.identification.uncertainty import uncertainty_of
 
 # Distance in standard errors of the outermost values of a profile.

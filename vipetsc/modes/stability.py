@@ -87,8 +87,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import trapezoid
 
+from vipetsc.modes.balance.harmonic_balance import Compliance
 from vipetsc.modes.balance.harmonics import ForceSeries
-from vipetsc.modes.balance.shifted_compliance import Compliance
 from vipetsc.modes.flow import Arc, ShootingMap
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError

@@ -26,8 +26,7 @@ from vipetsc.endings import Ending
 from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
-from vipetsc.modes.branches.follow import claim_branches
-from vipetsc.modes.branches.follower import Follower
+from vipetsc.modes.branches.follow import Follower, claim_branches
 from vipetsc.modes.system import System
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.claims import measure_claims

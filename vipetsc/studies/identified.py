@@ -8,18 +8,17 @@ import xarray as xr
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
-from vipetsc.identification.clearance_search import largest_towards, motion_without, reached_by
-from vipetsc.identification.growing_windows import GrowingWindows
+from vipetsc.identification.growing_windows import GrowingWindows, largest_towards, motion_without, reached_by
 from vipetsc.identification.misfit_profile import ProfileCosts
 from vipetsc.identification.uncertainty import (
     DETERMINED,
     SMALLEST,
     Uncertainty,
+    ljung_box,
     marginal_jacobian,
     quantile,
     uncertainty_of,
 )
-from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
 from vipetsc.studies.further_sensor import further_sensor_values
 from vipetsc.wording import counted

@@ -3,11 +3,9 @@
 Everything else is linear and enters by its compliance G(omega): the harmonics Z_k of the elongations and F_k of the
 forces, k = 0..K, obey Z_k + G(k Om) F_k(Z) = Z_k^linear at the frequency Om, which ``harmonic_balance`` derives.
 
-``stops`` says where a contact acts, ``arcs`` on which intervals of phase it does, ``harmonics`` the forces of contacts
-and springs in a periodic motion. ``shifted_compliance`` is the linear system between them, and ``harmonic_balance`` the
-equations of a motion's harmonics. ``conservative`` has branches of conservative motions, ``harmonic_frame`` the
-unknowns in which a step of such a branch is taken, ``describing_function`` a pair's first guess in a gap,
-``departures`` the contact episodes as shooting counts them. ``modes.stability`` has the stability of a motion.
+``stops`` says where a contact acts, ``harmonics`` has the forces of contacts and springs in a periodic motion,
+``harmonic_balance`` the equations of a motion's harmonics, and ``conservative`` the branches of conservative motions
+with their starts. ``modes.stability`` has the stability of a motion.
 """
 
 from vipetsc.modes.balance.conservative import ConservativeMotions

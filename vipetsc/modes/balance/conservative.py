@@ -26,7 +26,12 @@ one shift through a step of the continuation. It is
 
 where m is the effective mass of a pair, since at high frequencies inertia alone counts, G = -1/(m omega^2). The sign of
 s_k is the one with which the smallest singular value of 1 + s_k G(k Om) is larger: with it k Om is farther from the
-poles of G_s (``vipetsc.modes.balance.shifted_compliance``).
+poles of G_s (``ShiftedCompliance``).
+
+**Unknowns of a step** (``HarmonicFrame``) are numbers of order one, xi = (x/size, Om/omega): x (n,) are the motion's
+harmonics in m, and Om is its frequency in rad/s; ``size`` is the largest |x| of the motion at which the frame is,
+``omega`` that motion's frequency. A ``Point`` of a branch has its tangent as d(x, period) in m and s instead, of any
+length, with period = 2 pi/Om and so dperiod = -(period^2/2 pi) dOm.
 
 **Number of harmonics.** The *truncation* of a motion estimates the harmonics that it leaves out, relative to those that
 it has:
@@ -48,10 +53,10 @@ stages.
 
        b_p + G_pp(0) F_p0(a_p, b_p) = 0,    a_p + G_pp(Om) F_p1(a_p, b_p) = 0.
 
-   The first equation gives b_p for every a_p, and a_p is a root above the amplitude at which the pair begins to feel
+   (N. M. Krylov and N. N. Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947; ``describing_motion``). The
+   first equation gives b_p for every a_p, and a_p is a root above the amplitude at which the pair begins to feel
    its force: for a contact the clearance. If there are several roots, any one of them may be found; for a contact that
-   is pressed at rest it is one in the lowest of the brackets that are tried
-   (``vipetsc.modes.balance.describing_function``).
+   is pressed at rest it is one in the lowest of the brackets that are tried.
 2. *All pairs together.* From there Newton's method solves the equations of the mean and the first harmonic, K = 1. A
    solution in which a pair moves with another sign than it is to have is not taken: the third stage then tries from
    the motions of the first.
@@ -60,21 +65,266 @@ stages.
    ``FURTHEST``. The signs are not looked at again.
 """
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.balance.departures import departures_of
-from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
-from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
-from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.shifted_compliance import Compliance
-from vipetsc.modes.departures import Departure
+from vipetsc.modes.balance.harmonic_balance import BalanceFrame, Compliance, HarmonicBalance
+from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
+from vipetsc.modes.departures import Departure, union_length
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
+
+# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to 1e-9 rad at either end,
+# here as a part of the period.
+ROUNDING = 1e-9 / (2 * np.pi)
+
+
+def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Departure]:
+    """When contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+
+    That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
+    shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed for
+    the whole period, or open, has none. The middle and the length of a departure are over the period.
+    """
+    end = 0.5
+    if forces.odd:
+        end = 0.25
+    by_pair: dict[int, list[tuple[float, float]]] = {pair: [] for pair in range(len(forces.contacts))}
+    for episode in episodes:
+        by_pair[episode.pair].append((episode.onset, episode.onset + episode.length))
+
+    departures = []
+    for pair, stops in enumerate(forces.contacts):
+        spans = by_pair[pair]
+        if stops.is_pressed:
+            spans = _between(spans)
+        for begin, stop in spans:
+            middle = (begin + stop) / (4 * np.pi)
+            # Whether it lies within the arc that is longer by the rounding at both ends, counted from its beginning.
+            if (middle + ROUNDING) % 1 < end + 2 * ROUNDING:
+                departures.append(Departure(middle=middle, length=(stop - begin) / (2 * np.pi)))
+    return departures
+
+
+def fraction_closed(series: ForceSeries) -> float:
+    """The fraction of the period in which one contact or more is closed, as shooting counts it."""
+    # The episodes of one contact do not overlap.
+    if np.count_nonzero(series.closed) < 2:
+        return float(series.closed.max(initial=0.0))
+
+    intervals = []
+    for episode in series.episodes:
+        begin = episode.onset
+        if begin < 0:
+            # An episode that contains phase 0 begins before it, at the end of the period.
+            intervals.append((begin + 2 * np.pi, 2 * np.pi))
+        intervals.append((max(begin, 0.0), episode.onset + episode.length))
+    return union_length(np.array(intervals)) / (2 * np.pi)
+
+
+def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The intervals of phase between ``spans``, which are sorted and do not overlap.
+
+    The last interval ends where the first span begins, one turn later.
+    """
+    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
+    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
+    return [(begin, stop) for begin, stop in gaps if stop > begin]
+
+
+# Amplitudes are sought up to this multiple of ``SiteForces.amplitude_scale``, which is the clearance of a contact, and
+# means up to this multiple of the amplitude. The amplitude by Hertz's law grows without bound as the compliance goes to
+# 0, so that there must be some bound: of 30 random negative compliances 18 have a motion below 1e2 clearances, 19 below
+# 1e3, 26 below 1e4.
+LARGEST = 1e3
+# A mean below this fraction of the amplitude is rounding, and taken to be 0.
+LEAST_MEAN = 1e-14
+# The force of a contact that is pressed at rest softens as it opens and hardens beyond. Its balance may therefore have
+# the same sign at the smallest and at the largest amplitude, and change it twice in between. It is evaluated at
+# TRIED_OF_PRESSED amplitudes, spaced evenly in their logarithms, from this multiple of the depth to ``LARGEST``. Of 50
+# random pressed contacts 21 have a motion: all are found with 21 amplitudes or more, 20 with 6 or 11.
+LEAST_OF_PRESSED = 1e-2
+TRIED_OF_PRESSED = 41
+
+
+class PairCompliance(NamedTuple):
+    """Compliance in m/N of one pair: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
+
+    static: float
+    dynamic: float
+
+
+class DescribedMotion(NamedTuple):
+    """A motion ``mean`` + ``amplitude`` cos(theta) of one pair, in m."""
+
+    mean: float
+    amplitude: float
+
+
+def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: float) -> DescribedMotion:
+    """The motion z = b + a cos(Om t) of a ``pair`` with one of the ``forces``, of which two harmonics balance.
+
+    ``pair`` is its number, ``g`` are the compliances of the pair at 0 and at ``omega`` (rad/s). The equations are those
+    of the module. Raises ContinuationError where they have no solution.
+    """
+    spring = pair - len(forces.contacts)
+    if spring >= 0 and forces.springs[spring].cubic == 0:
+        raise ContinuationError(
+            f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
+            "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
+        )
+    is_pressed = pair < len(forces.contacts) and forces.contacts[pair].is_pressed
+    z = np.zeros((forces.pairs, 2), complex)
+
+    def force(mean: float, amplitude: float) -> np.ndarray:
+        """F_0, F_1 and F_2 in N: the motion is even in time, so that they are real."""
+        z[pair] = mean, amplitude
+        return forces.series(z, omega).forces[pair].real
+
+    def mean_of(amplitude: float) -> float:
+        """The mean b in m for an amplitude a in m."""
+
+        def static_balance(mean: float) -> float:
+            return mean + g.static * float(force(mean, amplitude)[0])
+
+        without = static_balance(0.0)
+        if forces.odd or abs(without) <= LEAST_MEAN * amplitude:
+            return 0.0
+        # A force that grows with the elongation opposes the mean: b lies between 0 and -G(0) F_0(a, 0), the mean that
+        # the force at b = 0 would cause. The force of a contact that is pressed at rest softens: its mean may be
+        # larger.
+        furthest = -without
+        while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
+            furthest *= 2
+        if static_balance(furthest) * without >= 0:
+            # No mean within the bound balances the force. 0 is then a guess: the balance of all harmonics decides.
+            return 0.0
+        return float(brentq(static_balance, furthest, 0.0))
+
+    def balance(amplitude: float) -> float:
+        """a + G(Om) F_1 in m."""
+        return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
+
+    size = forces.amplitude_scale(pair, g.dynamic)
+    sizes = [size, LARGEST * size]
+    if is_pressed:
+        sizes = (size * np.geomspace(LEAST_OF_PRESSED, LARGEST, TRIED_OF_PRESSED)).tolist()
+    for low, high in itertools.pairwise(sizes):
+        if balance(low) * balance(high) < 0:
+            amplitude = float(brentq(balance, low, high, rtol=1e-12))
+            return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)
+
+    needs = "a force that hardens needs a negative one of moderate size"
+    if is_pressed:
+        needs = "the force of a contact that is pressed at rest balances it at no amplitude"
+    raise ContinuationError(
+        f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and "
+        f"{needs}; change nnm.start_frequency"
+    )
+
+
+# A frequency that changes by this factor, or its inverse, within one correction has left the branch.
+LARGE_FACTOR = 2.0
+
+
+class HarmonicFrame(BalanceFrame):
+    """Unknowns ``xi`` (n + 1,) at and near the motion with the harmonics ``x`` (n,) in m and ``omega`` in rad/s.
+
+    ``size`` in m is the unit of the harmonics. The ``tangent`` is set after construction, where the motion has one.
+    """
+
+    def __init__(
+        self, balance: HarmonicBalance, newton: DenseNewton, tolerance: float, x: np.ndarray, omega: float, size: float
+    ) -> None:
+        self.balance = balance
+        self.newton = newton
+        self.tolerance = tolerance
+        self.shift = balance.shift(omega)
+        self.size = size
+        self.omega = omega
+        self.xi = np.append(x / size, 1.0)
+
+    def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
+        return xi[:-1] * self.size, float(xi[-1] * self.omega)
+
+    def encode(self, point: Point) -> np.ndarray:
+        """The unknowns (n + 1,) of another motion, which may have another number of harmonics."""
+        x = self.balance.resized(point.x)
+        return np.append(x / self.size, 2 * np.pi / point.period / self.omega)
+
+    def direction(self, point: Point) -> np.ndarray:
+        """The branch's direction (n + 1,) at another motion, of any length."""
+        # dOm = -2 pi/period^2 dperiod.
+        harmonics = self.balance.resized(point.tangent[:-1]) / self.size
+        return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
+
+    def residual(self, xi: np.ndarray) -> np.ndarray:
+        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
+
+        Raises FlowError where the frequency has changed by a factor of ``LARGE_FACTOR`` or more.
+        """
+        if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
+            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
+        return self.balance.residual(*self.motion(xi), self.shift) / self.size
+
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        x, omega = self.motion(xi)
+        jacobian = self.balance.jacobian(x, omega, self.shift)
+        by_omega = self.balance.rate(x, omega, self.shift)
+        return np.column_stack([jacobian, by_omega * (self.omega / self.size)])
+
+    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
+        """The point of the branch that an attempt has converged to.
+
+        ``direction`` (n + 1,) is the branch's unit tangent there; without one, None, the point has no slope. Its
+        ``energy_tangent`` is dE in J for a unit step along the tangent in this frame's unknowns: from frame to frame
+        only the sign can be compared.
+        """
+        balance = self.balance
+        xi = attempt.xi
+        x, omega = self.motion(xi)
+        period = 2 * np.pi / omega
+        series = balance.series(x, omega)
+
+        tangent = np.empty(0)
+        energy_tangent = slope = np.nan
+        if direction is not None:
+            energy_tangent = balance.energy_change(
+                x, omega, self.shift, along=direction[:-1] * self.size, by_omega=direction[-1] * self.omega
+            )
+            by_frequency = direction[-1] * self.omega / (2 * np.pi)
+            # The slope is df/dE in Hz/J: infinite at a fold of the energy.
+            slope = np.inf
+            if energy_tangent:
+                slope = by_frequency / energy_tangent
+            tangent = np.append(direction[:-1] * self.size, -direction[-1] * self.omega / (2 * np.pi) * period**2)
+
+        return Point(
+            x=x,
+            period=period,
+            energy=balance.energy(x, omega, self.shift),
+            residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
+            episodes=len(departures_of(balance.forces, series.episodes)),
+            closed=fraction_closed(series),
+            # The history has the residual of the guess, too; that of a guess which is not corrected is empty.
+            newton=max(len(attempt.history) - 1, 0),
+            order=balance.order,
+            truncation=balance.truncation(x, omega),
+            # At phase 0 all cosines are 1.
+            elongations=balance.unpack(x).real.sum(axis=1),
+            tangent=tangent,
+            energy_tangent=energy_tangent,
+            slope=slope,
+        )
+
 
 # Order of the motions with which a branch begins. No point of a branch has a lower one: a case with ``nnm.harmonics``
 # below it is refused. With 7 to 63 two breathers of the built-in lattice are the same and take the same CPU time.

@@ -1,11 +1,10 @@
 """Branches of a case: followed one a rank or by all ranks together, checked, and written to files that resume them.
 
 ``branch`` is a branch in memory, ``files`` its file; ``regions`` are those of a backbone, with their power laws.
-``branch_checks`` looks for a branch that retraces itself, stands still or passes on to another one; ``follower``
-follows one branch, ``follow`` distributes those of a case over ranks.
+``branch_checks`` looks for a branch that retraces itself, stands still or passes on to another one; ``growth``
+continues one branch, ``follow`` distributes those of a case over ranks.
 """
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch, write_branch
-from vipetsc.modes.branches.follow import claim_branches, follow_all
-from vipetsc.modes.branches.follower import Follower
+from vipetsc.modes.branches.follow import Follower, claim_branches, follow_all

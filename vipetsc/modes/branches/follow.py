@@ -1,6 +1,37 @@
-"""Follow all branches of a case, distributed over ranks, into a folder that is claimed for them."""
+"""Follow all branches of a case, distributed over ranks: each is saved as it grows and resumed at its end.
 
+A *branch* is a curve of periodic motions along which one parameter changes: a nonlinear normal mode (NNM), whose energy
+and frequency change, or a nonlinear frequency response curve (NFRC), whose parameter is the drive's frequency or
+another key of the case. Its *points* are single motions. Those of the continuation are regular, and their ``index``
+counts the steps from the start, which has 0; *special* points lie between them, where something changes: a fold of the
+energy or of the frequency, a change of stability, a contact that grazes. A ``Method`` gives the equations of a case's
+branches and their starts, and ``Growth`` continues a branch from one motion to its end. This module says from which
+motions, and keeps the files. A step of the length s solves H(xi) = 0 with t . (xi - xi_0) = s for the unknowns xi of
+the next point, with those of the last one, xi_0, and the unit tangent t of the branch there; charts, which scale the
+unknowns, are explained with it in ``vipetsc.modes.continuation.arclength``.
+
+**Directions.** An NNM that is followed both ways from its start makes two branches: ``<name>`` towards larger energies
+and ``<name>-down`` towards smaller ones. Both begin with the start.
+
+**Files.** A branch has the files ``branch-<name>.h5`` and ``.csv``. Every ``SAVE_EVERY`` seconds, where it is stopped
+and where it ends, a growing branch is written whole. A resumed command reads a branch that is complete, and goes on
+from the last point of one that was stopped, failed, or has used up its points; one that failed at its start is tried
+again. In between the steps, the bounds, and the numbers of points and of Newton steps in the case may have been
+changed, but not the physics. ``Branch`` explains ``ended``, ``complete`` and ``findings``.
+
+**Branches that cross** a branch at its special points, or are isolated near it, are followed after it, each with files
+of its own. They have the variables of their points alone (``Method.finish`` is not called for them). Their names have
+the number of the special point, counted from the start on.
+
+Phases of this loop are audit events ``vipetsc.<phase>`` of Python, which cost nothing unless a hook listens: the tests
+raise errors and signals there (chapter `trust` of the manual).
+"""
+
+import logging
+import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -8,12 +39,176 @@ from typing import Any
 from mpi4py import MPI
 
 from vipetsc.case import NnmCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.endings import Ended, Ending
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
+from vipetsc.io.netcdf import root_attributes
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.follower import BranchCase, Follower, method_of
-from vipetsc.modes.branches.growth import Listener
+from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
+from vipetsc.modes.branches.growth import Growth, Listener
+from vipetsc.modes.branches.lattices import LatticeMethod
+from vipetsc.modes.branches.method import CrossingBranch, Method
+from vipetsc.modes.branches.orbits import ShootingMethod
+from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.shared_frequencies import check_modes_alone
-from vipetsc.parallel import StopRequest, on_every_rank, on_root
+from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
+from vipetsc.sources import source_key
+
+logger = logging.getLogger(__name__)
+# What is added to the name of a branch that is followed towards smaller energies, beside the one towards larger ones.
+DOWN = "-down"
+BranchCase = NnmCase | NfrcCase
+
+
+def method_of(case: BranchCase) -> type[Method[Any]]:
+    """The method that finds the branches of a ``case``."""
+    if isinstance(case, NfrcCase):
+        return ResponseMethod
+    if case.krylov:
+        return LatticeMethod
+    if case.condensed:
+        return CondensedMethod
+    return ShootingMethod
+
+
+class Follower:
+    """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
+
+    ``about`` are attributes of the files. ``listener(branch, point)`` is called after each regular point on rank 0 of
+    ``comm``: of ``follow_all`` that is every rank with its own branches, unless all follow one together. All ranks of
+    ``comm`` call ``follow`` with the same jobs in the same order.
+    """
+
+    def __init__(
+        self,
+        case: BranchCase,
+        folder: Path | None,
+        about: dict[str, Any],
+        listener: Listener | None = None,
+        stop: StopRequest | None = None,
+        resume: bool = False,
+        comm: MPI.Comm = MPI.COMM_SELF,
+    ) -> None:
+        sys.audit("vipetsc.set-up", case.name)
+        self.case = case
+        self.folder = folder
+        self.about = about
+        self.stop = stop or StopRequest()
+        self.resume = resume
+        self.comm = comm
+        self.method: Method[Any] = method_of(case)(case, comm)
+        self.growth = Growth(self.method, comm, self.write, listener, self.stop)
+
+    def follow(self, job: int) -> list[Branch[Any]]:
+        """The branches of a ``job``, one for each direction, each with those that cross it, if asked for.
+
+        A job is a number from ``Method.jobs``, counted from 0: that of a mode, of a start frequency, or of a curve.
+        """
+        # Members of a sweep have the same audit event: hooks count what a case consists of.
+        sys.audit("vipetsc.member", job + 1)
+        branches: list[Branch[Any]] = []
+        for direction in self.method.directions:
+            name = self.method.name(job)
+            if direction < 0 < max(self.method.directions):
+                name += DOWN
+            branch = self._stored_or_new(name)
+            if not branch.complete:
+                self._follow_and_write(branch, partial(self._follow_one, branch, job, direction))
+            branches += [branch, *self._follow_crossing(branch)]
+        return branches
+
+    def _follow_and_write(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
+        """Call ``follow`` for a branch, and write it; how it ``ended`` says why it was stopped or failed."""
+        try:
+            follow()
+        except StoppedError as stopped:
+            branch.ended = Ended(Ending.STOPPED, str(stopped))
+        except self.method.failures as error:
+            branch.ended = Ending.FAILED.with_numbers(reason=error)
+        # A branch that was stopped before its first point has nothing to say, and is begun when it is resumed.
+        if branch.points or (self.method.keeps_empty and branch.ended.ending is not Ending.STOPPED):
+            self.write(branch)
+
+    def write(self, branch: Branch[Any]) -> None:
+        """Write a branch into the folder; one that ranks follow together is written by one of them."""
+        folder = self.folder
+        if folder:
+            on_root(self.comm, lambda: write_branch(branch, folder, self.about))
+
+    def _follow_one(self, branch: Branch[Any], job: int, direction: int) -> None:
+        """Compute the points of a branch, then what its file holds of the whole branch (``Method.finish``)."""
+        method = self.method
+        problem = method.problem(job)
+        interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
+        try:
+            if branch.points:
+                start = branch.regular()[-1]
+            else:
+                with method.stopped_by(problem, self.stop):
+                    start = method.start(problem, job, self.stop)
+            self.growth.run(branch, problem, start, method.rule, direction)
+        except interruptions:
+            if method.finishes_interrupted and branch.points:
+                method.finish(problem, branch)
+            raise
+        method.finish(problem, branch)
+
+    def _stored_or_new(self, name: str) -> Branch[Any]:
+        """The branch of that ``name`` as it is in its file when results are resumed, else one without points.
+
+        The ``extra`` variables of the file are not read: those of a branch that is not complete are computed again.
+        """
+        new = self.method.new_branch(name)
+        folder = self.folder
+        if folder is None:
+            return new
+        path = folder / f"branch-{name}.h5"
+        if not (self.resume and on_root(self.comm, path.exists)):
+            return new
+
+        try:
+            # Read by one rank: the others must not find another file, or none.
+            stored = on_root(self.comm, lambda: read_branch(path))
+            source = on_root(self.comm, lambda: root_attributes(path, "branch").get("source"))
+        except OSError as error:
+            self._warn(f"{error}; computed again")
+            return new
+        if not stored.complete and source != source_key():
+            self._warn(f"{path} was begun by other sources of vipetsc; computed again")
+            return new
+        # The case's bounds may be new.
+        branch = replace(stored, case=new.case, about=new.about, extra=new.extra)
+        try:
+            # A branch that is complete is not written again, and a table that is missing would stay away.
+            on_root(self.comm, lambda: restore_table(branch, folder))
+        except OSError as error:
+            self._warn(f"the table of branch {name} is not written: {error}")
+        return branch
+
+    def _warn(self, text: str) -> None:
+        """Log a warning that all ranks have, on one of them."""
+        if self.comm.rank == 0:
+            logger.warning("vipetsc: warning: %s", text)
+
+    def _follow_crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
+        """The branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
+        branches: list[Branch[Any]] = []
+        # ``further`` looks at ``branches`` whenever it is asked for the next one: no branch is begun twice.
+        for crossing in self.method.further(branch, branches):
+            other = self._stored_or_new(crossing.name)
+            branches.append(other)
+            if not other.complete:
+                self._follow_and_write(other, partial(self._cross, other, crossing))
+        return branches
+
+    def _cross(self, branch: Branch[Any], crossing: CrossingBranch) -> None:
+        """Follow a ``branch`` that crosses another one, or an isolated one near it."""
+        sys.audit("vipetsc.switch", branch.name)
+        problem, start = crossing.start()
+        if branch.points:
+            start = branch.regular()[-1]
+        self.growth.run(branch, problem, start, crossing.rule)
 
 
 def claim_branches(

@@ -19,7 +19,7 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
+from vipetsc.modes.balance.conservative import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.flow import ShootingMap
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow

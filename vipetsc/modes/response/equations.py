@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.lattice import ComplianceError, IncidentWave
-from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.balance.harmonic_balance import BalanceFrame, HarmonicBalance
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError, SpecialKind
@@ -63,7 +63,7 @@ class ContinuationParameter(NamedTuple):
     scale: float
 
 
-class SteadyFrame:
+class SteadyFrame(BalanceFrame):
     """The equations at and near one state, with its unknowns ``xi`` (n + 1,) and unit ``tangent`` (n + 1,).
 
     The ``shift`` (orders, 1, 1) in N/m of the compliance is chosen at this state and stays the same within a step.
@@ -71,6 +71,8 @@ class SteadyFrame:
 
     def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
         self.equations = equations
+        self.newton = equations.newton
+        self.tolerance = equations.tolerance
         self.xi = xi
         self.tangent = tangent
         self.shift = equations.shift_near(xi)
@@ -90,31 +92,6 @@ class SteadyFrame:
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
         """Derivative (n, n + 1) of the residual."""
         return self.equations.jacobian(xi, self.shift)
-
-    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the state at an ``arclength`` along the tangent."""
-        # The plane goes through the predictor as it is rounded, so that the row's first residual is exactly zero where
-        # the predictor is the guess.
-        predicted = self.xi + arclength * self.tangent
-        return self.solve(guess, self.tangent, self.tangent @ predicted)
-
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the state with row . xi = value, (n + 1,); not converged after an NoMotionError."""
-        equations = self.equations
-        try:
-            return equations.newton.solve(self, guess, row, value, equations.tolerance)
-        except NoMotionError as error:
-            return Attempt(False, str(error), [], guess, left_domain=True)
-
-    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a state ``xi`` (n + 1,), on the side of the frame's own.
-
-        Of the null vectors of the derivative the row ``tangent`` chooses the one with tangent . direction = 1.
-        """
-        right = np.zeros(len(xi))
-        right[-1] = 1
-        direction = np.linalg.solve(np.vstack([self.jacobian(xi), self.tangent]), right)
-        return np.asarray(direction / np.linalg.norm(direction))
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
         """The state that an attempt has converged to, without measures, which are computed once it is accepted.
