@@ -1,6 +1,10 @@
 """Verdicts on the paper's claims follow from numbers and thresholds, and the thresholds are those listed here."""
 
+import errno
 import json
+import os
+from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -16,7 +20,7 @@ from vipetsc.paper.claims import criteria as constants
 from vipetsc.paper.claims import measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
-from vipetsc.paper.claims.measure import rounded
+from vipetsc.paper.claims.measure import measure_claim, rounded
 from vipetsc.spectra import FEWEST
 
 IDS = [f"C{number}" for number in range(1, 19)]
@@ -295,3 +299,21 @@ def test_a_reading_that_is_not_there_is_not_measured(tmp_path):
         with pytest.raises(MissingEvidence, match="calibrated"):
             evidence.select("scattering", "printed")
         assert evidence.files == ["scattering/ensemble.h5"]
+
+
+@pytest.mark.parametrize(("number", "is_kept"), [(errno.EIO, False), (errno.ESTALE, False), (None, True)])
+def test_a_claim_is_not_judged_by_a_disk_that_fails_for_a_moment(monkeypatch, tmp_path, number, is_kept):
+    """An error of the file system ends the paper, since verdicts are kept; a file that was cut off is a reason."""
+
+    def fail(path: Path, *more: object) -> None:
+        if number is None:
+            raise OSError("truncated")
+        raise OSError(number, os.strerror(number), str(path))
+
+    (tmp_path / "design").mkdir()
+    (tmp_path / "design" / "design.h5").touch()
+    monkeypatch.setattr("vipetsc.paper.claims.evidence.open_netcdf", fail)
+    with Evidence(tmp_path) as evidence, nullcontext() if is_kept else pytest.raises(OSError, match=r"design\.h5"):
+        row = measure_claim("C10", "calibrated", evidence)
+        assert row["verdict"] == UNMEASURED
+        assert "truncated" in row["reason"]

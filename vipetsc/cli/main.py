@@ -14,7 +14,7 @@ from vipetsc.cli.arguments import COMMON_ARGUMENTS
 from vipetsc.cli.messages import code_of, discard, echo, reporting
 from vipetsc.cli.verb import BAD_INPUT, FAILED, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
-from vipetsc.io.errors import FolderError, ResultFileError
+from vipetsc.io.errors import FolderError, ResultFileError, is_of_file_system
 from vipetsc.parallel import StoppedError, StopRequest, StudyError, all_meet, on_root
 from vipetsc.register import PartError
 
@@ -90,6 +90,9 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
 
     except ResultFileError as error:
         text = f"vipetsc: {error}"
+        if is_of_file_system(error):
+            echo(MPI.COMM_WORLD, f"{text}; after the cause is removed, the same command continues", sys.stderr)
+            return FAILED
         if hasattr(options, "force"):
             text += "; move it away, or start again with --force"
         echo(MPI.COMM_WORLD, text, sys.stderr)

@@ -177,7 +177,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         with h5py.File(path) as file:
             yield file
     except (OSError, RuntimeError, KeyError) as error:
-        raise OSError(f"{path} cannot be read: {error}") from error
+        raise OSError(f"{path} cannot be read: {system_reason(error)}") from error
 
 
 class StoredArrays(Mapping[str, np.ndarray]):

@@ -27,4 +27,7 @@ class ResultFileError(FolderError):
 
 
 class UnreadableFileError(OSError, ResultFileError):
-    """A file of results that cannot be opened."""
+    """A file of results that cannot be opened; the message is a sentence, and the number the system's, or 0."""
+
+    def __str__(self) -> str:
+        return str(self.strerror or self.args[0])

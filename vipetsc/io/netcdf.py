@@ -23,7 +23,7 @@ import numpy as np
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
 from vipetsc.register import PartError
-from vipetsc.wording import shortened, system_reason
+from vipetsc.wording import shortened, system_number, system_reason
 
 # xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFile
         reason = "another program has it open for writing"
     if isinstance(error, KeyError):
         reason = "it lacks the coordinate of a dimension of its variables"
-    return UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}")
+    return UnreadableFileError(system_number(error), f"{path} cannot be opened as a {kind}: {reason}")
 
 
 @contextmanager

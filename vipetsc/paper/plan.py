@@ -23,6 +23,7 @@ import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.case.predict import PredictCase
 from vipetsc.endings import Ending
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
@@ -385,7 +386,9 @@ def read_json(path: Path) -> Any:
     """Content of a JSON file; None if it is not there or was cut off."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError) as error:
+        if is_of_file_system(error):
+            raise
         return None
 
 

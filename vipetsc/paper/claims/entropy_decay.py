@@ -3,6 +3,7 @@
 import numpy as np
 import xarray as xr
 
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.paper.claims.criteria import ABRUPT, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
 from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import FEWEST, doubt, normalised
@@ -94,6 +95,8 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
         _list_fits(result, decays(evidence, NEIGHBOURS, reading, "masked"), "neighbouring", "neighbours, masked")
     # Without this sweep the numbers of spread sites are reported alone.
     except (MissingEvidence, OSError, ValueError) as missing:
+        if is_of_file_system(missing):
+            raise
         result.reasons.append(str(missing).replace(f"{evidence.root}/", ""))
 
     result.uncertainty["amplitudes"] = len(spread[0].amplitude)

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, member_folder, open_ensemble, select
 from vipetsc.studies.backbone import initiation_of
@@ -54,8 +55,11 @@ class AnalysedMember:
     @property
     def onset(self) -> float:
         """Least amplitude in N at which a run like this one has a contact; NaN without the record of its linear run."""
-        with suppress(OSError, ValueError):
+        try:
             return initiation_of(self.folder.parent, self.case).onset
+        except (OSError, ValueError) as error:
+            if is_of_file_system(error):
+                raise
         return float("nan")
 
     def arrays(self, *names: str) -> tuple[np.ndarray, ...]:

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 from vipetsc.io.atomic import write_text
+from vipetsc.io.errors import is_of_file_system
 from vipetsc.paper.claims.criteria import CLAIMS, UNMEASURED, verdict
 from vipetsc.paper.claims.evidence import Evidence, Measurement, MissingEvidence, Numbers
 
@@ -47,6 +48,9 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         result.reasons.append(str(missing))
     # Files of another version, or files that were cut off.
     except (KeyError, OSError, ValueError) as error:
+        # The verdict of a claim must not depend on a disk that fails for a moment: it would be kept.
+        if is_of_file_system(error):
+            raise
         message = " ".join(str(error).split()).replace(f"{evidence.root}/", "")
         file = "a file"
         if evidence.files:
