@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -147,3 +148,29 @@ def test_the_rules_find_what_they_forbid(text):
 )
 def test_the_rules_allow_what_is_public(text):
     assert broken_rules(text) == []
+
+
+def class_members(path: Path) -> Iterator[tuple[str, set[str]]]:
+    """Yield the top-level classes of a file, each with the names that its body defines."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef):
+            functions = {item.name for item in node.body if isinstance(item, ast.FunctionDef)}
+            values = {ast.unparse(target) for item in node.body for target in getattr(item, "targets", [])}
+            yield node.name, functions | values
+
+
+def test_no_class_replaces_what_is_private_to_its_base():
+    """A method that a library's class has for itself may change or go with each version."""
+    replaced = []
+    for path in SOURCES:
+        module = ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
+        for name, members in class_members(path):
+            private = [member for member in members if is_private(member)]
+            if not private or module.endswith("__main__"):
+                continue
+            bases = getattr(importlib.import_module(module), name).__mro__[1:]
+            foreign = [base for base in bases if is_foreign(base.__module__) and base is not object]
+            replaced += [
+                f"{name}.{member} of {base.__name__}" for member in private for base in foreign if member in vars(base)
+            ]
+    assert replaced == []

@@ -17,6 +17,7 @@ from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError, is_of_file_system
 from vipetsc.parallel import StoppedError, StopRequest, StudyError, all_meet, on_root
 from vipetsc.register import PartError
+from vipetsc.wording import nearest
 
 # s within which all ranks that were stopped must meet. If one of them was killed they never do, and the launcher kills
 # the others within this time.
@@ -29,19 +30,38 @@ class Parser(argparse.ArgumentParser):
 
     error_in_print: OSError | None = None
 
-    def _print_message(self, message: str, file: Any = None) -> None:
-        if not message or MPI.COMM_WORLD.rank != 0:
+    def say(self, text: str, file: Any = None) -> None:
+        """Print ``text`` on rank 0, to stdout or another ``file``."""
+        if MPI.COMM_WORLD.rank != 0:
             return
         try:
-            super()._print_message(message, file)
-            sys.stdout.flush()
+            print(text, end="", file=file, flush=True)
         except OSError as error:
             discard(sys.stdout)
             self.error_in_print = error
 
+    def print_help(self, file: Any = None) -> None:
+        """Print the help on rank 0."""
+        self.say(self.format_help(), file)
+
+    def print_usage(self, file: Any = None) -> None:
+        """Print how the verb is called, on rank 0."""
+        self.say(self.format_usage(), file)
+
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with ``status``; if that is 0, with the code of a failure to print the help."""
-        super().exit(status or on_root(MPI.COMM_WORLD, lambda: code_of("stdout", self.error_in_print)), message)
+        self.say(message or "", sys.stderr)
+        sys.exit(status or on_root(MPI.COMM_WORLD, lambda: code_of("stdout", self.error_in_print)))
+
+
+class ShowVersion(argparse.Action):
+    """Print the version and end."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print on rank 0; argparse's own action prints on every rank."""
+        assert isinstance(parser, Parser)
+        parser.say(f"vipetsc {vipetsc.__version__}\n")
+        parser.exit()
 
 
 def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
@@ -55,6 +75,8 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
         " ".join(arguments).encode()
     except UnicodeEncodeError:
         parser.error("an argument is not text in UTF-8, which files of results could not hold; rename the file")
+    if arguments[0] not in (*VERBS, *ABOUT_THE_PROGRAM):
+        parser.error(_without_verb(arguments[0]))
     options = parser.parse_args(arguments)
     # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
@@ -70,6 +92,17 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
         return BAD_INPUT
 
     return code or next(filter(None, lost), 0)
+
+
+def _without_verb(word: str) -> str:
+    """Return what is said of a first ``word`` that is not a verb."""
+    if word.endswith(".toml"):
+        return f"a verb comes before the case file: vipetsc run {word}"
+    listed = f"the verbs are {', '.join(VERBS)}"
+    near = nearest(word, VERBS)
+    if near:
+        return f"{word!r} is not a verb; did you mean {near}? ({listed})"
+    return f"{word!r} is not a verb; {listed}"
 
 
 def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
@@ -127,7 +160,7 @@ def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None
         description="Waves in phononic lattices with vibro-impacts. Without a verb, the built-in four-band case runs.",
         epilog="PETSc options follow --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
     )
-    parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
+    parser.add_argument("--version", action=ShowVersion, nargs=0, help="show program's version number and exit")
 
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS.values():

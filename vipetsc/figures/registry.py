@@ -1,6 +1,5 @@
 """Every picture by name: what it is drawn from and by which function; the check of names; the drawing of folders."""
 
-import difflib
 import itertools
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -45,6 +44,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 from vipetsc.register import FIGURE, reserve
+from vipetsc.wording import nearest
 
 
 class FigureSpec(NamedTuple):
@@ -195,8 +195,8 @@ def figure_names(
     valid = [*measures, *specified]
     for name in names:
         if name not in valid:
-            # A name far from all valid ones gets a guess too, which shows what names look like.
-            (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
+            near = nearest(name, valid)
+            question = f"; did you mean {near!r}?" if near else "."
             holder = source
             if source != BRANCHES:
                 article = "an" if source[0] in "aeiou" else "a"
@@ -206,7 +206,7 @@ def figure_names(
             reason = ""
             if missing:
                 reason = f"; a module of the case cannot be used: {missing}"
-            raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}{reason}")
+            raise KeyError(f"no figure {name!r} of {holder}{question} There are {listed}{reason}")
     return list(names)
 
 

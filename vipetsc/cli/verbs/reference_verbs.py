@@ -14,6 +14,7 @@ from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.extras import require
 from vipetsc.parallel import StopRequest, on_root
+from vipetsc.wording import nearest
 
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
@@ -25,8 +26,11 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
     names = on_root(comm, lambda: [*itertools.chain(*parts().values()), *studies()])
     if options.topic not in names:
-        listed = ", ".join(sorted(names))
-        raise CaseError([Problem("TOPIC", options.topic, f"no such chapter; the chapters are {listed}")], "manual")
+        remedy = "no such chapter; vipetsc manual lists them"
+        near = nearest(options.topic, names)
+        if near:
+            remedy += f"; did you mean {near}?"
+        raise CaseError([Problem("TOPIC", options.topic, remedy)], "manual")
     echo(comm, on_root(comm, lambda: chapter(options.topic)))
     return DONE
 
