@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import h5py
 import numpy as np
 
-from vipetsc.io.atomic import atomic_write
+from vipetsc.io.atomic import atomic_write, hdf5_file
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
 from vipetsc.register import PartError
 from vipetsc.wording import shortened, system_number, system_reason
@@ -33,18 +33,13 @@ if TYPE_CHECKING:
 MAY_BE_EMPTY = ("site", "episode")  # dimensions of runs without sites, or without contact
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
-Node: TypeAlias = "h5py.h5g.GroupID | h5py.h5d.DatasetID"
+Node: TypeAlias = "h5py.Group | h5py.Dataset"
 
 # Attributes by which HDF5 and netCDF-4 describe dimensions. Readers do not see them as attributes of a variable.
 DIMENSION_ATTRIBUTES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
 DIMENSION_ATTRIBUTES |= {"_Netcdf4Dimid", "_Netcdf4Coordinates", "_nc3_strict", "_NCProperties"}
 # The attribute NAME of a dimension without a coordinate begins so.
-NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
-
-# An attribute that is a text: its type in memory, its type in the file, and its space.
-TEXT = h5py.string_dtype()
-STORED_TEXT = h5py.h5t.py_create(TEXT, logical=True)
-ONE_VALUE = h5py.h5s.create_simple(())
+NO_COORDINATE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
@@ -68,20 +63,14 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
     Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
-    # HDF5 only makes the file in memory, and Python writes its bytes: where the disk is full, HDF5 would crash later.
-    with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
+    with atomic_write(Path(path)) as aside, hdf5_file(aside) as file:
         put_dataset(file, data)
-        file.flush()
-        image = file.id.get_file_image()
-    with atomic_write(Path(path)) as aside:
-        aside.write_bytes(image)
 
 
-def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
+def put_dataset(file: h5py.File, data: xr.Dataset) -> None:
     """Add the variables and attributes of ``data`` to ``file``; an attribute that is a dict or a list becomes JSON.
 
-    All ranks that have the file open must call it with the same data; one of them has to ``write`` the values. Raises
-    ValueError if a dimension has no coordinate, or the name of another one further up.
+    Raises ValueError if a dimension has no coordinate, or the name of another one further up.
     """
     _check_dimensions(data)
     # Coordinates come first, because variables are attached to their scales.
@@ -91,27 +80,20 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
         item = variables[name]
         values = item.values
         dtype = values.dtype
-        is_text = dtype.kind in "UO"
         # HDF5 has no type for numpy's text of fixed width, and h5py takes texts of any length as objects.
-        if is_text:
+        if dtype.kind in "UO":
             values = values.astype(object)
-            dtype = TEXT
-        dataset = _add_dataset(file, name, item.dims, values.shape, dtype, item.attrs)
-        if not write or not values.size:
-            continue
-
-        if is_text:
-            h5py.Dataset(dataset)[...] = values
-        else:
-            dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values))
+            dtype = h5py.string_dtype()
+        dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
+        if values.size:
+            dataset[...] = values
 
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
-        node = file.require_group(group or "/").id
         # HDF5 has attributes that are a number, a text or an array of either.
         if isinstance(value, dict | list):
             value = json.dumps(value)
-        _put_attribute(node, key, value)
+        file.require_group(group or "/").attrs[key] = value
 
 
 def _check_dimensions(data: xr.Dataset) -> None:
@@ -137,62 +119,28 @@ def add_variable(
     are soft links to coordinates outside it, which programs need that open the group alone. Raises ValueError if a
     dimension has no coordinate.
     """
-    return h5py.Dataset(_add_dataset(file, name, dims, shape, dtype, attributes))
-
-
-def _add_dataset(
-    file: h5py.File, name: Hashable, dims: Sequence[Hashable], shape: Sequence[int], dtype: Any, attributes: Any
-) -> h5py.h5d.DatasetID:
-    """Add an empty dataset as ``add_variable`` does; return it as an object of h5py's low level.
-
-    The high level makes the same file in four times the time: it asks HDF5 for much of each dataset that it opens.
-    """
     path = str(name)
     group, _, own_name = path.rpartition("/")
-    nodes = file.id
-    if path.encode() in nodes:
+    if path in file:
         # A soft link to a coordinate of that name outside the group has its place.
         del file[path]
-    if group and group.encode() not in nodes:
-        file.create_group(group)
 
-    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     # Two files of the same contents have the same bytes, whenever they are written.
-    properties.set_obj_track_times(False)
-    stored_type = h5py.h5t.py_create(np.dtype(dtype), logical=True)
-    space = h5py.h5s.create_simple(tuple(shape))
-    dataset = h5py.h5d.create(nodes, path.encode(), stored_type, space, properties)
-
+    dataset = file.create_dataset(path, tuple(shape), dtype, track_times=False)
     if tuple(dims) == (name,):
-        h5py.h5ds.set_scale(dataset, own_name.encode())
+        dataset.make_scale(own_name)
     else:
         for axis, dim in enumerate(map(str, dims)):
-            if dim.encode() not in nodes:
+            if dim not in file:
                 raise ValueError(f"{name}: its dimension {dim} has no coordinate")
-            h5py.h5ds.attach_scale(dataset, h5py.h5d.open(nodes, dim.encode()), axis)
+            dataset.dims[axis].attach_scale(file[dim])
             link = _path(group, dim.rpartition("/")[2])
-            if link.encode() not in nodes:
+            if link not in file:
                 file[link] = h5py.SoftLink(f"/{dim}")
 
     for key, value in attributes.items():
-        _put_attribute(dataset, key, value)
+        dataset.attrs[key] = value
     return dataset
-
-
-def _put_attribute(node: Node, key: str, value: Any) -> None:
-    """Give a group or a dataset an attribute, which replaces one of the same name."""
-    if isinstance(value, str) and not h5py.h5a.exists(node, key.encode()):
-        attribute = h5py.h5a.create(node, key.encode(), STORED_TEXT, ONE_VALUE)
-        attribute.write(np.array(value, dtype=TEXT))
-        return
-
-    # Other values are few. The high level finds a type for them.
-    holder: h5py.Group | h5py.Dataset
-    if isinstance(node, h5py.h5g.GroupID):
-        holder = h5py.Group(node)
-    else:
-        holder = h5py.Dataset(node)
-    holder.attrs[key] = value
 
 
 def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Dataset:
@@ -306,26 +254,26 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
     variables: Variables = {}
     attributes: dict[str, Any] = {}
     with files.acquire_context() as file:
-        nodes = dict(_nodes("", h5py.h5g.open(file.id, b"/")))
-        # Objects are recognised by their addresses: for the name of an object HDF5 would search the whole file.
-        paths = {h5py.h5o.get_info(node).addr: path for path, node in nodes.items()}
+        nodes = dict(_nodes("", file))
+        # Nodes are equal where they are the same object: for the name of an object HDF5 would search the whole file.
+        paths = {node: path for path, node in nodes.items()}
 
         for path, node in nodes.items():
             stored = _stored_attributes(node)
-            described = {key: _attribute(value) for key, value in stored.items() if key not in DIMENSION_ATTRIBUTES}
-            if isinstance(node, h5py.h5g.GroupID):
+            described = {key: value for key, value in stored.items() if key not in DIMENSION_ATTRIBUTES}
+            if isinstance(node, h5py.Group):
                 attributes |= {_path(path, key): value for key, value in described.items()}
                 continue
-            if bytes(stored.get("NAME", b"")).startswith(NO_COORDINATE):
+            if str(stored.get("NAME")).startswith(NO_COORDINATE):
                 continue
 
-            dims = _dimensions(file, path, node, stored, paths)
+            dims = _dimensions(path, node, stored, paths)
             # Texts are read at once: they are few, and the type of numpy's array depends on the longest. So are
             # coordinates, of which xarray makes indexes.
             if h5py.check_string_dtype(node.dtype):
-                data = h5py.Dataset(node).asstr()[...].astype(str)
+                data = node.asstr()[...].astype(str)
             elif dims == [path]:
-                data = h5py.Dataset(node)[...]
+                data = node[...]
             else:
                 data = indexing.LazilyIndexedArray(StoredArray(files, path, node.shape, node.dtype))
             variables[path] = xr.Variable(dims, data, described)
@@ -337,65 +285,45 @@ def _path(*parts: str) -> str:
     return "/".join(parts).strip("/")
 
 
-def _nodes(path: str, group: h5py.h5g.GroupID) -> Iterator[tuple[str, Node]]:
+def _nodes(path: str, group: h5py.Group) -> Iterator[tuple[str, Node]]:
     """The ``group`` at a ``path``, its datasets, and then each group in it with its own contents, by their paths.
 
-    Soft links are left out: they lead to coordinates of other groups. Nodes are of h5py's low level: its groups and
-    datasets take twice the time.
+    Soft links are left out: they lead to coordinates of other groups.
     """
     yield path, group
     groups = {}
     for name in group:
-        if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
-        member = h5py.h5o.open(group, name)
-        member_path = _path(path, name.decode("utf-8", "surrogateescape"))
-        if isinstance(member, h5py.h5d.DatasetID):
-            yield member_path, member
-        elif isinstance(member, h5py.h5g.GroupID):
-            groups[member_path] = member
+        member = group[name]
+        if isinstance(member, h5py.Dataset):
+            yield _path(path, name), member
+        elif isinstance(member, h5py.Group):
+            groups[_path(path, name)] = member
 
     for inner_path, inner in groups.items():
         yield from _nodes(inner_path, inner)
 
 
 def _stored_attributes(node: Node) -> dict[str, Any]:
-    """The attributes of a group or a dataset with texts as bytes, without the list of the datasets that a scale has."""
-    stored: dict[str, Any] = {}
-    for index in range(h5py.h5a.get_num_attrs(node)):
-        attribute = h5py.h5a.open(node, index=index)
-        name = attribute.name.decode("utf-8", "surrogateescape")
-        if name == "REFERENCE_LIST":
-            continue
-
-        dtype = attribute.dtype
-        if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL:
-            stored[name] = h5py.Empty(dtype)
-            continue
-        values = np.empty(attribute.shape, dtype)
-        # The type is named because numpy counts a type that is itself an array among the axes.
-        attribute.read(values, h5py.h5t.py_create(dtype))
-        stored[name] = values[()]
-    return stored
+    """The attributes of a group or a dataset, without the lists of the scales of a dataset and of what a scale has."""
+    lists = {"REFERENCE_LIST", "DIMENSION_LIST"}
+    return {name: _attribute(node.attrs[name]) for name in node.attrs if name not in lists}
 
 
-def _dimensions(
-    file: h5py.File, path: str, dataset: h5py.h5d.DatasetID, stored: Mapping[str, Any], paths: Mapping[int, str]
-) -> list[str]:
+def _dimensions(path: str, dataset: h5py.Dataset, stored: Mapping[str, Any], paths: Mapping[Node, str]) -> list[str]:
     """The names of the dimensions of a ``dataset`` at a ``path``, with ``stored`` attributes.
 
-    The dimension of an axis is named by the path of the scale that is attached to it, which ``paths`` has by the
-    address; a scale has the dimension of its own path. An axis without a scale is a dimension that no other dataset
-    has.
+    The dimension of an axis is named by the path of the scale that is attached to it, which ``paths`` has; a scale has
+    the dimension of its own path. An axis without a scale is a dimension that no other dataset has.
     """
-    if dataset.rank == 1 and stored.get("CLASS") == b"DIMENSION_SCALE":
+    if dataset.ndim == 1 and stored.get("CLASS") == "DIMENSION_SCALE":
         return [path]
 
     dims = []
-    for axis, scales in enumerate(stored.get("DIMENSION_LIST", [[]] * dataset.rank)):
+    for axis, scales in enumerate(dataset.dims):
         if len(scales):
-            scale = h5py.h5r.dereference(scales[0], file.id)
-            dims.append(paths[h5py.h5o.get_info(scale).addr])
+            dims.append(paths[scales[0]])
         else:
             dims.append(_path(path, f"axis_{axis}"))
     return dims
