@@ -27,6 +27,7 @@ from vipetsc.case.features import refusals
 from vipetsc.case.nnm_checks import (
     ONE_CONTACT,
     check_condensed,
+    check_damped,
     check_forced,
     check_gaps,
     check_lattice,
@@ -133,6 +134,8 @@ class NnmCase(CaseFile):
         problems = [*check_options(nnm), *refusals(cls, refusable, valid)]
         if nnm.system == "own":
             problems += _check_own(nnm, contacts, problems, valid)
+            if nnm.custom is not None:
+                problems += check_damped(nnm, len(nnm.custom.masses))
             return problems
 
         cell, wrong = check_cell(lattice)
@@ -170,6 +173,7 @@ class NnmCase(CaseFile):
         problems += check_start_sites(nnm, len(sites))
         problems += check_size(nnm, lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
+        problems += check_damped(nnm, lattice.cells * cell.dofs)
         rigid = rigid_motions(lattice, contacts, cell, gaps)
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 

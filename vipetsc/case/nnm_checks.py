@@ -7,7 +7,7 @@ from vipetsc.case.case_file import Problem, Valid
 from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites, path_of, values_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
-from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_LATTICE, NnmTable
+from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_DAMPED, MOST_OF_LATTICE, NnmTable
 from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
@@ -214,6 +214,13 @@ def _is_odd(lattice: LatticeTable) -> bool:
 def check_method(nnm: NnmTable) -> Iterator[Problem]:
     """Problems with keys of another method than the one by which motions are found."""
     foreign: tuple[str, ...]
+    if nnm.method == "damped":
+        if nnm.system == "condensed":
+            yield Problem("nnm.method", "damped", 'needs all masses: nnm.system = "chain", "reduced" or "own"')
+        for key in ("switch", "orbits_at", "start_frequency", "start_sites", "multipliers"):
+            if getattr(nnm, key):
+                yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; omit it")
+        return
     if nnm.system == "condensed" or nnm.method == "condensed":
         method = "shot"
         foreign = ("switch",)
@@ -265,6 +272,14 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
     if inside:
         edges = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
         yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({edges} rad/s); motions there radiate")
+
+
+def check_damped(nnm: NnmTable, masses: int) -> Iterator[Problem]:
+    """The problem of damped modes of too many ``masses``, each of which has harmonics of its own."""
+    unknowns = masses * (2 * min(nnm.harmonics, MOST_OF_DAMPED) + 1)
+    if nnm.method == "damped" and unknowns > MOST_UNKNOWNS:
+        remedy = f"{masses} masses have up to {unknowns} unknown harmonics, of at most {MOST_UNKNOWNS}; decrease it"
+        yield Problem("nnm.harmonics", nnm.harmonics, remedy)
 
 
 def check_start_sites(nnm: NnmTable, count: int) -> Iterator[Problem]:

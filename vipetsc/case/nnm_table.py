@@ -20,6 +20,8 @@ MOST_OF_LATTICE = 40_000
 # points, and cost the cube: six points in contact take 8, 25 and 237 s of CPU at 52, 100 and 200 masses, without
 # matrices 2 to 3.
 FEW_MASSES = 100
+# Last harmonic of damped modes at most; their number does not adapt to the motion.
+MOST_OF_DAMPED = 63
 
 Bounds = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(rising)]
 
@@ -114,8 +116,10 @@ class NnmTable(Section):
         " user-defined system (own)",
         "reduced",
     )
-    method: Literal["shooting", "condensed"] = described(
-        "shooting, or harmonic balance condensed onto contacts and nonlinear springs", "shooting"
+    method: Literal["shooting", "condensed", "damped"] = described(
+        "shooting; harmonic balance condensed onto contacts and nonlinear springs; damped: modes with dashpots and"
+        " contacts that dissipate (frequency and damping ratio over the energy)",
+        "shooting",
     )
     start_frequency: list[Positive] = described(
         "frequencies outside the pass bands at which branches of a lattice begin, instead of modes", [], unit="rad/s"

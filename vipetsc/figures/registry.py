@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import (
     condensed_branches,
     cost_maps,
+    damped_modes,
     entropy,
     frequency_energy,
     identified,
@@ -88,6 +89,7 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
     branch_kinds.ORBITS: frequency_energy.backbone,
     branch_kinds.CONDENSED: condensed_branches.condensed_branches,
     branch_kinds.RESPONSES: nfrc.frequency_response,
+    branch_kinds.DAMPED: damped_modes.damped_modes,
 }
 
 BRANCH = "branch"  # the figure of branches

@@ -24,7 +24,10 @@ RESPONSES = "responses"
 CHOSEN = "chosen"
 """Kind of points at values that the case asks for, whose names in files are ``quantity@value``."""
 
-BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES)
+DAMPED = "damped"
+"""Damped modes: frequency and damping ratio over the energy."""
+
+BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES, DAMPED)
 
 
 def branch_kind(branch: xr.Dataset) -> str:

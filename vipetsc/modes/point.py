@@ -67,10 +67,13 @@ class Point(Solution):
     elongations: np.ndarray = field(default_factory=lambda: np.empty(0))
     loss: float = np.nan
     force: float = np.nan
+    zeta: float = np.nan
 
     @property
     def damping_ratio(self) -> float:
-        """Loss over 4 pi times the energy: of a linear mode its damping ratio."""
+        """Loss over 4 pi times the energy: of a linear mode its damping ratio; of a damped mode ``zeta``."""
+        if np.isfinite(self.zeta):
+            return self.zeta
         return self.loss / (4 * np.pi * self.energy)
 
     @property

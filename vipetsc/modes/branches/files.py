@@ -18,7 +18,7 @@ import xarray as xr
 
 from vipetsc.endings import Ended, Ending
 from vipetsc.io.atomic import write_text
-from vipetsc.io.branch_kinds import CONDENSED, ORBITS, RESPONSES, kind_of_file
+from vipetsc.io.branch_kinds import CONDENSED, DAMPED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import kinds_in, stored_kinds
@@ -45,6 +45,7 @@ PASSED = "points visited as the parameter increases slowly; a jump where they ar
 OF_ALL = ("multiplier_max", "slope", *OF_LOSSES, "contacts", "region")
 TABLES = {
     ORBITS: {"x": "initial", "half_trace": "half_trace", "half_trace_imaginary": "half_trace_imaginary"},
+    DAMPED: {"w": "elongation"},
     CONDENSED: {"w": "elongation", "harmonics": "harmonics_kept", "truncation": "truncation"},
 }
 
@@ -282,6 +283,43 @@ def _condensed_variables(branch: Branch[Point]) -> Variables:
     }
 
 
+def _damped_variables(branch: Branch[Point]) -> Variables:
+    """Harmonics of all masses and the damping ratio of damped modes, as unknowns, and their tangents."""
+    count = branch.dofs
+    x = branch.column("x").reshape(len(branch.points), count)
+    # The first point of a branch that has gone no further has no tangent.
+    directions = [p.tangent[:-1] if p.tangent.size else np.full(count, np.nan) for p in branch.points]
+    elongations = np.array([p.elongations for p in branch.points]).reshape(len(branch.points), -1)
+    text = "mass by mass, cosines of all harmonics and then minus their sines (m); last, the damping ratio"
+    return _nnm_variables(branch) | {
+        "unknown": variable("unknown", np.arange(1, count + 1), "1", "number of the unknown"),
+        "x": variable(("point", "unknown"), x, "1", text),
+        "tangent": variable(("point", "unknown"), np.reshape(directions, x.shape), "1", "tangent of the branch"),
+        "truncation": variable("point", branch.column("truncation"), "1", "estimated size of the neglected harmonics"),
+        "place": variable("place", np.arange(1, elongations.shape[1] + 1), "1", "contact, then smooth spring"),
+        "elongation": variable(("point", "place"), elongations, "m", "elongation at phase 0"),
+        "harmonics_kept": variable("point", branch.column("order"), "1", "number of the last harmonic"),
+    }
+
+
+def _damped_modes(data: xr.Dataset) -> list[Point]:
+    """The damped modes of a file."""
+    points = []
+    for i, fields in enumerate(_nnm_fields(data)):
+        tangent = np.append(data["tangent"].values[i], data["tangent_period"].values[i])
+        point = Point(
+            **fields,
+            x=data["x"].values[i],
+            zeta=float(data["x"].values[i, -1]),
+            tangent=tangent[np.isfinite(tangent)],
+            truncation=float(data["truncation"].values[i]),
+            elongations=data["elongation"].values[i],
+            order=int(data["harmonics_kept"].values[i]),
+        )
+        points.append(point)
+    return points
+
+
 def _condensed_motions(data: xr.Dataset) -> list[Point]:
     """The condensed motions of a file."""
     points = []
@@ -378,5 +416,6 @@ FORMATS = {
     CONDENSED: Format(
         ("point", "harmonics", "tangent", "next_step"), "place", _condensed_variables, _condensed_motions
     ),
+    DAMPED: Format(("point", "x", "tangent", "next_step"), "unknown", _damped_variables, _damped_modes),
     RESPONSES: Format(("xi", "tangent", "next_step"), "site", _response_variables, _responses),
 }

@@ -45,6 +45,7 @@ from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.modes.branches.damped import DampedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
 from vipetsc.modes.branches.growth import Growth, Listener
 from vipetsc.modes.branches.lattices import LatticeMethod
@@ -67,6 +68,8 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
         return ResponseMethod
     if case.krylov:
         return LatticeMethod
+    if case.nnm.method == "damped":
+        return DampedMethod
     if case.condensed:
         return CondensedMethod
     return ShootingMethod

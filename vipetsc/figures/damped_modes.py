@@ -1,0 +1,42 @@
+"""Damped modes: frequency and damping ratio over the energy, a column a branch."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from vipetsc.figures import panels, style
+from vipetsc.figures.frequency_energy import HOLLOW, MARKS
+from vipetsc.io.branch_kinds import kind_names
+from vipetsc.io.netcdf import open_netcdf
+
+
+def damped_modes(paths: Sequence[Path]) -> Figure:
+    """Draw frequency and damping ratio of the branches in ``paths`` over their energies, with special points."""
+    branches = []
+    for path in paths:
+        with open_netcdf(path, "branch", ("energy", "frequency", "damping_ratio", "kind")) as file:
+            branches.append(file.load())
+
+    figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 3.6)
+    columns = figure.subplots(2, len(branches), sharex="col", squeeze=False).T
+    for column, branch in zip(columns, branches, strict=True):
+        energy = branch["energy"].values
+        kinds = kind_names(branch)
+        for axes, name in zip(column, ("frequency", "damping_ratio"), strict=True):
+            values = branch[name].values
+            axes.plot(energy, values, color=style.BLACK)
+            for kind, (mark, label) in MARKS.items():
+                at = kinds == kind
+                if at.any():
+                    axes.plot(energy[at], values[at], mark, ms=3, label=label, **HOLLOW)
+        # Branches begin at energies that are many decades below those at which they change.
+        if energy.min() > 0 and energy.max() > 30 * energy.min():
+            column[0].set_xscale("log")
+        column[0].set_title(str(branch.attrs["name"]))
+        column[0].set_ylabel("frequency (Hz)")
+        column[1].set(xlabel="mean energy (J)", ylabel="damping ratio")
+        if column[0].get_legend_handles_labels()[0]:
+            column[0].legend(fontsize=6, loc="best")
+    panels.label_panels(columns.T)
+    return figure
