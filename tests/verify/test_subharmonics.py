@@ -36,6 +36,7 @@ def test_the_fold_is_that_of_multiple_scales():
     for small in (1e-3, 1e-4):
         case = duffing(small, range=[3 + 7 * small, 3 + 12 * small], harmonics=9)
         curves = follow_all(case, None, MPI.COMM_SELF)
+        assert curves[0].about["drive_harmonic"] == 3
         # All shifts in time of a motion are one curve, which leaves the range at both ends.
         assert len(curves) == 3
         assert [point.kind for point in curves[0].points if point.kind != "regular"] == []

@@ -136,7 +136,8 @@ def lag_of(branch: xr.Dataset) -> np.ndarray:
     """
     name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
     # The mean is harmonic 0.
-    order = NfrcCase.of(branch).nfrc.subharmonic
+    # Of subharmonics the drive's frequency is a multiple of the motion's.
+    order = int(branch.attrs.get("drive_harmonic", 1))
     fundamental = branch[name].values[:, 0, order] + 1j * branch[f"{name}_imaginary"].values[:, 0, order]
     lag = -np.degrees(np.angle(fundamental))
     # Above -180 by more than rounding: of the two angles of antiphase it is 180.

@@ -86,6 +86,8 @@ class ResponseMethod(Method[Response]):
             about["unit"] = unit_of(case.nfrc.over, case.model_dump(by_alias=True, exclude_none=True))
         if isola:
             about["isola"] = number
+        if case.nfrc.subharmonic > 1:
+            about["drive_harmonic"] = case.nfrc.subharmonic
         if curve.values:
             about["family"] = curve.values
 
