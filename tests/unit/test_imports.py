@@ -36,6 +36,7 @@ FLOORS = (
     "progress",
     "sources",
     "process",
+    "endings",
     "wording",
     "__init__",
 )

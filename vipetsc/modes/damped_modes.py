@@ -23,6 +23,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vipetsc.modes.balance.conservative import departures_of, fraction_closed
+from vipetsc.modes.balance.harmonic_balance import BalanceFrame
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.departures import Departure
 from vipetsc.modes.newton import DenseNewton
@@ -36,13 +37,13 @@ LARGE_FACTOR = 2.0
 ALONG = 1e-6
 
 
-class DampedFrame:
+class DampedFrame(BalanceFrame):
     """Unknowns ``xi`` (n + 2,) at and near a motion with the harmonics ``x`` (n,), ``zeta`` and ``omega`` in rad/s."""
-
-    tangent: np.ndarray
 
     def __init__(self, modes: "DampedModes", x: np.ndarray, zeta: float, omega: float) -> None:
         self.modes = modes
+        self.newton = modes.newton
+        self.tolerance = modes.tolerance
         self.size = float(np.abs(x).max())
         self.omega = omega
         self.xi = np.concatenate([x / self.size, [zeta, 1.0]])
@@ -78,19 +79,6 @@ class DampedFrame:
     @property
     def _force(self) -> float:
         return float(self.size * self.omega**2 * self.modes.system.masses.max())
-
-    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 2,) for the motion at an ``arclength`` along the tangent."""
-        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
-
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 2,) for the motion with row . xi = value."""
-        return self.modes.newton.solve(self, guess, row, value, self.modes.tolerance)
-
-    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 2,) at a solution, on the side of the frame's own."""
-        border = np.vstack([self.jacobian(xi), self.tangent])
-        return unit(np.linalg.solve(border, np.eye(len(xi))[-1]))
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
         """The point that an attempt has converged to; ``direction`` (n + 2,) is the branch's unit tangent there."""

@@ -7,11 +7,11 @@ import numpy as np
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm_table import MOST_OF_DAMPED
 from vipetsc.io.branch_kinds import DAMPED
-from vipetsc.modes.damped_modes import DampedModes
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.losses import dissipation_of
 from vipetsc.modes.branches.orbits import NnmMethod, start_energy
+from vipetsc.modes.damped_modes import DampedModes
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import PeriodicProblem, StartError
 from vipetsc.modes.shared_frequencies import check_start
