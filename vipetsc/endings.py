@@ -20,6 +20,7 @@ class Ending(Enum):
     POINTS_USED = "{points} points reached: increase {key} and resume to continue"
     # Of branches that have left their range.
     END_OF_RANGE = "reached the end of nfrc.range, {end:g}"
+    END_OF_AMPLITUDES = "left the range of amplitudes by nfrc.isola_reach, at {end:g}"
     END_OF_PARAMETER = "reached p = {end:g}"
     OUT_OF_ENERGIES = "left the energy range {low:g} to {high:g} J"
     OUT_OF_FREQUENCIES = "left the frequency range {low:g} to {high:g} rad/s"

@@ -186,6 +186,10 @@ class NfrcCase(Case):
                 "looked for over other amplitudes, along which this curve runs itself; omit it, or vary the frequency"
             )
             yield Problem("nfrc.isolas", nfrc.isolas, remedy)
+        if nfrc.curves_of and nfrc.over != "frequency":
+            yield Problem(
+                "nfrc.curves_of", nfrc.curves_of, 'begin on curves over the frequency: nfrc.over = "frequency"'
+            )
         if nfrc.harmonics < nfrc.subharmonic:
             remedy = f"the drive is harmonic {nfrc.subharmonic} of a motion with nfrc.subharmonic periods; increase it"
             yield Problem("nfrc.harmonics", nfrc.harmonics, remedy)

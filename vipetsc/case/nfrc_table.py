@@ -80,6 +80,13 @@ class NfrcTable(Section):
     switch: Annotated[list[Literal["branch-point", "period-doubling"]], AfterValidator(once)] = described(
         "kinds of special points at which the curves that cross are followed, with the harmonics that they need", []
     )
+    curves_of: Annotated[
+        list[Literal["fold", "branch-point", "period-doubling", "neimark-sacker"]], AfterValidator(once)
+    ] = described(
+        "kinds of special points on curves over the frequency that are followed over frequency and amplitude, the"
+        " latter up to the factor `isola_reach`",
+        [],
+    )
     special_points: Literal["stability", "all"] = described(
         "special points other than folds: where states become stable or unstable, or all where the number"
         " of growing perturbations changes",

@@ -43,6 +43,8 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
     Raises OSError or ValueError for a file that holds no response.
     """
     branches = responses_in(paths, "share")
+    if all("special" in branch.attrs for branch in branches):
+        return response_page(branches, [_draw_plane], height=2.6)
     rows = [_draw_displacement]
     nfrc = NfrcCase.of(branches[0]).nfrc
     if nfrc.source == "force" and nfrc.over == "frequency":
@@ -213,6 +215,23 @@ def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: b
             if labelled:
                 look["label"] = label
             axes.plot(parameter[places], values[places], **look)
+
+
+def _draw_plane(axes: Axes, branch: xr.Dataset) -> None:
+    """Draw a curve of special points over frequency and amplitude, with its cusps."""
+    frequency = parameter_of(branch)
+    amplitude = branch["amplitude"].values
+    label = next(label for kind, (label, *_) in SPECIAL.items() if kind == branch.attrs["special"])
+    axes.plot(frequency, amplitude, color=style.BLACK, label=label)
+    names = np.array(branch["kind"].attrs["flag_meanings"].split())[branch["kind"].values]
+    for kind, marker in (("cusp", "*"), ("extreme-amplitude", "v")):
+        at = names == kind
+        if at.any():
+            axes.plot(
+                frequency[at], amplitude[at], marker, mfc="white", mec=style.VERMILION, label=kind.replace("-", " ")
+            )
+    axes.set_ylabel("amplitude of the drive")
+    axes.legend(fontsize=6, loc="best")
 
 
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:

@@ -41,7 +41,8 @@ def response_family(paths: Sequence[Path]) -> Figure:
     Rows are the largest relative displacement of the first site, the largest displacement of each named mass that all
     curves have, and the phase of the first site's fundamental under a force over its frequency.
     """
-    curves = responses_in(paths)
+    # Curves of special points over two parameters have a picture of their own.
+    curves = [curve for curve in responses_in(paths) if "special" not in curve.attrs]
     rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
     labels = ["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"]
     locations = _common_locations(curves)

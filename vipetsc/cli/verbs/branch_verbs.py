@@ -240,6 +240,10 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
 
     unit = parameter_unit(case, curve)
     parameter = parameter_values(curve)
+    if "special" in curve.about:
+        cusps = [point.measured for point in curve.points if point.kind == "cusp"]
+        ends = (f"{cusp.frequency:.6g} rad/s at amplitude {cusp.amplitude:.6g}" for cusp in cusps)
+        return [*rows, ("cusps", ", ".join(ends) or "none")]
     for kind, heading in SPECIAL_POINTS.items():
         at = parameter[curve.is_kind(kind)]
         if at.size:

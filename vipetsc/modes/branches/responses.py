@@ -18,6 +18,7 @@ from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.kinds import RESPONSE_KINDS
 from vipetsc.modes.branches.method import CrossingBranch, Method, value_kind
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import PeriodicProblem, SpecialKind
@@ -34,6 +35,7 @@ from vipetsc.modes.response.isolated import (
 )
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
+from vipetsc.modes.response.special_curves import SpecialCurve, SpecialSteps, crosses_amplitude
 from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -44,6 +46,8 @@ from vipetsc.spectra.measures import JOINT
 
 # Between the name of a curve and the number of an isolated one near it.
 ISOLA = "-isola-"
+# The same for curves of special points, after their kind.
+CURVE = "-curve-"
 
 
 class ResponseMethod(Method[Response]):
@@ -69,7 +73,7 @@ class ResponseMethod(Method[Response]):
 
     def new_branch(self, name: str) -> Branch[Response]:
         """A curve without states, an isolated one near it, or one that crosses it."""
-        base = name
+        base, special_kind = _without_curve(name)
         case_of = None
         for kind in self.case.nfrc.switch:
             base, crosses, _ = base.partition(f"-{kind}-")
@@ -86,6 +90,8 @@ class ResponseMethod(Method[Response]):
             about["unit"] = unit_of(case.nfrc.over, case.model_dump(by_alias=True, exclude_none=True))
         if isola:
             about["isola"] = number
+        if special_kind:
+            about["special"] = special_kind
         if case.nfrc.subharmonic > 1:
             about["drive_harmonic"] = case.nfrc.subharmonic
         if curve.values:
@@ -132,10 +138,37 @@ class ResponseMethod(Method[Response]):
         """The isolated curves near a curve, and those that cross it or one of these at ``nfrc.switch``."""
         yield from self._isolas(branch, followed)
         curve = next(curve for curve in self.curves if curve.name == branch.name)
+        for kind in self.case.nfrc.curves_of:
+            for number, point in enumerate((p for p in branch.points if p.kind == kind), 1):
+                yield from self._special_curve(curve, point, f"{branch.name}-{kind}{CURVE}{number}", followed)
         for other in [branch, *followed]:
+            if "special" in other.about:
+                continue
             for kind in self.case.nfrc.switch:
                 for number, point in enumerate((p for p in other.points if p.kind == kind), 1):
                     yield from self._crossing(curve, point, f"{other.name}-{kind}-{number}", followed)
+
+    def _special_curve(
+        self, curve: ResponseCurve, point: Response, name: str, followed: Sequence[Branch[Response]]
+    ) -> Iterator[CrossingBranch]:
+        """The curve of special points through a special ``point``, in both directions, unless followed already."""
+        states = self._equations(curve, curve.case)
+        assert isinstance(states, SteadyStates)
+
+        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> SpecialSteps:
+            assert isinstance(problem, SpecialCurve)
+            return SpecialSteps(problem, start, max(self.case.nfrc.points - 1 - done, 0))
+
+        def start(side: int) -> tuple[SpecialCurve, Response]:
+            problem = SpecialCurve(states, point.kind, point)
+            return problem, problem.start(side)
+
+        others = [other.points for other in followed if other.about.get("special") == point.kind]
+        if any(crosses_amplitude(points, point) for points in others):
+            return
+        yield CrossingBranch(name, partial(start, 1), rule)
+        if followed[-1].ended.ending is not Ending.CLOSED:
+            yield CrossingBranch(f"{name}-back", partial(start, -1), rule)
 
     def _crossing(
         self, curve: ResponseCurve, point: Response, name: str, followed: Sequence[Branch[Response]]
@@ -203,6 +236,8 @@ class ResponseMethod(Method[Response]):
 
     def chosen(self, problem: PeriodicProblem[Response]) -> list[SpecialKind[Response]]:
         """The states at the values ``nfrc.points_at``, within the range."""
+        if isinstance(problem, SpecialCurve):
+            return []
         assert isinstance(problem, SteadyStates | StatesOverKey)
         options = self.case.nfrc
         of_curve = response_measures(self.case)
@@ -233,8 +268,17 @@ class ResponseMethod(Method[Response]):
         """The state with its measures, which special points have already."""
         if point.measures is not None:
             return point
-        assert isinstance(problem, SteadyStates | StatesOverKey)
+        assert isinstance(problem, SteadyStates | StatesOverKey | SpecialCurve)
         return replace(point, measures=problem.measured(point.xi))
+
+
+def _without_curve(name: str) -> tuple[str, str]:
+    """The name of the curve on which a curve of special points begins, and their kind; "" of any other curve."""
+    base, curve, _ = name.partition(CURVE)
+    if not curve:
+        return name, ""
+    kind = next(kind for kind in RESPONSE_KINDS if base.endswith(f"-{kind}"))
+    return base.removesuffix(f"-{kind}"), kind
 
 
 def _axes(case: NfrcCase) -> Variables:
