@@ -84,19 +84,17 @@ def test_contacts_of_the_step_that_stalls_are_logged(stiffness):
 
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize(
-    ("states_every", "interval", "damping", "episodes"),
-    [(None, 2e-4, None, 19), (5, 2e-4, None, 19), (2, 8e-4, {"mass": 10.0}, 21)],
+    ("states_every", "interval", "damping"), [(None, 2e-4, None), (5, 2e-4, None), (2, 8e-4, {"mass": 10.0})]
 )
-def test_contacts_after_the_stall_are_not_logged(states_every, interval, damping, episodes):
+def test_contacts_after_the_stall_are_not_logged(states_every, interval, damping):
     """Other contacts have ended before a site stalls, and would go on after it; some were logged at a checkpoint.
 
-    With samples 0.8 ms apart, several steps, the stall lies between two samples. Contacts are followed to the end of
-    the step in which a site stalls.
+    With samples 0.8 ms apart, several steps, the stall lies between two samples.
     """
     case = struck_case([1e6, 1e6, STALLING], struck=[5, 20, 31], interval=interval, damping=damping)
     result = ends_as_alone(case, states_every)
     assert "stalled: the contacts of sites 3 at 0.0029" in result.sentence
-    assert result.statistics["episodes"] == episodes
+    assert result.statistics["episodes"] == 19
 
 
 @pytest.mark.parallel([2, 3])

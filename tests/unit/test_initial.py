@@ -139,8 +139,9 @@ def test_without_a_drive_the_frequency_and_the_cell_are_those_of_the_motion():
     model = case.model()
     assert model.scale == case.initial.amplitude
     assert model.drive.duration == 0.0
-    # A default end is a whole number of sample intervals.
-    assert case.time.end == pytest.approx(24 / model.speed, abs=case.time.sample_interval)
+    # A default end is the last whole number of sample intervals before the traverse.
+    interval = case.time.sample_interval
+    assert case.time.end == pytest.approx(int(24 / model.speed / interval) * interval, rel=1e-12)
     assert linear_case(case).initial == case.initial
 
 

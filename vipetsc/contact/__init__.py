@@ -29,9 +29,10 @@ kink included, and its mode never changes.
 
 **Rest.** Motion within the tolerance of a landing is not resolved. The front of a wave grows from below it where a stop
 has no clearance, and a mass may creep onto a stop, where impacts fade: both have many roots there, on each of which a
-landing would be useless. A site therefore rests if its impact ends within the tolerance, by its energy, or if it would
-land again without having left the tolerance: its force is that of max(x, 0), without loss, and nothing is landed on
-until it is a hundred tolerances away. There it becomes free or closed. The approach velocity of a contact that begins
+landing would be useless. A site therefore rests if it comes back to a stop without having left the tolerance, or if its
+impact is too slow to leave it and its rebound too slow to go beyond a hundred tolerances. At rest its force is that of
+max(x, 0), without loss, and nothing is landed on until it is a hundred tolerances away. There it becomes free or
+closed. The approach velocity of a contact that begins
 at an indentation x > 0 is the speed with which two masses alone come there from x = 0 without loss.
 
 **Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein

@@ -159,12 +159,15 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> bool:
-    """Whether a site stays within the tolerance of a landing on one stop in the step from ``start`` to ``end`` (3,).
+    """Whether a site that may rest stays within the tolerance of a landing in the step from ``start`` to ``end`` (3,).
 
     The step has ``h`` seconds; ``b`` (6,) is overwritten.
     """
     side = landed_side(site, start[0])
     if side == 0:
+        return False
+    # A contact may be so stiff that an impact of any speed ends within the tolerance: its separation is not rest.
+    if site.mode != FREE and gap_of(site, side) > 0.0:
         return False
     bernstein(start, end, h, b)
     stays = True

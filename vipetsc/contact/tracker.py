@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import LANDED_G, Extremes, extremes, shortest_beginning, shortest_impact, switching
+from vipetsc.contact.changes import LANDED_G, MOVED, Extremes, extremes, shortest_beginning, shortest_impact, switching
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -127,9 +127,16 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
 
 
 @kernel
-def _is_unresolved(site: Any, rate: float) -> bool:
-    """Whether an impact on a ``site`` with the speed ``rate`` in m/s ends within the tolerance of its landing."""
-    return 0.5 * site.reduced_mass * rate * rate <= elastic_energy(site.elastic, site.tolerance)
+def _is_unresolved(site: Any, motion: np.ndarray, t: float) -> bool:
+    """Whether an impact on a ``site`` with this ``motion`` (3,) at ``t`` in s is within what is resolved of a motion.
+
+    By its energy it ends within the tolerance of its landing, and its rebound in the range of a site at rest: it comes
+    back there under the acceleration of now, or is so slow that it would take longer than the run so far to leave it.
+    """
+    rate = abs(motion[1])
+    if 0.5 * site.reduced_mass * rate * rate > elastic_energy(site.elastic, site.tolerance):
+        return False
+    return min(0.5 * rate * rate / abs(motion[2]), rate * t) <= MOVED * site.tolerance
 
 
 @kernel
@@ -156,7 +163,7 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
                 if contacts[i].mode == FREE:
                     tracks.sites[i].counts.grazes += 1
                 continue
-            if contacts[i].mode == FREE and _is_unresolved(contacts[i], rate):
+            if contacts[i].mode == FREE and _is_unresolved(contacts[i], motion[i], t):
                 mode = side_of(mode) * RESTING
             _set_mode(contacts, tracks, i, mode, motion[i], energies, t)
             switched += 1
