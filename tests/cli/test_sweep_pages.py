@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import set_words
-from vipetsc.cli.drawing import left_out
+from vipetsc.cli.drawing import sentences_on
 from vipetsc.cli.main import main
 from vipetsc.cli.verbs.sweep_verb import PICTURES
-from vipetsc.figures.sweep_members import Files
+from vipetsc.figures.registry import draw
+from vipetsc.figures.style import LeftOut
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -152,8 +153,10 @@ def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, ca
 def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
     """A sentence names branches that a figure does not show, or the reason why a figure with branches is left out."""
     # An empty folder stands for one with branches.
-    (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), ["ibtet"])
+    (sentence,) = sentences_on(PICTURES, [burst, tmp_path], LeftOut(), ["ibtet"])
     assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"
 
-    (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), None)
+    left_out = LeftOut()
+    draw("sweep", [burst, tmp_path], newest=0.0, left_out=left_out)
+    (sentence,) = sentences_on(PICTURES, [burst, tmp_path], left_out, None)
     assert sentence.startswith("no picture of ibtet_backbone: needs branches of the same law")

@@ -20,8 +20,7 @@ from vipetsc.cli.verbs.branch_verbs import PICTURES, parameter_unit
 from vipetsc.figures import branch_curves, nfrc, registry, response_family, response_outputs, style
 from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.stability import SPACING, StabilityLook, draw_states
-from vipetsc.figures.sweep_members import Files
-from vipetsc.figures.without_picture import reasons_without_pictures
+from vipetsc.figures.style import LeftOut, NoPicture
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.modes.branches.files import stored_states
@@ -274,11 +273,13 @@ def test_outputs_on_one_page_are_those_that_all_curves_have(monkeypatch, variabl
     The lag yields four rows, three amplitudes and a phase of masses, and the largest force yields one.
     """
     curves = [xr.Dataset(dict.fromkeys(names, 1.0)) for names in variables]
-    assert bool(response_outputs.without_outputs(curves)) == (rows == 0)
-
     monkeypatch.setattr(response_outputs, "responses_in", lambda paths: curves)
     monkeypatch.setattr(response_outputs, "response_page", lambda curves, drawn, height: len(drawn))
-    assert response_outputs.response_outputs([]) == rows
+    if rows:
+        assert response_outputs.response_outputs([]) == rows
+    else:
+        with pytest.raises(NoPicture, match="needs"):
+            response_outputs.response_outputs([])
 
 
 def put_condensed_branch(path: Path, points: int, places: int = 1) -> None:
@@ -319,13 +320,17 @@ def test_every_contact_and_every_motion_of_a_condensed_branch_has_a_curve(tmp_pa
 
 
 def test_a_branch_without_points_is_no_file(tmp_path):
-    """A branch without points is named in place of a picture, or the figure is if the folder has no other branch."""
+    """A branch without points is named in place of a picture."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
-    assert registry.draw(BRANCHES, [tmp_path]) == []
-    assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == [registry.BRANCH]
+    alone = LeftOut()
+    assert registry.draw(BRANCHES, [tmp_path], left_out=alone) == []
+    assert not alone.drawn
+    assert [*alone.reasons[registry.BRANCH]] == ["branch-empty"]
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
-    assert [path.name for path in registry.draw(BRANCHES, [tmp_path])] == ["branch-begun.png"]
-    assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == ["branch-empty"]
+    both = LeftOut()
+    assert [path.name for path in registry.draw(BRANCHES, [tmp_path], left_out=both)] == ["branch-begun.png"]
+    assert [*both.reasons[registry.BRANCH]] == ["branch-empty"]
+    assert both.drawn == {registry.BRANCH}
 
 
 def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypatch):

@@ -21,12 +21,11 @@ from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
 from vipetsc.figures.panels import label_panels
 from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
-from vipetsc.figures.runs import without_phase
+from vipetsc.figures.runs import phase
 from vipetsc.figures.schematics import draw_unit_cell
 from vipetsc.figures.sources import BRANCHES, OPTIMUM
-from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
+from vipetsc.figures.style import SCREEN, LeftOut, NoPicture, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
-from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io.read import open_run
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Pair
@@ -193,10 +192,14 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypat
     folder, shape = measured
     # A lower resolution changes no layout: text that is cut off in a fine picture is cut off in a coarse one.
     monkeypatch.setattr(style, "SCREEN", 100)
-    paths = draw("run", [folder], [name])
-    if name in WITHOUT.get(shape, {}):
-        assert paths == []
+    left_out = LeftOut()
+    paths = draw("run", [folder], [name], left_out=left_out)
+    # The reasons are exactly these: a further one would keep a picture from being drawn.
+    reason = WITHOUT.get(shape, {}).get(name)
+    if reason:
+        assert (paths, left_out.reasons) == ([], {name: {name: reason}})
         return
+    assert not left_out.reasons
     (path,) = paths
     assert path == folder / "figures" / f"{name}.png"
     assert_not_blank(path)
@@ -204,20 +207,11 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypat
     assert not list(path.parent.glob(".*"))
 
 
-def test_what_cannot_be_drawn_is_said(measured):
-    """Figures that cannot be drawn have their reasons, and others have none."""
-    folder, shape = measured
-    # The reasons are exactly these: a further one would keep a picture from being drawn.
-    assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
-
-
 def test_a_site_that_was_not_reached_has_no_portrait(tmp_path):
     """A run that ends before a wave has reached the first site has no phase portraits, which would be empty axes."""
     write_run(tmp_path / "run.h5")
-    with open_run(tmp_path / "run.h5") as run:
-        assert without_phase(run, None) == ""
-        at_rest = run.assign(displacement=xr.zeros_like(run["displacement"]))
-    assert without_phase(at_rest, None) == "cell 8, the first site, was at rest all the time"
+    with open_run(tmp_path / "run.h5") as run, pytest.raises(NoPicture, match="cell 8, the first site, was at rest"):
+        phase(run.assign(displacement=xr.zeros_like(run["displacement"])), None)
 
 
 @pytest.mark.slow
@@ -226,7 +220,7 @@ def test_all_of_a_picture_can_be_read(tmp_path):
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with rc_style(), Files() as files:
-        for name, make, _ in drawings("run", [tmp_path], files):
+        for name, make, *_ in drawings("run", [tmp_path], files):
             figure = make()
             save(figure, tmp_path / f"{name}.png")
             assert (name, complaints(figure)) == (name, [])
@@ -275,11 +269,12 @@ def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
 def test_ranks_divide_the_figures_among_them(tmp_path):
     write_run(tmp_path / "run.h5")
     written = []
+    left_out = LeftOut()
     for rank in range(2):
         # Each of two ranks draws every second picture.
-        paths = draw("run", [tmp_path], formats=("pdf",), turns=count(rank, 2))
+        paths = draw("run", [tmp_path], formats=("pdf",), turns=count(rank, 2), left_out=left_out)
         written += [path.name for path in paths]
-    drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path], Files())}
+    drawable = {*figure_names("run")} - {*left_out.reasons}
     assert sorted(written) == sorted(f"{name}.pdf" for name in drawable)
 
 

@@ -12,6 +12,7 @@ from vipetsc.figures import identified, registry, style
 from vipetsc.figures.frequency_energy import MOST_ORBITS, portraits
 from vipetsc.figures.modal import MOST_ROWS, MovedEnergies
 from vipetsc.figures.prefixed_units import prefix_units
+from vipetsc.figures.style import NoPicture
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.transfer_curves import TransferCurve, _of_contact, _superposition
 from vipetsc.figures.warning_lines import warned
@@ -96,10 +97,10 @@ def test_an_identification_has_no_empty_panel(monkeypatch, starts, panels):
     assert len(identified.growing_windows(identification(1, starts)).axes) == panels
 
 
-@pytest.mark.parametrize(("places", "has_reason"), [(0, True), (5, False)])
-def test_profiles_that_were_not_computed_are_a_reason(places, has_reason):
-    data = xr.Dataset({"profile/value": (("parameter", "place"), np.zeros((2, places)))})
-    assert bool(identified.without_profiles(data)) == has_reason
+def test_profiles_that_were_not_computed_are_a_reason():
+    data = xr.Dataset({"profile/value": (("parameter", "place"), np.zeros((2, 0)))})
+    with pytest.raises(NoPicture, match="no profile"):
+        identified.misfit_profiles(data)
 
 
 @pytest.mark.parametrize("count", [MOST_ORBITS, MOST_ORBITS + 3])

@@ -21,8 +21,7 @@ from vipetsc.figures import response_family
 from vipetsc.figures.nfrc import responses_in
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
-from vipetsc.figures.sweep_members import Files
-from vipetsc.figures.without_picture import reasons_without_pictures
+from vipetsc.figures.style import LeftOut
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.sweeps import measure
 
@@ -99,20 +98,19 @@ def test_a_folder_with_one_curve_has_no_common_picture(family, tmp_path):
     folder, _ = family
     single = sorted(folder.glob("branch-*.h5"))[0]
     (tmp_path / single.name).write_bytes(single.read_bytes())
-    assert [path.stem for path in draw("branches", [tmp_path])] == [single.stem]
-    reasons = reasons_without_pictures("branches", [tmp_path], Files(), ["responses"])
-    assert reasons == {"responses": "needs several curves of nfrc"}
+    left_out = LeftOut()
+    assert [path.stem for path in draw("branches", [tmp_path], left_out=left_out)] == [single.stem]
+    assert left_out.reasons["responses"] == {"responses": "needs several curves of nfrc"}
 
 
 def test_curves_of_several_folders_have_a_common_picture(family, tmp_path):
-    """Folders with one curve each have a common picture, which is not reported as missing."""
+    """Folders with one curve each have a common picture."""
     folder, _ = family
     folders = []
     for path in sorted(folder.glob("branch-*.h5"))[:2]:
         folders.append(tmp_path / path.stem)
         folders[-1].mkdir()
         (folders[-1] / path.name).write_bytes(path.read_bytes())
-    assert reasons_without_pictures("branches", folders, Files(), ["responses"]) == {}
     assert [path.stem for path in draw("branches", folders, ["responses"])] == ["responses"]
 
 

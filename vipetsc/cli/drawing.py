@@ -1,7 +1,7 @@
 """Pictures of the results in a folder, drawn from its files on all ranks."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
@@ -16,9 +16,11 @@ from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
-    from vipetsc.figures.sweep_members import Files
+    from vipetsc.figures.style import LeftOut
 
-SWEEP_FIGURES = "sweep"  # the name in the registry of the pictures of sweeps
+# Names in the registry of the pictures of sweeps and of branches.
+SWEEP_FIGURES = "sweep"
+BRANCH_FIGURES = "branches"
 
 
 @dataclass(frozen=True)
@@ -67,19 +69,22 @@ def draw_pictures(
 
     # Imported here: a run without pictures does not load matplotlib.
     from vipetsc.figures.registry import draw
-    from vipetsc.figures.sweep_members import Files
+    from vipetsc.figures.style import LeftOut
+
+    left_out = LeftOut()
 
     def draw_part() -> list[Path]:
         # Pictures are listed by falling duration, so that ranks which take them in turn end at about the same time.
         turns = count(comm.rank, comm.size)
         with reading(pictures, folders):
-            return draw(pictures.source, folders, names, formats, newest=newest, files=files, turns=turns)
+            return draw(pictures.source, folders, names, formats, newest=newest, turns=turns, left_out=left_out)
 
-    # What is left out and what is drawn is read from the same results, which are opened once.
-    with Files() as files:
-        report(pictures, comm, on_root(comm, lambda: left_out(pictures, folders, files, names)))
-        drawn_here = on_every_rank(comm, draw_part)
+    drawn_here = on_every_rank(comm, draw_part)
+
     # ``gather`` returns None on all ranks but the first.
+    for other in comm.gather(left_out) or []:
+        left_out.add(other)
+    report(pictures, comm, on_root(comm, lambda: sentences_on(pictures, folders, left_out, names)))
     return sorted(path for paths in comm.gather(drawn_here) or [] for path in paths)
 
 
@@ -127,41 +132,56 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
         pictures.prepare(folders)
 
 
-def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names: list[str] | None) -> list[str]:
-    """Sentences about pictures that the results do not allow; on one rank, which opens results through ``files``.
+def sentences_on(
+    pictures: Pictures, folders: Sequence[Path], left_out: "LeftOut", names: Sequence[str] | None
+) -> list[str]:
+    """Return sentences about pictures that the results do not allow; on one rank.
 
     Raises FolderError if a figure among ``names`` is one of them.
     """
     from vipetsc.figures.registry import OVER_BRANCHES
     from vipetsc.figures.transfer_curves import curves_left_out
-    from vipetsc.figures.without_picture import reasons_without_pictures
 
-    with reading(pictures, folders):
-        reasons = reasons_without_pictures(pictures.source, folders, files, names)
-    asked = [name for name in names or () if name in reasons]
-    if asked:
-        missing = "; ".join(f"--fig {name}: {reasons[name]}" for name in asked)
-        raise FolderError(f"{folders[0]}: {missing}")
-    sentences = sentences_on(reasons)
+    missing = {name: reasons for name, reasons in left_out.reasons.items() if name not in left_out.drawn}
+    if asked := [name for name in names or () if name in missing]:
+        listed = "; ".join(f"--fig {name}: {next(iter(missing[name].values()))}" for name in asked)
+        raise FolderError(f"{folders[0]}: {listed}")
+    sentences = _by_reason(pictures, folders, left_out)
     if pictures.source != SWEEP_FIGURES:
         return sentences
 
     # Only one page shows branches, and perhaps not all curves of the sweep.
-    branches = [str(folder) for folder in folders if not (folder / "ensemble.h5").exists()]
+    branches = _folders_of_branches(folders)
     if branches and names and OVER_BRANCHES not in names:
         drawn = ", ".join(names)
         sentences.append(f"{drawn}: without the branches of {', '.join(branches)}; --fig {OVER_BRANCHES} draws both")
-    elif branches and OVER_BRANCHES not in reasons and (unrelated := curves_left_out(folders)):
+    elif branches and OVER_BRANCHES not in missing and (unrelated := curves_left_out(folders)):
         sentences.append(f"{OVER_BRANCHES}: without {unrelated}")
     return sentences
 
 
-def sentences_on(reasons: Mapping[str, str]) -> list[str]:
-    """Sentences about figures that are left out, from the ``reasons`` by name."""
+def _by_reason(pictures: Pictures, folders: Sequence[Path], left_out: "LeftOut") -> list[str]:
+    """Return a sentence for each reason of ``left_out``; none for figures that few results have."""
+    from vipetsc.figures.registry import FIGURES, OVER_BRANCHES
+
     by_reason: dict[str, list[str]] = {}
-    for name, reason in reasons.items():
-        by_reason.setdefault(reason, []).append(name)
-    return [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
+    for name, reasons in left_out.reasons.items():
+        is_rare = name in FIGURES and FIGURES[name].needs
+        # Who draws a sweep together with branches expects the figure that shows both.
+        if is_rare and not (name == OVER_BRANCHES and _folders_of_branches(folders)):
+            continue
+        # Each branch is a result of its own; a measure that one of the sweeps has gives its figure pages.
+        for stem, reason in reasons.items():
+            if pictures.source == BRANCH_FIGURES:
+                by_reason.setdefault(reason, []).append(stem)
+            elif name not in left_out.drawn and name not in by_reason.setdefault(reason, []):
+                by_reason[reason].append(name)
+    return [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items() if named]
+
+
+def _folders_of_branches(folders: Sequence[Path]) -> list[str]:
+    """Return those of ``folders`` drawn with a sweep that hold branches."""
+    return [str(folder) for folder in folders if not (folder / "ensemble.h5").exists()]
 
 
 def newest_result(folders: Sequence[Path]) -> float:

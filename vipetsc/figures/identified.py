@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
+from vipetsc.figures.style import NoPicture
 
 MOST_CHANNELS = 8  # on a page, which is 15 inches high then; a note says that there are more
 MOST_NAMES = 12  # parameters that are named in a legend, and whose correlations are written out: more would overlap
@@ -86,18 +87,14 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
     return figure
 
 
-def without_profiles(identified: xr.Dataset) -> str:
-    """Return why an identification has no profiles; empty where it has some."""
-    if not identified.sizes["place"]:
-        return "no profile was computed ([identify] profile = 0)"
-    return ""
-
-
 def misfit_profiles(identified: xr.Dataset) -> Figure:
     """Draw how the misfit grows when each parameter is held at values off the best one, and all others are fitted.
 
     Dashed is the parabola ((value - best) / standard error)^2 of a model that is linear in its parameters.
     """
+    if not identified.sizes["place"]:
+        raise NoPicture("no profile was computed ([identify] profile = 0)")
+
     count = identified.sizes["parameter"]
     columns = min(count, 4)
     rows = -(-count // columns)
@@ -216,9 +213,6 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     panels.label_panels([misfit, course, *starts])
     return figure
 
-
-WITHOUT = {"misfit_profiles": without_profiles}
-"""Why an identification lacks a picture, by the picture's name; the others are always there."""
 
 FIGURES = (record_and_model, residual_correlations, misfit_profiles, parameter_correlation, growing_windows)
 """All pictures of an identification, which bear the names of their functions."""

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
+from vipetsc.figures.style import NoPicture
 from vipetsc.io.read import field_time
 
 MOST_ROWS = 16  # most sites that have a row each, with a marker for each episode; of more there is a map
@@ -68,13 +69,6 @@ class Episodes(NamedTuple):
         return len(self.cells) <= MOST_ROWS and len(self.site) <= MOST_MARKERS
 
 
-def without_impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no picture of its impacts; empty where it has one."""
-    if not run.sizes["site"]:
-        return "the lattice has no contact sites"
-    return "" if run.sizes["episode"] else "no contact closed in this run"
-
-
 def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
 
@@ -82,6 +76,11 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     instead. Where all contacts touch or are pressed from the beginning, there are no impacts: the map is one of their
     indentation, if all displacements were recorded.
     """
+    if not run.sizes["site"]:
+        raise NoPicture("the lattice has no contact sites")
+    if not run.sizes["episode"]:
+        raise NoPicture("no contact closed in this run")
+
     episodes = Episodes.of(run)
     model = Case.of(run).model()
     are_pressed = bool(model.gaps) and max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run

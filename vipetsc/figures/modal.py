@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
+from vipetsc.figures.style import NoPicture
 
 # Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy that all
 # modes have together: a line of less would be flat.
@@ -67,18 +68,15 @@ class MovedEnergies(NamedTuple):
         return cls(labels=[labels[i] for i in shown], energy=moved[shown], rows=len(rows))
 
 
-def without_modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no picture of the energies of its modes; empty where it has one."""
-    if not Case.of(run).model().chain.cell.joins_cells:
-        return "a lattice without springs from cell to cell has no bands"
-    if analysis is None or "bands/transfer" not in analysis:
-        return "needs the analysis of a run with all displacements and velocities"
-    return "" if analysis["bands/modal_energy"].values.any() else "the drive did no work"
-
-
 def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw energies of the linear modes by pass band over time, the impacts below, and transfers by site and band."""
-    assert analysis is not None
+    if not Case.of(run).model().chain.cell.joins_cells:
+        raise NoPicture("a lattice without springs from cell to cell has no bands")
+    if analysis is None or "bands/transfer" not in analysis:
+        raise NoPicture("needs the analysis of a run with all displacements and velocities")
+    if not analysis["bands/modal_energy"].values.any():
+        raise NoPicture("the drive did no work")
+
     energy = analysis["bands/modal_energy"]
     largest = float(energy.sum("bands/part").max())
 

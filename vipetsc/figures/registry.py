@@ -36,7 +36,7 @@ from vipetsc.figures import (
 )
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.sources import BRANCHES, DESIGN, FILES, IDENTIFIED, LAW, OPTIMUM, PAPER, PREDICTION, RUN, SWEEP
-from vipetsc.figures.style import Drawing, Shown, draw_each, rc_style, save
+from vipetsc.figures.style import Drawing, LeftOut, Shown, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
@@ -60,10 +60,8 @@ class FigureSpec(NamedTuple):
     measure
         Of sweeps, a word that ``sweep.measures`` of the case must have; the function gets no other sweeps.
     needs
-        Of sweeps, what a message says that they must hold.
-    without
-        Of runs (run, analysis or None), of branches (branches), of a source in ``FILES`` (data), -> the reason why
-        there is no such picture, or "".
+        What results must hold, for a figure that few results have: nothing is said where they do not hold it, unless
+        the figure is asked for.
     together
         Whether one picture shows all branches of all folders.
     """
@@ -73,7 +71,6 @@ class FigureSpec(NamedTuple):
     function: Callable[..., Any]
     measure: str = ""
     needs: str = ""
-    without: Callable[..., str] | None = None
     together: bool = False
 
 
@@ -121,13 +118,13 @@ BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over 
 
 _SPECS = (
     # The figures of a run are listed by falling duration, so that ranks which share them end at about the same time.
-    FigureSpec("modal_energies", RUN, modal.modal_energies, without=modal.without_modal_energies),
-    FigureSpec("spacetime", RUN, runs.spacetime, without=runs.without_spacetime),
-    FigureSpec("dispersion", RUN, runs.dispersion, without=runs.without_dispersion),
-    FigureSpec("phase", RUN, runs.phase, without=runs.without_phase),
+    FigureSpec("modal_energies", RUN, modal.modal_energies),
+    FigureSpec("spacetime", RUN, runs.spacetime),
+    FigureSpec("dispersion", RUN, runs.dispersion),
+    FigureSpec("phase", RUN, runs.phase),
     FigureSpec("unit_cell", RUN, schematics.unit_cell),
-    FigureSpec("impacts", RUN, impact_panels.impacts, without=impact_panels.without_impacts),
-    FigureSpec("ledger", RUN, runs.ledger, without=runs.without_ledger),
+    FigureSpec("impacts", RUN, impact_panels.impacts),
+    FigureSpec("ledger", RUN, runs.ledger),
     FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("partition", SWEEP, wavenumber_bins.partition, measure="entropy", needs=THREE_AMPLITUDES),
@@ -145,10 +142,8 @@ _SPECS = (
     FigureSpec(OVER_BRANCHES, SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec(BRANCH, BRANCHES, branch),
-    FigureSpec("outputs", BRANCHES, response_outputs.response_outputs, without=response_outputs.without_outputs),
-    FigureSpec(
-        "responses", BRANCHES, response_family.response_family, without=response_family.without_family, together=True
-    ),
+    FigureSpec("outputs", BRANCHES, response_outputs.response_outputs, needs="[output] points or forces"),
+    FigureSpec("responses", BRANCHES, response_family.response_family, needs="several curves", together=True),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
     FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
     FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
@@ -158,10 +153,7 @@ _SPECS = (
     FigureSpec("convergence", OPTIMUM, optimum.convergence),
     FigureSpec("compared_designs", OPTIMUM, optimum.compared_designs),
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
-    *(
-        FigureSpec(draw.__name__, IDENTIFIED, draw, without=identified.WITHOUT.get(draw.__name__))
-        for draw in identified.FIGURES
-    ),
+    *(FigureSpec(draw.__name__, IDENTIFIED, draw) for draw in identified.FIGURES),
 )
 # Nothing may take a figure out and put it back: pictures, and messages about them, come in the order of this table.
 FIGURES: Mapping[str, FigureSpec] = MappingProxyType({spec.name: spec for spec in _SPECS})
@@ -227,6 +219,7 @@ def draw(
     newest: float | None = None,
     omit: Collection[str] = (),
     files: Files | None = None,
+    left_out: LeftOut | None = None,
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; return the files, each complete.
 
@@ -246,6 +239,8 @@ def draw(
         Figures that are left out.
     files
         Results that the caller has opened and will close.
+    left_out
+        Gets the reasons of pictures that have nothing to show.
 
     Raises
     ------
@@ -269,6 +264,7 @@ def draw(
                 formats=formats,
                 turns=itertools.count() if turns is None else turns,
                 keep=keep,
+                left_out=left_out,
             )
 
 
@@ -308,25 +304,50 @@ def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files,
     used: dict[str, int] = {}
     specs = figures_of(SWEEP, folders)
     for name in names:
-        spec = specs.get(name)
-        offered = specified_drawings(spec, ensembles, files) if spec else _measure_drawings(name, ensembles, by_name)
+        if name in specs:
+            offered = _needed_drawings(specs[name], ensembles, folders, files)
+        else:
+            offered = _measure_drawings(name, ensembles, by_name)
         for drawing in offered:
             # Two sweeps in one folder of pictures may offer one stem, and the second would replace the first.
             used[drawing.stem] = used.get(drawing.stem, 0) + 1
             count = used[drawing.stem]
-            yield drawing if count == 1 else drawing._replace(stem=f"{drawing.stem}-no-{count}")
+            stem = drawing.stem
+            if count > 1:
+                stem += f"-no-{count}"
+            yield drawing._replace(stem=stem, figure=name)
+
+
+def _needed_drawings(
+    spec: FigureSpec, ensembles: Sequence[xr.Dataset], folders: Sequence[Path], files: Files
+) -> Iterator[Drawing]:
+    """Yield what ``spec`` offers of the sweeps; of sweeps that lack what it needs a drawing without a picture."""
+    is_empty = True
+    for drawing in specified_drawings(spec, ensembles, files):
+        yield drawing
+        is_empty = False
+    if is_empty:
+        unrelated = ""
+        if spec.name == OVER_BRANCHES:
+            unrelated = transfer_curves.curves_left_out(folders)
+        yield Drawing.without_picture(spec.name, unrelated or f"needs {spec.needs}")
 
 
 def _measure_drawings(name: str, ensembles: Sequence[xr.Dataset], by_name: bool) -> Iterator[Drawing]:
     """Yield the pages of the measure of that ``name``, sweep after sweep."""
     for ensemble in ensembles:
         sweep = table(ensemble)["name"] if len(ensembles) > 1 else ""
-        for measure in measure_pages.measures_of(ensemble):
-            is_asked = measure_pages.figure_name(measure) == name
-            if is_asked and not measure_pages.reason_without_page(ensemble, measure, by_name):
-                others = [other for other in ensembles if other is not ensemble and measure in other]
-                for drawing in measure_pages.measure_pages(ensemble, measure, sweep, others):
-                    yield drawing._replace(draw=warned(drawing.draw, [Shown(sweep, [ensemble])]))
+        stem = "-".join(filter(None, [name, sweep]))
+        measures = [m for m in measure_pages.measures_of(ensemble) if measure_pages.figure_name(m) == name]
+        if not measures:
+            yield Drawing.without_picture(stem, "the sweep does not measure it")
+        for measure in measures:
+            if reason := measure_pages.reason_without_page(ensemble, measure, by_name):
+                yield Drawing.without_picture(stem, reason)
+                continue
+            others = [other for other in ensembles if other is not ensemble and measure in other]
+            for drawing in measure_pages.measure_pages(ensemble, measure, sweep, others):
+                yield drawing._replace(draw=warned(drawing.draw, [Shown(sweep, [ensemble])]))
 
 
 def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
@@ -357,16 +378,17 @@ def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files
 def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files: Files) -> Iterator[Drawing]:
     """Yield the drawing of the branches in ``paths``, from so many ``folders``; none if there is nothing to show."""
     branches = [open_branch(path, files) for path in paths]
+    stem = paths[0].stem if paths else spec.name
     if not all(map(has_points, branches)):
+        yield Drawing.without_picture(stem, "no point of the branch was computed")._replace(figure=spec.name)
         return
-    if spec.without and spec.without(branches):
-        return
-    stem = paths[0].stem if paths else ""
-    if spec.without:
+
+    if spec.name != BRANCH:
         stem = stem.replace(BRANCH, spec.name, 1)
     elif folders > 1:
         stem = stem.replace(BRANCH, "branches", 1)
-    yield Drawing(stem, warned(partial(spec.function, paths), _shown_branches(paths, branches)))
+    draw_branches = warned(partial(spec.function, paths), _shown_branches(paths, branches))
+    yield Drawing(stem, draw_branches, figure=spec.name)
 
 
 def _shown_branches(paths: Sequence[Path], branches: Sequence[xr.Dataset]) -> list[Shown]:
@@ -406,8 +428,7 @@ def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> It
     run, analysis = run_and_analysis(folder, files)
     results = [run] if analysis is None else [run, analysis]
     for spec in specs:
-        if not (spec.without and spec.without(run, analysis)):
-            yield Drawing(spec.name, warned(partial(spec.function, run, analysis), [Shown("", results)]))
+        yield Drawing(spec.name, warned(partial(spec.function, run, analysis), [Shown("", results)]))
 
 
 def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:
@@ -425,8 +446,7 @@ def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> I
     """Yield every figure of ``specs`` from the one file in ``folder`` that has its results."""
     for spec in specs:
         data = result_of(spec.source, folder, files)
-        if not (spec.without and spec.without(data)):
-            yield Drawing(spec.name, partial(spec.function, data))
+        yield Drawing(spec.name, partial(spec.function, data))
 
 
 def result_of(source: str, folder: Path, files: Files) -> xr.Dataset:

@@ -18,21 +18,13 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, parameter_label, parameter_of, responses_in
 from vipetsc.figures.stability import UNDECIDED, StabilityLook, draw_states
+from vipetsc.figures.style import NoPicture
 from vipetsc.figures.swept_axes import SweptKey
-from vipetsc.io.branch_kinds import RESPONSES, branch_kind
+from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
 
 MOST_LOCATIONS = 4  # that have a row each: with those of the site and the phase they fill the height of a page
 MOST_CURVES = 24  # that the legend names, which is then three inches high
 LEGEND_LINE = 0.13  # height in inches of a line of the legend
-
-
-def without_family(curves: Sequence[xr.Dataset]) -> str:
-    """Return why the branches ``curves`` have no common picture; empty if they have one."""
-    if len(curves) < 2 or any(branch_kind(curve) != RESPONSES for curve in curves):
-        return "needs several curves of nfrc"
-    if len({str(curve.attrs["over"]) for curve in curves}) > 1:
-        return "needs curves over the same parameter"
-    return ""
 
 
 def response_family(paths: Sequence[Path]) -> Figure:
@@ -41,8 +33,16 @@ def response_family(paths: Sequence[Path]) -> Figure:
     Rows are the largest relative displacement of the first site, the largest displacement of each named mass that all
     curves have, and the phase of the first site's fundamental under a force over its frequency.
     """
+    needs = "needs several curves of nfrc"
+    if len(paths) < 2 or any(kind_of_file(path) != RESPONSES for path in paths):
+        raise NoPicture(needs)
     # Curves of special points over two parameters have a picture of their own.
     curves = [curve for curve in responses_in(paths) if "special" not in curve.attrs]
+    if len(curves) < 2:
+        raise NoPicture(needs)
+    if len({str(curve.attrs["over"]) for curve in curves}) > 1:
+        raise NoPicture("needs curves over the same parameter")
+
     rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
     labels = ["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"]
     locations = _common_locations(curves)

@@ -12,18 +12,13 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, responses_in
 from vipetsc.figures.stability import StabilityLook, draw_states
+from vipetsc.figures.style import NoPicture
+from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
 
 # Labels of the rows of the page by the quantities that they show.
 AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
 # Lines of locations, which differ in greyscale print.
 DASHES = ("-", style.DASHED, "-.", style.DOTTED)
-
-
-def without_outputs(branches: Sequence[xr.Dataset]) -> str:
-    """Return why ``branches`` have no page of ``response_outputs`` together; empty if they have one."""
-    if _all_have(branches, "lag") or _all_have(branches, "largest_force"):
-        return ""
-    return "needs [output] points or forces = true in the case of nfrc"
 
 
 def _all_have(branches: Sequence[xr.Dataset], name: str) -> bool:
@@ -34,10 +29,16 @@ def _all_have(branches: Sequence[xr.Dataset], name: str) -> bool:
 def response_outputs(paths: Sequence[Path]) -> Figure:
     """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file.
 
-    The motion of masses is drawn if all files have it, and so are forces. All files must have one of the two (see
-    ``without_outputs``).
+    The motion of masses is drawn if all files have it, and so are forces. Raises NoPicture if
+    some file has neither.
     """
+    needs = "needs [output] points or forces = true in the case of nfrc"
+    if any(kind_of_file(path) != RESPONSES for path in paths):
+        raise NoPicture(needs)
     curves = responses_in(paths)
+    if not (_all_have(curves, "lag") or _all_have(curves, "largest_force")):
+        raise NoPicture(needs)
+
     rows: list[Callable[[Axes, xr.Dataset], None]] = []
     if _all_have(curves, "lag"):
         rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]

@@ -12,6 +12,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
+from vipetsc.figures.style import NoPicture
 from vipetsc.io.read import field_time, first_site
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.damped import decay_length
@@ -31,18 +32,13 @@ REFINE = 10
 COLOURS = 256  # of time in a phase portrait: as many as the colour map has
 
 
-def without_spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no picture of its energy in space and time; empty where it has one."""
-    if "velocity" not in run:
-        return "needs the velocities, which were not recorded"
-    if analysis is None or analysis.sizes.get("time", 0) < 2:
-        return "needs the analysis of a run with two samples or more"
-    return ""
-
-
 def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw kinetic energy (J) of every cell over time with the sites marked, next to the wavenumber content."""
-    assert analysis is not None
+    if "velocity" not in run:
+        raise NoPicture("needs the velocities, which were not recorded")
+    if analysis is None or analysis.sizes.get("time", 0) < 2:
+        raise NoPicture("needs the analysis of a run with two samples or more")
+
     has_content = "wavenumber_content" in analysis
     figure = style.new_figure(style.PAGE if has_content else style.COLUMN, 2.5)
     left, *right = np.atleast_1d(figure.subplots(1, 2 if has_content else 1))
@@ -78,11 +74,9 @@ def _draw_energy(axes: Axes, run: xr.Dataset, analysis: xr.Dataset) -> None:
         axes.legend(loc="upper left", labelcolor="white", handletextpad=0.3, **dark)
 
 
-def without_dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no picture of its dispersion; empty where it has one."""
-    if analysis is not None and any(name in analysis for name in CELLS):
-        return ""
-    if not Case.of(run).model().chain.cell.joins_cells:
+def _why_no_dispersion(run: xr.Dataset, analysis: xr.Dataset | None, cell: UnitCell) -> str:
+    """Return why the spectra of a ``run`` were not measured."""
+    if not cell.joins_cells:
         return "a lattice without springs from cell to cell has no dispersion"
     if run.sizes["cell"] < 2:
         return "needs two cells or more in the record, side by side"
@@ -100,9 +94,11 @@ def _left_out(analysis: xr.Dataset | None, measure: str) -> str:
 
 def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw 2-D spectra of the cells before and after the first site, and their sums over wavenumber."""
-    assert analysis is not None
     model = Case.of(run).model()
     cell = model.chain.cell
+    if analysis is None or not any(name in analysis for name in CELLS):
+        raise NoPicture(_why_no_dispersion(run, analysis, cell))
+
     # The spectrum of all cells together is drawn only if there are none of those before and after a site.
     measured = [name for name in CELLS if name in analysis]
     parts = [name for name in measured if name != "dispersion"]
@@ -140,15 +136,11 @@ def _mark_drive(axes: Axes, model: Model) -> None:
     panels.note(axes, text, (0, frequency), (2, 1), **place)
 
 
-def without_ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no picture of its energies; empty where it has one."""
-    if len(run["time"]) < 2 or not np.any(run["energy/work"]):
-        return "the drive did no work"
-    return ""
-
-
 def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw energies over time, and below them the residual relative to the work done, on a log scale."""
+    if len(run["time"]) < 2 or not np.any(run["energy/work"]):
+        raise NoPicture("the drive did no work")
+
     largest = float(np.abs(run["energy/work"]).max())
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
@@ -233,29 +225,22 @@ class Motion(NamedTuple):
     v: np.ndarray
 
 
-def without_phase(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
-    """Return why a run has no phase portraits; empty where it has some."""
-    site = first_site(run)
-    if site is None:
-        return "the lattice has no contact sites"
-    cell = int(run["sites/cell"][site])
-    if cell not in run["cell"].values:
-        return f"cell {cell}, the first site, was not recorded"
-    if "displacement" not in run or "velocity" not in run:
-        return "displacement and velocity were not both recorded"
-    if not np.any(run["displacement"].sel(cell=cell)):
-        return f"cell {cell}, the first site, was at rest all the time"
-    if Case.of(run).model().chain.pairs:
-        return "portraits show the cell's contact pair, but the contacts join other masses"
-    return ""
-
-
 def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw velocity against displacement at the first site: grey before the first contact, then by time."""
     site = first_site(run)
-    assert site is not None
+    if site is None:
+        raise NoPicture("the lattice has no contact sites")
     cell = int(run["sites/cell"][site])
+    if cell not in run["cell"].values:
+        raise NoPicture(f"cell {cell}, the first site, was not recorded")
+    if "displacement" not in run or "velocity" not in run:
+        raise NoPicture("displacement and velocity were not both recorded")
+    if not np.any(run["displacement"].sel(cell=cell)):
+        raise NoPicture(f"cell {cell}, the first site, was at rest all the time")
     chain = Case.of(run).model().chain
+    if chain.pairs:
+        raise NoPicture("portraits show the cell's contact pair, but the contacts join other masses")
+
     recorded = run.sel(cell=cell)
     u, v, time = refined(recorded["displacement"].values, recorded["velocity"].values, field_time(run))
     host = chain.cell.host

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -58,16 +59,50 @@ class Shown(NamedTuple):
     results: Sequence[xr.Dataset]
 
 
+class NoPicture(Exception):
+    """Raised by a figure that has nothing to show; the text is the reason."""
+
+
 class Drawing(NamedTuple):
     """A picture that can be drawn: ``draw`` returns the figure, ``stem`` is the name of its file without the suffix.
 
-    ``draw`` has to be called before the next drawing is asked for. ``shown`` are the members that the picture shows, or
-    empty if it shows all results that the figure was given.
+    ``draw`` has to be called before the next drawing is asked for; it raises NoPicture if there is nothing to show.
+    ``shown`` are the members that the picture shows, or empty if it shows all results that the figure was given.
+    ``figure`` is the name by which the picture is asked for, by default the ``stem``. ``reason`` says why there is no
+    picture, where that is known before it is drawn.
     """
 
     stem: str
     draw: Callable[[], Figure]
     shown: Sequence[Shown] = ()
+    figure: str = ""
+    reason: str = ""
+
+    @classmethod
+    def without_picture(cls, stem: str, reason: str) -> "Drawing":
+        """Return a drawing of which nothing can be shown, for the ``reason``."""
+
+        def draw() -> Figure:
+            raise NoPicture(reason)
+
+        return cls(stem, draw, reason=reason)
+
+
+@dataclass
+class LeftOut:
+    """Pictures that have nothing to show: the ``reasons`` by the names of their figures, and of these by their stems.
+
+    ``drawn`` are the names of the figures of which a picture was drawn, or stays.
+    """
+
+    reasons: dict[str, dict[str, str]] = field(default_factory=dict)
+    drawn: set[str] = field(default_factory=set)
+
+    def add(self, other: "LeftOut") -> None:
+        """Add what another rank has left out and drawn."""
+        for name, reasons in other.reasons.items():
+            self.reasons.setdefault(name, {}).update(reasons)
+        self.drawn |= other.drawn
 
 
 def band_colour(number: int) -> str:
@@ -175,6 +210,7 @@ def draw_each(
     turns: Iterator[int],
     note: str = "",
     keep: Callable[[Path], bool] = lambda path: False,
+    left_out: LeftOut | None = None,
 ) -> list[Path]:
     """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``; return the files.
 
@@ -188,7 +224,11 @@ def draw_each(
         A line of text below every picture, above the figure's label.
     keep
         Whether the file at a path is to stay as it is.
+    left_out
+        Gets the reasons of pictures that have nothing to show.
     """
+    if left_out is None:
+        left_out = LeftOut()
     written: list[Path] = []
     turn = next(turns, None)
     for number, drawing in enumerate(drawings):
@@ -196,11 +236,15 @@ def draw_each(
             continue
 
         paths = [target / f"{drawing.stem}.{suffix}" for suffix in formats]
-        if not all(keep(path) for path in paths):
-            sys.audit("vipetsc.draw", drawing.stem)
-            figure = drawing.draw()
-            for path in paths:
-                written.append(save(figure, path, note))
+        name = drawing.figure or drawing.stem
+        try:
+            if not all(keep(path) for path in paths):
+                sys.audit("vipetsc.draw", drawing.stem)
+                figure = drawing.draw()
+                written += [save(figure, path, note) for path in paths]
+            left_out.drawn.add(name)
+        except NoPicture as none:
+            left_out.reasons.setdefault(name, {})[drawing.stem] = str(none)
 
         # Asked for only now: a counter of all ranks must not give a number to a rank that is still drawing.
         turn = next(turns, None)

@@ -84,6 +84,8 @@ class PaperFigure:
             if finished:
                 for drawing in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
                     stem = drawing.stem
+                    if drawing.reason:
+                        continue
                     # A word stands between dashes or at an end: a part of a longer word does not match.
                     if all(f"-{word}-" in f"{stem}-" for word in part.only):
                         yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", drawing.draw, part.cost)
