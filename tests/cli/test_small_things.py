@@ -83,7 +83,7 @@ def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch,
     (tmp_path / "design.h5").touch()
     monkeypatch.chdir(tmp_path)
     pictures, folders = pictures_of([Path(path)])
-    assert pictures.source == "design"
+    assert pictures.kind.source == "design"
     assert folders == [tmp_path]
 
 

@@ -14,7 +14,8 @@ from vipetsc.case.verb_cases import VERB_CASES
 from vipetsc.cli.verb import DONE, FAILED, STOPPED, Outcome
 from vipetsc.cli.verbs.plot_verb import pictures_of
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs, verb_of
-from vipetsc.io.folder import KINDS, FolderError
+from vipetsc.io.folder import FolderError
+from vipetsc.io.kinds import KINDS
 
 ROOT = Path(__file__).parents[2]
 NAMES = [verb.name for verb in study_verbs()]
@@ -33,7 +34,7 @@ def drawn(monkeypatch):
     sources = []
 
     def draw(pictures, folders, comm, afresh):
-        sources.append(pictures.source)
+        sources.append(pictures.kind.source)
         return [folders[0] / "figures" / "picture.png"]
 
     monkeypatch.setattr("vipetsc.cli.verb.draw_pictures", draw)
@@ -99,7 +100,7 @@ def test_petsc_options_of_what_is_simulated_are_checked(call, tmp_path, name):
 def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
     """Results are drawn unless they cannot be, or the case switches pictures off."""
     ended = call(name, finish)
-    assert drawn == [VERBS[name].pictures.source]
+    assert drawn == [VERBS[name].pictures.kind.source]
     assert "figures/picture.png" in ended.stdout
 
     assert call(name, lambda case, work: Outcome(drawable=False)).returncode == DONE
@@ -160,7 +161,7 @@ def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
 def test_results_are_recognised_by_their_file(tmp_path, name):
     """Results are recognised by their folder, and by the file of the results in it."""
     pictures = VERBS[name].pictures
-    file = tmp_path / pictures.file.replace("*", "x")
+    file = tmp_path / pictures.kind.file.replace("*", "x")
     file.touch()
     assert pictures_of([tmp_path]) == (pictures, [tmp_path])
     assert pictures_of([file]) == (pictures, [tmp_path])
@@ -179,11 +180,11 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
     for folder in folders:
         folder.mkdir()
         (folder / "branch-x.h5").touch()
-    assert pictures_of(folders)[0].source == "branches"
+    assert pictures_of(folders)[0].kind.source == "branches"
 
     (folders[0] / "ensemble.h5").touch()
     (folders[0] / "branch-x.h5").unlink()
-    assert pictures_of(folders)[0].source == "sweep"
+    assert pictures_of(folders)[0].kind.source == "sweep"
 
     (folders[0] / "ensemble.h5").rename(folders[0] / "law.h5")
     with pytest.raises(FolderError, match="only sweeps and folders of branches can be drawn on one page"):
@@ -192,7 +193,7 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
 
 def test_a_folder_without_results_is_taken_for_a_run(tmp_path):
     """An empty folder is treated as that of a run, so that the message names the missing run.h5."""
-    assert pictures_of([tmp_path])[0].source == "run"
+    assert pictures_of([tmp_path])[0].kind.source == "run"
 
 
 def test_the_verb_of_a_case_is_found_by_its_class():

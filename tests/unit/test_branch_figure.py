@@ -18,10 +18,10 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.cli.drawing import draw_pictures
 from vipetsc.cli.verbs.branch_verbs import PICTURES, parameter_unit
 from vipetsc.figures import branch_curves, nfrc, registry, response_family, response_outputs, style
-from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.stability import SPACING, StabilityLook, draw_states
 from vipetsc.figures.style import LeftOut, NoPicture
 from vipetsc.io import branch_kinds
+from vipetsc.io.kinds import BRANCHES
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.modes.branches.files import stored_states
 
@@ -323,12 +323,12 @@ def test_a_branch_without_points_is_no_file(tmp_path):
     """A branch without points is named in place of a picture."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
     alone = LeftOut()
-    assert registry.draw(BRANCHES, [tmp_path], left_out=alone) == []
+    assert registry.draw(BRANCHES.source, [tmp_path], left_out=alone) == []
     assert not alone.drawn
     assert [*alone.reasons[registry.BRANCH]] == ["branch-empty"]
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
     both = LeftOut()
-    assert [path.name for path in registry.draw(BRANCHES, [tmp_path], left_out=both)] == ["branch-begun.png"]
+    assert [path.name for path in registry.draw(BRANCHES.source, [tmp_path], left_out=both)] == ["branch-begun.png"]
     assert [*both.reasons[registry.BRANCH]] == ["branch-empty"]
     assert both.drawn == {registry.BRANCH}
 

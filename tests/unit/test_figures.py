@@ -23,9 +23,9 @@ from vipetsc.figures.panels import label_panels
 from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
 from vipetsc.figures.runs import phase
 from vipetsc.figures.schematics import draw_unit_cell
-from vipetsc.figures.sources import BRANCHES, OPTIMUM
 from vipetsc.figures.style import SCREEN, LeftOut, NoPicture, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
+from vipetsc.io.kinds import BRANCHES, OPTIMUM
 from vipetsc.io.read import open_run
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Pair
@@ -287,8 +287,8 @@ def test_a_misspelt_figure_is_refused_with_the_nearest_name(tmp_path):
 @pytest.mark.parametrize(
     ("source", "name", "message"),
     [
-        (BRANCHES, "brunch", "no figure 'brunch' of branches; did you mean 'branch'"),
-        (OPTIMUM, "converge", "no figure 'converge' of an optimum; did you mean 'convergence'"),
+        (BRANCHES.source, "brunch", "no figure 'brunch' of branches; did you mean 'branch'"),
+        (OPTIMUM.source, "converge", "no figure 'converge' of an optimum; did you mean 'convergence'"),
     ],
 )
 def test_a_figure_that_a_source_does_not_have_is_refused(source, name, message):

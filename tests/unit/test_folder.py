@@ -15,7 +15,8 @@ import pytest
 
 from vipetsc.io import lock
 from vipetsc.io.atomic import atomic_write
-from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, Claim, FolderError, claimed
+from vipetsc.io.folder import Claim, FolderError, claimed
+from vipetsc.io.kinds import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP
 from vipetsc.io.lock import locked
 
 ROOT = Path(__file__).parents[2]

@@ -19,7 +19,8 @@ import vipetsc
 from tests.conftest import assert_same_bits, datasets, put_members
 from tests.faults.inject import Injector
 from vipetsc.case import Case, case_id
-from vipetsc.io.folder import SEARCH, FolderError, claimed
+from vipetsc.io.folder import FolderError, claimed
+from vipetsc.io.kinds import SEARCH
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import draw, make, steps
 from vipetsc.paper.build_record import read_record, write_record

@@ -13,7 +13,7 @@ from vipetsc import register
 from vipetsc.case.registered import check_factors, check_law
 from vipetsc.case.waveforms import OneDrive, waveform_record
 from vipetsc.figures.registered import drawn, registered_figures
-from vipetsc.figures.sources import FILES
+from vipetsc.io.kinds import KIND_OF, STUDIES
 from vipetsc.lattice.drive import impulse
 from vipetsc.register import (
     DISSIPATION,
@@ -139,13 +139,13 @@ def test_a_frequency_that_is_none_is_named_with_its_file(monkeypatch, frequency)
         waveform_record("tap").frequency(OneDrive(), np.inf)
 
 
-@pytest.mark.parametrize("source", FILES)
+@pytest.mark.parametrize("source", [kind.source for kind in STUDIES])
 def test_registered_figures_are_found_by_every_kind_of_results(source, tmp_path):
     """The case in the one file of a source names the module of the figures."""
     module = tmp_path / "pictures.py"
     code = f"from vipetsc import register\n\n\n@register.figure('mine', source='{source}')\ndef mine(data):\n    pass\n"
     module.write_text(code)
-    with h5py.File(tmp_path / FILES[source].name, "w") as file:
+    with h5py.File(tmp_path / KIND_OF[source].file, "w") as file:
         file.attrs["case"] = f"[plugins]\nmodules = ['{module}']\n"
     try:
         figures, message = registered_figures(source, [tmp_path])

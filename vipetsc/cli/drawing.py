@@ -13,30 +13,23 @@ from mpi4py import MPI
 from vipetsc.cli.messages import echo
 from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError
+from vipetsc.io.kinds import BRANCHES, SWEEP, ResultKind
 from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
     from vipetsc.figures.style import LeftOut
 
-# Names in the registry of the pictures of sweeps and of branches.
-SWEEP_FIGURES = "sweep"
-BRANCH_FIGURES = "branches"
-
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures that a verb draws of its results.
+    """Pictures that a verb draws of its results, which are of a ``kind``.
 
-    ``source`` is the name of these pictures in the registry of figures. ``file`` is the name of the file of results (a
-    pattern as of ``Path.glob``): a folder that has it can be drawn; ``noun`` says what the file is. ``prepare`` checks
-    folders before they are drawn, and measures what is missing in them or older than its run; without it, the drawing
-    finds out which file cannot be read. ``recognise`` says whether folders hold such results, where that takes more
-    than one ``file`` in one folder.
+    A folder that has the file of this kind can be drawn. ``prepare`` checks folders before they are drawn, and measures
+    what is missing in them or older than its run; without it, the drawing finds out which file cannot be read.
+    ``recognise`` says whether folders hold such results, where that takes more than one file in one folder.
     """
 
-    source: str
-    file: str
-    noun: str
+    kind: ResultKind
     prepare: Callable[[Sequence[Path]], None] | None = None
     recognise: Callable[[Sequence[Path]], bool] | None = None
 
@@ -44,7 +37,7 @@ class Pictures:
         """Whether these pictures show the results in ``folders``."""
         if self.recognise:
             return self.recognise(folders)
-        return len(folders) == 1 and any(folders[0].glob(self.file))
+        return len(folders) == 1 and any(folders[0].glob(self.kind.file))
 
 
 def draw_pictures(
@@ -77,7 +70,7 @@ def draw_pictures(
         # Pictures are listed by falling duration, so that ranks which take them in turn end at about the same time.
         turns = count(comm.rank, comm.size)
         with reading(pictures, folders):
-            return draw(pictures.source, folders, names, formats, newest=newest, turns=turns, left_out=left_out)
+            return draw(pictures.kind.source, folders, names, formats, newest=newest, turns=turns, left_out=left_out)
 
     drawn_here = on_every_rank(comm, draw_part)
 
@@ -91,7 +84,7 @@ def draw_pictures(
 def report(pictures: Pictures, comm: MPI.Comm, sentences: Sequence[str]) -> None:
     """Print ``sentences`` about pictures that are left out, on rank 0."""
     for sentence in sentences:
-        if pictures.source == SWEEP_FIGURES:
+        if pictures.kind is SWEEP:
             echo(comm, f"vipetsc: {sentence}", sys.stderr)
         else:
             # No warning: a lattice without sites, for example, has no picture of impacts.
@@ -110,9 +103,9 @@ def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
         # After a check by `prepare` an error is one of the program. One of the file system is not about it.
         if pictures.prepare or is_of_file_system(error):
             raise
-        article = "an" if pictures.noun[0] in "aeiou" else "a"
-        path = folders[0] / pictures.file
-        raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
+        article = "an" if pictures.kind.noun[0] in "aeiou" else "a"
+        path = folders[0] / pictures.kind.file
+        raise FolderError(f"{path}: is not {article} {pictures.kind.noun} of vipetsc ({error})") from None
 
 
 def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
@@ -125,7 +118,7 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
         from vipetsc.figures.registry import figure_names
 
         try:
-            figure_names(pictures.source, names, folders)
+            figure_names(pictures.kind.source, names, folders)
         except KeyError as error:
             raise FolderError(f"--fig: {error.args[0]}") from None
     if pictures.prepare:
@@ -147,7 +140,7 @@ def sentences_on(
         listed = "; ".join(f"--fig {name}: {next(iter(missing[name].values()))}" for name in asked)
         raise FolderError(f"{folders[0]}: {listed}")
     sentences = _by_reason(pictures, folders, left_out)
-    if pictures.source != SWEEP_FIGURES:
+    if pictures.kind is not SWEEP:
         return sentences
 
     # Only one page shows branches, and perhaps not all curves of the sweep.
@@ -172,7 +165,7 @@ def _by_reason(pictures: Pictures, folders: Sequence[Path], left_out: "LeftOut")
             continue
         # Each branch is a result of its own; a measure that one of the sweeps has gives its figure pages.
         for stem, reason in reasons.items():
-            if pictures.source == BRANCH_FIGURES:
+            if pictures.kind is BRANCHES:
                 by_reason.setdefault(reason, []).append(stem)
             elif name not in left_out.drawn and name not in by_reason.setdefault(reason, []):
                 by_reason[reason].append(name)

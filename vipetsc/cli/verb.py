@@ -21,7 +21,7 @@ from vipetsc.case import CaseFile
 from vipetsc.cli.arguments import Argument
 from vipetsc.cli.drawing import Pictures, draw_pictures
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
-from vipetsc.io.folder import FolderKind
+from vipetsc.io.kinds import ResultKind
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
@@ -53,7 +53,7 @@ class Verb(ABC):
     text: str
     example: str
     arguments: tuple[Argument, ...] = ()
-    results: FolderKind | None = None
+    results: ResultKind | None = None
     is_stoppable: bool = False
     is_answer: bool = False
     takes_petsc_options: bool = False
@@ -150,7 +150,7 @@ class StudyVerb(Verb):
     case: type[CaseFile]
     study: Callable[[Any, Work], Outcome]
     table: Callable[[Any, int], Rows]
-    results: FolderKind
+    results: ResultKind
     pictures: Pictures | None = None
     suffix: str = ""
     load: Callable[[argparse.Namespace], CaseFile] | None = None

@@ -30,7 +30,8 @@ from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.dynamics.subnormals import subnormals_as_zero
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.endings import Ended, Ending
-from vipetsc.io.folder import RUN, claimed, provenance
+from vipetsc.io.folder import claimed, provenance
+from vipetsc.io.kinds import RUN
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
 

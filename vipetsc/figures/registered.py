@@ -11,20 +11,20 @@ from matplotlib.figure import Figure
 
 from vipetsc import plugins
 from vipetsc.case.parts import module_names
-from vipetsc.figures.sources import FILES, SWEEP
 from vipetsc.figures.style import SCREEN, Drawing
+from vipetsc.io.kinds import KINDS, PAPER, SWEEP
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
 
 MOST_PIXELS = 20_000  # 1.6 GB for a square picture
-RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", *(file.name for file in FILES.values()))
+RESULTS = tuple(kind.file for kind in KINDS if kind is not PAPER)
 
 
 def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, Callable[..., Any]], str]:
     """The functions of registered figures of a ``source`` by name, and a message why modules cannot be imported, or "".
 
     The modules are those that the case of the results in the first of ``folders`` names. Sources are those of
-    ``vipetsc.figures.sources``, functions those of ``vipetsc.figures.registry.FigureSpec``.
+    ``vipetsc.io.kinds``, functions those of ``vipetsc.figures.registry.FigureSpec``.
     """
     figures: dict[str, Callable[..., Any]] = {}
     if not folders:
@@ -40,7 +40,7 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
         for part in parts:
             if isinstance(part, FigurePart) and part.source == source:
                 draw = partial(drawn, part)
-                if source == SWEEP:
+                if source == SWEEP.source:
                     draw = partial(_each_sweep, draw)
                 figures[part.name] = draw
     return figures, "; ".join(reasons)

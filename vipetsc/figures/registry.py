@@ -35,12 +35,24 @@ from vipetsc.figures import (
     wavenumber_bins,
 )
 from vipetsc.figures.registered import registered_figures
-from vipetsc.figures.sources import BRANCHES, DESIGN, FILES, IDENTIFIED, LAW, OPTIMUM, PAPER, PREDICTION, RUN, SWEEP
 from vipetsc.figures.style import Drawing, LeftOut, Shown, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
 from vipetsc.io.errors import ResultFileError
+from vipetsc.io.kinds import (
+    BRANCHES,
+    IDENTIFIED,
+    KIND_OF,
+    LAW,
+    OPTIMUM,
+    PAPER,
+    PREDICTION,
+    RUN,
+    SEARCH,
+    SWEEP,
+    ResultKind,
+)
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
@@ -49,12 +61,12 @@ from vipetsc.wording import nearest
 
 
 class FigureSpec(NamedTuple):
-    """A figure: its ``name``, the ``source`` that it is drawn from, and the ``function`` that draws it.
+    """A figure: its ``name``, the ``kind`` of results that it is drawn from, and the ``function`` that draws it.
 
     Attributes
     ----------
     function
-        Of a run, (run, analysis or None) -> Figure. Of a source in ``FILES``, (data) -> Figure. Of branches, (paths) ->
+        Of a run, (run, analysis or None) -> Figure. Of one of ``STUDIES``, (data) -> Figure. Of branches, (paths) ->
         Figure. Of sweeps, (sweeps) -> iterator of Drawing; the name of such a drawing's file is that of the figure,
         followed by the drawing's stem.
     measure
@@ -67,7 +79,7 @@ class FigureSpec(NamedTuple):
     """
 
     name: str
-    source: str
+    kind: ResultKind
     function: Callable[..., Any]
     measure: str = ""
     needs: str = ""
@@ -144,10 +156,10 @@ _SPECS = (
     FigureSpec(BRANCH, BRANCHES, branch),
     FigureSpec("outputs", BRANCHES, response_outputs.response_outputs, needs="[output] points or forces"),
     FigureSpec("responses", BRANCHES, response_family.response_family, needs="several curves", together=True),
-    FigureSpec("deflections", DESIGN, cost_maps.deflections),
-    FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
-    FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
-    FigureSpec("dispersion_against_eta", DESIGN, partial(cost_maps.dispersions, along="eta", other="lambda")),
+    FigureSpec("deflections", SEARCH, cost_maps.deflections),
+    FigureSpec("cost_maps", SEARCH, cost_maps.cost_maps),
+    FigureSpec("dispersion_against_lambda", SEARCH, partial(cost_maps.dispersions, along="lambda", other="eta")),
+    FigureSpec("dispersion_against_eta", SEARCH, partial(cost_maps.dispersions, along="eta", other="lambda")),
     FigureSpec("law", LAW, law_panels.law),
     FigureSpec("prediction", PREDICTION, predicted_energies.prediction),
     FigureSpec("convergence", OPTIMUM, optimum.convergence),
@@ -163,8 +175,8 @@ reserve(FIGURE, FIGURES)
 def figures_of(source: str, folders: Sequence[Path]) -> dict[str, FigureSpec]:
     """Return the figures of ``source`` by name, with those of the modules that the results in ``folders`` name."""
     registered, _ = registered_figures(source, folders)
-    specs = {name: spec for name, spec in FIGURES.items() if spec.source == source}
-    return specs | {name: FigureSpec(name, source, function) for name, function in registered.items()}
+    specs = {name: spec for name, spec in FIGURES.items() if spec.kind.source == source}
+    return specs | {name: FigureSpec(name, KIND_OF[source], function) for name, function in registered.items()}
 
 
 def figure_names(
@@ -177,7 +189,7 @@ def figure_names(
     """
     specified = [*figures_of(source, folders)]
     measures: dict[str, str] = {}
-    if source == SWEEP:
+    if source == SWEEP.source:
         with Files() as opened_here:
             opened = opened_here if files is None else files
             for folder in with_ensemble(folders):
@@ -192,7 +204,7 @@ def figure_names(
             near = nearest(name, valid)
             question = f"; did you mean {near!r}?" if near else "."
             holder = source
-            if source != BRANCHES:
+            if source != BRANCHES.source:
                 article = "an" if source[0] in "aeiou" else "a"
                 holder = f"{article} {source}"
             listed = ", ".join(valid)
@@ -226,7 +238,7 @@ def draw(
     Parameters
     ----------
     source
-        Contents of the folders, as in ``vipetsc.figures.sources``: "sweep" or "paper" (perhaps with folders of
+        Contents of the folders, as in ``vipetsc.io.kinds``: "sweep" or "paper" (perhaps with folders of
         branches), "branches" (those of one name side by side); of one folder "run", "design", "optimum",
         "identification", "law" or "prediction".
     names
@@ -284,16 +296,16 @@ def drawings(
     Raises KeyError as ``figure_names``.
     """
     chosen = [name for name in figure_names(source, names, folders, files) if name not in omit]
-    if source == SWEEP:
+    if source == SWEEP.source:
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
     named = figures_of(source, folders)
     specs = [named[name] for name in chosen]
-    if source == PAPER:
+    if source == PAPER.source:
         ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
         return itertools.chain.from_iterable(specified_drawings(spec, ensembles, files) for spec in specs)
-    if source == BRANCHES:
+    if source == BRANCHES.source:
         return _branch_drawings(specs, folders, files)
-    if source == RUN:
+    if source == RUN.source:
         return _run_drawings(specs, folders[0], files)
     return _file_drawings(specs, folders[0], files)
 
@@ -302,7 +314,7 @@ def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files,
     """Yield the pages of measures and what the other figures offer, each with a stem of its own."""
     ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
     used: dict[str, int] = {}
-    specs = figures_of(SWEEP, folders)
+    specs = figures_of(SWEEP.source, folders)
     for name in names:
         if name in specs:
             offered = _needed_drawings(specs[name], ensembles, folders, files)
@@ -445,11 +457,10 @@ def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset
 def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
     """Yield every figure of ``specs`` from the one file in ``folder`` that has its results."""
     for spec in specs:
-        data = result_of(spec.source, folder, files)
+        data = result_of(spec.kind, folder, files)
         yield Drawing(spec.name, partial(spec.function, data))
 
 
-def result_of(source: str, folder: Path, files: Files) -> xr.Dataset:
-    """Return the results in the one file of a ``source`` in ``folder``, opened as one of the ``files``."""
-    file = FILES[source]
-    return files.get(folder / file.name, partial(open_netcdf, kind=source, needs=file.needs))
+def result_of(kind: ResultKind, folder: Path, files: Files) -> xr.Dataset:
+    """Return the results of a ``kind`` in their one file in ``folder``, opened as one of the ``files``."""
+    return files.get(folder / kind.file, partial(open_netcdf, kind=kind.source, needs=kind.needs))

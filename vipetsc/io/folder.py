@@ -27,6 +27,7 @@ import numpy as np
 
 import vipetsc
 from vipetsc.io.atomic import discard, write_text
+from vipetsc.io.kinds import KINDS, ResultKind
 from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.parallel import on_root
 from vipetsc.process import say
@@ -43,47 +44,6 @@ ACCOMPANYING = (
 
 Difference = Callable[[str], str | None]
 """Takes the text of an earlier case; returns why its results are not the wanted ones, or None if they are."""
-
-
-@dataclass(frozen=True)
-class FolderKind:
-    """Kind of a folder of results; patterns of names are those of ``Path.glob``.
-
-    Attributes
-    ----------
-    noun
-        What messages call one result.
-    results
-        Patterns of the files that show that a folder holds results of this kind.
-    has_folders
-        Whether every folder in the folder belongs to the results, as those of a sweep's members do.
-    marker
-        Name of the file with the case of the results.
-    free
-        Section of the case that may change while the results stay valid; empty for none.
-    """
-
-    noun: str
-    results: tuple[str, ...]
-    has_folders: bool = False
-    marker: str = "case.toml"
-    free: str = ""
-
-    def is_in(self, folder: Path) -> bool:
-        """Return whether ``folder`` holds results of this kind."""
-        return any(any(folder.glob(pattern)) for pattern in self.results)
-
-
-RUN = FolderKind(noun="run", results=("run.h5", "parts"), free="analysis")
-BRANCHES = FolderKind(noun="branch", results=("branch-*.h5",))
-SEARCH = FolderKind(noun="search", results=("design.h5",))
-LAW = FolderKind(noun="law", results=("law.h5", "law-runs*.jsonl"))
-SWEEP = FolderKind(noun="sweep", results=("ensemble.h5", "members*.jsonl"), has_folders=True)
-PREDICTION = FolderKind(noun="prediction", results=("prediction.h5", "prediction-runs*.jsonl"))
-OPTIMUM = FolderKind(noun="optimum", results=("optimum.h5", "optimum-runs*.jsonl"))
-IDENTIFIED = FolderKind(noun="identification", results=("identified.h5", "identified-runs*.jsonl"))
-PAPER = FolderKind(noun="paper", results=("plan.json",), marker="plan.json")
-KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, IDENTIFIED, PAPER)
 
 
 @dataclass(frozen=True)
@@ -119,7 +79,7 @@ def set_aside_in(folder: Path) -> Path:
 def claimed(
     comm: MPI.Comm,
     path: str | Path,
-    kind: FolderKind,
+    kind: ResultKind,
     text: str,
     *,
     force: bool = False,
@@ -154,7 +114,7 @@ def claimed(
         yield Claim(comm, path, going_on)
 
 
-def _claim(path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None) -> bool:
+def _claim(path: Path, kind: ResultKind, text: str, force: bool, resume: bool, difference: Difference | None) -> bool:
     """Prepare the folder ``path``; returns whether it holds results of the same case. See ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
 
@@ -185,7 +145,7 @@ def _claim(path: Path, kind: FolderKind, text: str, force: bool, resume: bool, d
     return going_on
 
 
-def _set_aside(path: Path, kind: FolderKind) -> None:
+def _set_aside(path: Path, kind: ResultKind) -> None:
     """Move the results in ``path`` to NAME.old, or remove them if results that are complete are there already."""
     old = set_aside_in(path)
     if old.exists() and not (old / REPLACED).exists() and (not old.is_dir() or any(old.iterdir())):
@@ -213,7 +173,7 @@ def _set_aside(path: Path, kind: FolderKind) -> None:
     say(f"earlier results stay in {old} until the new ones are complete")
 
 
-def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
+def _holds_another_kind(path: Path, kind: ResultKind) -> bool:
     """Return whether ``path`` holds results of a kind other than ``kind``."""
     return any(other.is_in(path) for other in KINDS if other is not kind)
 
@@ -223,7 +183,7 @@ def _results(folder: Path) -> list[Path]:
     return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
 
 
-def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
+def _problem(folder: Path, kind: ResultKind, text: str, difference: Difference | None) -> str | None:
     """Message why the results in ``folder`` are not results of ``text``; None if they are."""
     earlier = _text_of(folder / kind.marker)
     if difference:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from vipetsc.io.kinds import BRANCHES, RUN, STUDIES, SWEEP
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import nearest_site
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Files that ``open_results`` opens if a folder is given: the first one that exists.
-FIRST = "run.h5", "optimum.h5", "identified.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
+FIRST = (RUN.file, *(kind.file for kind in STUDIES), "analysis.h5")
 # What the file of every run has: its times, cells and case, and for its energies, sites and episodes all variables.
 RUN_NEEDS = (
     *("time", "cell", "dof", "case"),
@@ -67,13 +68,13 @@ def open_results(path: str | Path) -> xr.Dataset:
     without results or with several branches, and as ``open_netcdf``.
     """
     path = Path(path)
-    if path.is_dir() and (path / "ensemble.h5").exists():
+    if path.is_dir() and (path / SWEEP.file).exists():
         return open_ensemble(path)
 
     files = [path]
     if path.is_dir():
         present = [path / name for name in FIRST if (path / name).exists()]
-        files = present[:1] or sorted(path.glob("branch-*.h5"))
+        files = present[:1] or sorted(path.glob(BRANCHES.file))
     if len(files) != 1:
         contents = ", ".join(file.name for file in files) or "no results"
         raise ValueError(f"{path}: contains {contents}; name a file")

@@ -12,7 +12,8 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case.design import DesignCase
-from vipetsc.io.folder import SEARCH, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.kinds import SEARCH
 from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band

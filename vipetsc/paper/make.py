@@ -15,7 +15,8 @@ from typing import Any
 
 from mpi4py import MPI
 
-from vipetsc.io.folder import PAPER, Claim, claimed, provenance
+from vipetsc.io.folder import Claim, claimed, provenance
+from vipetsc.io.kinds import PAPER
 from vipetsc.paper.build_record import FORMATS, BuildRecord, is_whole, read_record, write_record
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.draw import draw_paper

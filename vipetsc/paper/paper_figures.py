@@ -82,7 +82,7 @@ class PaperFigure:
             finished = [folders[step] for step in part.steps if step in folders]
             # A figure has no pictures without its steps; with some of them it shows what there is.
             if finished:
-                for drawing in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
+                for drawing in drawings(FIGURES[part.figure].kind.source, finished, files, [part.figure]):
                     stem = drawing.stem
                     if drawing.reason:
                         continue

@@ -29,7 +29,8 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, ProfileCosts, Side, profile_about, profile_costs
 from vipetsc.identification.motion import MotionError
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import IDENTIFIED, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.kinds import IDENTIFIED
 from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, StudyError, divided, on_root

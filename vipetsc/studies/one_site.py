@@ -41,7 +41,8 @@ import xarray as xr
 
 from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.law import LawCase
-from vipetsc.io.folder import LAW, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.kinds import LAW
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest

@@ -20,7 +20,7 @@ import xarray as xr
 from vipetsc.case import LawCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.extras import require
-from vipetsc.io.folder import OPTIMUM
+from vipetsc.io.kinds import OPTIMUM
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import on_root

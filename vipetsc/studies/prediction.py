@@ -19,7 +19,8 @@ import xarray as xr
 
 from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.predict import PredictCase
-from vipetsc.io.folder import PREDICTION, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.kinds import PREDICTION
 from vipetsc.io.netcdf import open_netcdf, tabulated
 from vipetsc.io.records import Record
 from vipetsc.lattice import Chain, pass_bands

@@ -15,7 +15,8 @@ import xarray as xr
 from vipetsc.case import Case, Sweep
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import SWEEP, FolderError, origin
+from vipetsc.io.folder import FolderError, origin
+from vipetsc.io.kinds import SWEEP
 from vipetsc.io.netcdf import naming_spoilt, open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import RecordFile

@@ -18,7 +18,8 @@ from mpi4py import MPI
 import h5py
 import xarray as xr
 
-from vipetsc.io.folder import FolderKind, claimed
+from vipetsc.io.folder import claimed
+from vipetsc.io.kinds import ResultKind
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.parallel import StopRequest, on_root
 
@@ -57,7 +58,7 @@ class Study(Generic[Result]):
     content of the file: rank 0 calls it, and writes the file. ``read`` reads the result from a folder.
     """
 
-    kind: FolderKind
+    kind: ResultKind
     file: str
     make: Callable[[Any, StudyWork], Callable[[], xr.Dataset]]
     read: Callable[[Path], Result]

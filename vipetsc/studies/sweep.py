@@ -21,7 +21,8 @@ import numpy as np
 from vipetsc.case import Case, CaseError, Problem, Sweep
 from vipetsc.case.html import html_table
 from vipetsc.io.atomic import discard
-from vipetsc.io.folder import SWEEP, claimed
+from vipetsc.io.folder import claimed
+from vipetsc.io.kinds import SWEEP
 from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.plugins import announce_parts

@@ -21,7 +21,7 @@ from vipetsc.cli.messages import echo_warnings
 from vipetsc.cli.tables import first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.endings import Ending
-from vipetsc.io.folder import BRANCHES
+from vipetsc.io.kinds import BRANCHES
 from vipetsc.parallel import on_root
 from vipetsc.wording import counted, with_unit
 
@@ -280,7 +280,7 @@ def hold_branches(folders: Sequence[Path]) -> bool:
     return all(any(folder.glob("branch-*.h5")) and not (folder / "run.h5").exists() for folder in folders)
 
 
-PICTURES = Pictures(source="branches", file="branch-*.h5", noun=BRANCHES.noun, recognise=hold_branches)
+PICTURES = Pictures(BRANCHES, recognise=hold_branches)
 
 NNM = StudyVerb(
     name="nnm",

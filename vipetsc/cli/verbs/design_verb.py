@@ -4,7 +4,7 @@ from vipetsc.case import DesignCase
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
-from vipetsc.io.folder import SEARCH
+from vipetsc.io.kinds import SEARCH
 
 
 def design_rows(case: DesignCase, ranks: int) -> Rows:
@@ -23,6 +23,6 @@ VERB = StudyVerb(
     study=study_of("vipetsc.paper.cell_search:search_design", summary),
     table=design_rows,
     results=SEARCH,
-    pictures=Pictures(source="design", file="design.h5", noun=SEARCH.noun),
+    pictures=Pictures(SEARCH),
     is_stoppable=False,  # it takes seconds, and has nothing to save before its end
 )

@@ -5,7 +5,7 @@ from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
 from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
-from vipetsc.io.folder import IDENTIFIED
+from vipetsc.io.kinds import IDENTIFIED
 
 
 def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
@@ -30,5 +30,5 @@ VERB = StudyVerb(
     study=study_of("vipetsc.studies.identification:run_identification", summary),
     table=identify_rows,
     results=IDENTIFIED,
-    pictures=Pictures(source="identification", file="identified.h5", noun=IDENTIFIED.noun),
+    pictures=Pictures(IDENTIFIED),
 )

@@ -5,7 +5,7 @@ from vipetsc.cli.arguments import CASE, FORCE, RESUME, SET, output_folder
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Rows, StudyVerb, study_of
-from vipetsc.io.folder import LAW
+from vipetsc.io.kinds import LAW
 
 
 def law_rows(case: LawCase, ranks: int) -> Rows:
@@ -24,6 +24,6 @@ VERB = StudyVerb(
     study=study_of("vipetsc.studies.one_site:make_law", lambda law: table(law.summary())),
     table=law_rows,
     results=LAW,
-    pictures=Pictures(source="law", file="law.h5", noun=LAW.noun),
+    pictures=Pictures(LAW),
     suffix="-law",
 )

@@ -5,7 +5,7 @@ from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
 from vipetsc.cli.verb import Rows, StudyVerb, study_of, summary
-from vipetsc.io.folder import OPTIMUM
+from vipetsc.io.kinds import OPTIMUM
 from vipetsc.wording import counted
 
 
@@ -35,5 +35,5 @@ VERB = StudyVerb(
     study=study_of("vipetsc.studies.optimum_search:run_search", summary),
     table=optimise_rows,
     results=OPTIMUM,
-    pictures=Pictures(source="optimum", file="optimum.h5", noun=OPTIMUM.noun),
+    pictures=Pictures(OPTIMUM),
 )

@@ -10,7 +10,7 @@ from vipetsc.cli.arguments import argument, output_folder
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, FAILED, PlainVerb
 from vipetsc.io.extras import require
-from vipetsc.io.folder import PAPER
+from vipetsc.io.kinds import PAPER
 from vipetsc.parallel import StopRequest, on_root
 
 

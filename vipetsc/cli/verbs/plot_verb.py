@@ -15,6 +15,7 @@ from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import remove_abandoned
 from vipetsc.io.folder import FolderError
+from vipetsc.io.kinds import RUN
 from vipetsc.parallel import StopRequest, on_root
 
 NARROWEST = 320  # pixels, at which the type can still be read
@@ -98,8 +99,8 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     from vipetsc.cli.verbs.verb_list import study_verbs
 
     # Pictures are listed by their source, since verbs that leave the same kind of folder have them in common.
-    by_source = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
-    files = {pictures.file for pictures in by_source.values()}
+    by_source = {verb.pictures.kind.source: verb.pictures for verb in study_verbs() if verb.pictures}
+    files = {pictures.kind.file for pictures in by_source.values()}
     folders = list(paths)
     for i, path in enumerate(paths):
         if any(path.match(pattern) for pattern in files):
@@ -130,7 +131,7 @@ def film(
     from vipetsc.io.netcdf import naming_spoilt, open_netcdf
     from vipetsc.io.read import open_run
 
-    if pictures.source != "run":
+    if pictures.kind is not RUN:
         raise FolderError(
             f"--movie: {folder} contains no run; for a sweep, repeat a member with run CASE --member ID and plot"
             f" that run"

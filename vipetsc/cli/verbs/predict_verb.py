@@ -11,7 +11,7 @@ from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.verb import Rows, StudyVerb, study_of
-from vipetsc.io.folder import PREDICTION
+from vipetsc.io.kinds import PREDICTION
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,5 +81,5 @@ VERB = StudyVerb(
     study=study_of("vipetsc.studies.prediction:predict", prediction_table),
     table=predict_rows,
     results=PREDICTION,
-    pictures=Pictures(source="prediction", file="prediction.h5", noun=PREDICTION.noun),
+    pictures=Pictures(PREDICTION),
 )

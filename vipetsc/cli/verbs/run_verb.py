@@ -17,7 +17,8 @@ from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.messages import logger
 from vipetsc.cli.tables import duration, first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
-from vipetsc.io.folder import RUN, FolderError
+from vipetsc.io.folder import FolderError
+from vipetsc.io.kinds import RUN
 from vipetsc.lattice import waves_at
 from vipetsc.parallel import on_root
 from vipetsc.wording import counted
@@ -288,7 +289,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         measure_run(folder)
 
 
-PICTURES = Pictures(source="run", file="run.h5", noun="run", prepare=measure_where_missing)
+PICTURES = Pictures(RUN, prepare=measure_where_missing)
 VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",

@@ -9,7 +9,8 @@ from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
-from vipetsc.io.folder import SWEEP, FolderError
+from vipetsc.io.folder import FolderError
+from vipetsc.io.kinds import SWEEP
 
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
@@ -84,9 +85,7 @@ def begin_with_a_sweep(folders: Sequence[Path]) -> bool:
     return (folders[0] / "ensemble.h5").exists()
 
 
-PICTURES = Pictures(
-    source="sweep", file="ensemble.h5", noun="sweep", prepare=relate_to_branches, recognise=begin_with_a_sweep
-)
+PICTURES = Pictures(SWEEP, prepare=relate_to_branches, recognise=begin_with_a_sweep)
 
 VERB = StudyVerb(
     name="sweep",

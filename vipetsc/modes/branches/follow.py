@@ -41,7 +41,8 @@ from mpi4py import MPI
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.endings import Ended, Ending
-from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
+from vipetsc.io.folder import Claim, claimed, provenance
+from vipetsc.io.kinds import BRANCHES
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed import CondensedMethod
