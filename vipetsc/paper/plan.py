@@ -23,7 +23,7 @@ import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.case.predict import PredictCase
 from vipetsc.endings import Ending
-from vipetsc.io.errors import is_of_file_system
+from vipetsc.io.errors import UnreadableFileError, is_of_file_system
 from vipetsc.io.folder import FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
@@ -38,6 +38,7 @@ from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Results
 from vipetsc.studies.prediction import predict
 from vipetsc.studies.sweep import has_all_records, run_sweep
+from vipetsc.wording import system_number, system_reason
 
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
@@ -181,12 +182,18 @@ class PaperStep:
         A branch is finished when it has ended, also in a failure that it names; a sweep when its
         ensemble has all records.
         """
-        with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
-            if "ending" in file.attrs:
-                return bool(file.attrs["complete"]) or file.attrs["ended"] == Ending.FAILED.name
-            if isinstance(self.case, Sweep) and not has_all_records(path.parent):
-                return False
-            return self._is_same_case(file.attrs["case"])
+        try:
+            with h5py.File(path) as file:
+                if "ending" in file.attrs:
+                    return bool(file.attrs["complete"]) or file.attrs["ended"] == Ending.FAILED.name
+                if isinstance(self.case, Sweep) and not has_all_records(path.parent):
+                    return False
+                return self._is_same_case(file.attrs["case"])
+        # One that was cut off does not open.
+        except OSError as error:
+            if is_of_file_system(error):
+                reason = f"{path} cannot be read: {system_reason(error)}"
+                raise UnreadableFileError(system_number(error), reason) from error
         return False
 
     def _is_same_case(self, text: str) -> bool:
