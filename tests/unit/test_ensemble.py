@@ -15,8 +15,8 @@ from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.io.records import RecordFile, read_records
 from vipetsc.lattice import four_band
+from vipetsc.paper.engines import agreement, sampled
 from vipetsc.sources import source_key
-from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, _fits, fit_curve
 from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, measured, read_linear
 from vipetsc.studies.sweep import conclude, summarise

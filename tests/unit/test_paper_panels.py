@@ -8,9 +8,9 @@ import tomli_w
 import xarray as xr
 
 from vipetsc.figures import cost_maps, scattering, transfer, wavenumber_bins
-from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, Sweeps
+from vipetsc.paper.pages import PAGES
 from vipetsc.spectra import entropies, filter_bank
 
 AMPLITUDES = [1.0, 4.0, 16.0, 64.0, 256.0]  # N
@@ -48,7 +48,7 @@ def entropy_ensemble(amplitudes: list[float], episodes: list[float]) -> xr.Datas
 
 def history(amplitudes: list[float], episodes: list[float]):
     """Return the axes that show H(t) of the sweep."""
-    (offered,) = FIGURES["entropy_history"].function(Sweeps([entropy_ensemble(amplitudes, episodes)], Files()))
+    (offered,) = PAGES["entropy_history"].function(Sweeps([entropy_ensemble(amplitudes, episodes)], Files()))
     return offered.draw().axes[0]
 
 

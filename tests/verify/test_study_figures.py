@@ -13,7 +13,6 @@ from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import sweep_members
-from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, ROWS, amplitudes
 from vipetsc.figures.style import GREY, SKY, rc_style
@@ -21,6 +20,8 @@ from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, series_of
 from vipetsc.figures.wavenumber_bins import FIELD, bin_colours, partition, partition_explained, shown_bins
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
+from vipetsc.paper.entropy_pages import AVERAGES, COLOURS
+from vipetsc.paper.pages import PAGES
 from vipetsc.spectra import filter_bank, normalised, transform
 from vipetsc.studies.sweep import run_sweep
 
@@ -99,7 +100,7 @@ def only(name, study):
 
 def offered_drawings(name, study):
     """The drawings of ``name`` that a study offers, by their suffixes."""
-    return {drawing.stem: drawing for drawing in FIGURES[name].function(Sweeps(study, Files()))}
+    return {drawing.stem: drawing for drawing in (FIGURES | PAGES)[name].function(Sweeps(study, Files()))}
 
 
 def maps(figure):
@@ -136,18 +137,18 @@ def test_every_figure_is_drawn_from_files(whole):
 @pytest.mark.slow
 def test_no_figure_is_offered_where_its_data_lack(whole, curves):
     for name in OF_FIELDS:
-        assert list(FIGURES[name].function(Sweeps([curves], Files()))) == []
-        assert list(FIGURES[name].function(Sweeps([], Files()))) == []
+        assert list((FIGURES | PAGES)[name].function(Sweeps([curves], Files()))) == []
+        assert list((FIGURES | PAGES)[name].function(Sweeps([], Files()))) == []
     for name in OF_CURVES:
-        assert list(FIGURES[name].function(Sweeps([whole], Files()))) == []
+        assert list((FIGURES | PAGES)[name].function(Sweeps([whole], Files()))) == []
 
 
 def test_suffixes_distinguish_figures(curves):
-    names = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
+    names = [drawing.stem for drawing in PAGES["entropy_history"].function(Sweeps([curves], Files()))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
 
     # With several sweeps, names begin with that of the sweep.
-    named = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves, curves], Files()))]
+    named = [drawing.stem for drawing in PAGES["entropy_history"].function(Sweeps([curves, curves], Files()))]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 

@@ -20,6 +20,7 @@ from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
 from vipetsc.figures.transfer import ROOM, closing_error
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
+from vipetsc.paper.pages import PAGES
 from vipetsc.studies.backbone import initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 
@@ -78,7 +79,7 @@ def offered_figures(name, *folders):
     """The figures of ``name`` from ``folders``, by their suffixes."""
     with rc_style():
         sweeps = Sweeps(map(open_ensemble, folders), Files())
-        found = {drawing.stem: drawing.draw() for drawing in FIGURES[name].function(sweeps)}
+        found = {drawing.stem: drawing.draw() for drawing in (FIGURES | PAGES)[name].function(sweeps)}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
 
@@ -215,7 +216,7 @@ def test_whole_members_alone_make_no_curves(whole):
 
 
 def test_nothing_to_draw_from_nothing():
-    assert all(not dict(FIGURES[name].function(Sweeps([], Files()))) for name in NAMES)
+    assert all(not dict((FIGURES | PAGES)[name].function(Sweeps([], Files()))) for name in NAMES)
 
 
 @pytest.mark.slow
@@ -360,9 +361,8 @@ def test_regimes_without_an_ensemble(whole):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["png", "pdf"])
 def test_files_are_named_by_figure_and_suffix(reduced, kind):
-    written = draw("paper", [reduced], ["ibtet"], [kind]) + draw("sweep", [reduced], ["ibtet_backbone"], [kind])
-    stems = ("ibtet-calibrated", "ibtet_backbone-calibrated-1-site-4-cycles")
-    assert [p.name for p in written] == [f"{stem}.{kind}" for stem in stems]
+    written = draw("sweep", [reduced], ["ibtet_backbone"], [kind])
+    assert [p.name for p in written] == [f"ibtet_backbone-calibrated-1-site-4-cycles.{kind}"]
     # An empty page is smaller.
     assert all(path.stat().st_size > 10_000 for path in written)
 

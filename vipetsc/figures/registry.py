@@ -15,7 +15,6 @@ from vipetsc.figures import (
     condensed_branches,
     cost_maps,
     damped_modes,
-    entropy,
     frequency_energy,
     identified,
     impact_panels,
@@ -40,19 +39,7 @@ from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
 from vipetsc.io.errors import ResultFileError
-from vipetsc.io.kinds import (
-    BRANCHES,
-    IDENTIFIED,
-    KIND_OF,
-    LAW,
-    OPTIMUM,
-    PAPER,
-    PREDICTION,
-    RUN,
-    SEARCH,
-    SWEEP,
-    ResultKind,
-)
+from vipetsc.io.kinds import BRANCHES, IDENTIFIED, KIND_OF, LAW, OPTIMUM, PREDICTION, RUN, SEARCH, SWEEP, ResultKind
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
@@ -143,14 +130,9 @@ _SPECS = (
     FigureSpec("partition_explained", SWEEP, wavenumber_bins.partition_explained, "entropy", needs=THREE_AMPLITUDES),
     FigureSpec("reconstruction", SWEEP, wavenumber_bins.reconstruction, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("entropy_maps", SWEEP, scattering.entropy_maps, measure="entropy", needs=THREE_AMPLITUDES),
-    FigureSpec("entropy", PAPER, entropy.entropy, measure="entropy"),
-    FigureSpec("entropy_all", PAPER, entropy.entropy_all, measure="entropy"),
-    FigureSpec("entropy_history", PAPER, entropy.entropy_history, measure="entropy"),
     FigureSpec("transfer", SWEEP, transfer.transfer, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec("transfer_dispersions", SWEEP, transfer.transfer_dispersions, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec("band_energies", SWEEP, transfer.band_energies, measure="transfer", needs=WHOLE_MEMBERS),
-    FigureSpec("band_energies-shares", PAPER, transfer.band_shares, measure="transfer"),
-    FigureSpec("ibtet", PAPER, transfer_curves.ibtet, measure="transfer"),
     FigureSpec(OVER_BRANCHES, SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec(BRANCH, BRANCHES, branch),
@@ -238,9 +220,9 @@ def draw(
     Parameters
     ----------
     source
-        Contents of the folders, as in ``vipetsc.io.kinds``: "sweep" or "paper" (perhaps with folders of
-        branches), "branches" (those of one name side by side); of one folder "run", "design", "optimum",
-        "identification", "law" or "prediction".
+        Contents of the folders, a name in ``vipetsc.io.kinds``: "sweep" (perhaps with folders of branches), "branches"
+        (those of one name side by side); of one folder "run", "design", "optimum", "identification", "law" or
+        "prediction".
     names
         Figures, and of sweeps measures; by default all figures, and the measures that most readers look at.
     turns
@@ -300,9 +282,6 @@ def drawings(
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
     named = figures_of(source, folders)
     specs = [named[name] for name in chosen]
-    if source == PAPER.source:
-        ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
-        return itertools.chain.from_iterable(specified_drawings(spec, ensembles, files) for spec in specs)
     if source == BRANCHES.source:
         return _branch_drawings(specs, folders, files)
     if source == RUN.source:

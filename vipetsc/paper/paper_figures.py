@@ -14,9 +14,12 @@ from pydantic import TypeAdapter
 
 from vipetsc.case import Case
 from vipetsc.case.schema import PRESETS
-from vipetsc.figures.registry import FIGURES, drawings
+from vipetsc.figures.registry import FIGURES, drawings, specified_drawings, with_ensemble
 from vipetsc.figures.schematics import lattice_page, reduced_model
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import Files
+from vipetsc.io.read import open_ensemble
+from vipetsc.paper.pages import PAGES
 
 READINGS = ("calibrated", "printed")
 # The sweep whose transfer is related to branches, and the steps of these.
@@ -82,13 +85,21 @@ class PaperFigure:
             finished = [folders[step] for step in part.steps if step in folders]
             # A figure has no pictures without its steps; with some of them it shows what there is.
             if finished:
-                for drawing in drawings(FIGURES[part.figure].kind.source, finished, files, [part.figure]):
+                for drawing in _drawings(part.figure, finished, files):
                     stem = drawing.stem
                     if drawing.reason:
                         continue
                     # A word stands between dashes or at an end: a part of a longer word does not match.
                     if all(f"-{word}-" in f"{stem}-" for word in part.only):
                         yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", drawing.draw, part.cost)
+
+
+def _drawings(name: str, folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
+    """Return the drawings of the page called ``name``, one of the paper's or of the registry."""
+    if name not in PAGES:
+        return drawings(FIGURES[name].kind.source, folders, files, [name])
+    ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
+    return specified_drawings(PAGES[name], ensembles, files)
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:

@@ -32,9 +32,9 @@ from vipetsc.modes.system import System
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.claims.criteria import CLAIMS
+from vipetsc.paper.engines import agreement, sampled
 from vipetsc.paper.paper_figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Results
 from vipetsc.studies.prediction import predict
 from vipetsc.studies.sweep import has_all_records, run_sweep

@@ -16,8 +16,8 @@ from PIL import Image
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
+from vipetsc.paper.engines import COMPARED
 from vipetsc.paper.paper_figures import READINGS, PaperFigure, describe
-from vipetsc.studies.engines import COMPARED
 
 # The page holds about a hundred pictures. Pictures of lines keep all their pixels, in few colours. Pictures of maps
 # would be large in this form: they are made narrower, and compressed with losses that only an enlargement shows.
