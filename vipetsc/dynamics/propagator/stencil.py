@@ -115,10 +115,11 @@ class Stencil(NamedTuple):
     """P(H) on the cells of one rank, as ``apply_propagator`` reads it.
 
     Owned cells in the ranges ``interior`` (range, 2), half open, read only owned ones, far from the ends and from cells
-    that differ: output rows are summed four at a time, of which one may be there twice. For cell 0, and with the state
-    as one row of numbers, the outputs of block b go to the places ``blocks`` (block, 4); its terms, ``starts[b]`` to
-    ``starts[b + 1]``, a multiple of four, are ``values`` (term, 4) times the numbers at ``places`` (term,). Cell i is i
-    places further.
+    that differ: output rows are summed four at a time. For cell 0, and with the state as one row of numbers, the
+    outputs of block b go to the places ``blocks`` (block, 4). Two that are there twice have a negative place: their
+    second sums go to ``spare`` (4, cell), since sums that are formed together must not be the same numbers. The terms
+    of block b, ``starts[b]`` to ``starts[b + 1]``, a multiple of four, are ``values`` (term, 4) times the numbers at
+    ``places`` (term,). Cell i is i places further.
 
     ``borders`` (table, 2 dof, 2 reach + 1, output) are dense rows of the other cells, with zeros for more outputs than
     2 dof up to a multiple of four; ``border_cells`` (cell, 3) has the halo's first column for each, the owned cell that
@@ -130,6 +131,7 @@ class Stencil(NamedTuple):
     starts: np.ndarray
     places: np.ndarray
     values: np.ndarray
+    spare: np.ndarray
     borders: np.ndarray
     border_cells: np.ndarray
     total: np.ndarray
@@ -177,6 +179,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Rec
         starts=sparse.starts,
         places=sparse.places,
         values=sparse.values,
+        spare=np.empty((4, CHUNK)),
         borders=borders,
         border_cells=np.column_stack([np.concatenate(columns), cells - layout.start, table]),
         total=np.zeros(borders.shape[3]),
@@ -196,7 +199,7 @@ class SparseRows(NamedTuple):
 def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
     """Rows in blocks of four, from ``entries`` (2 dof, 2 dof, cell) of an interior cell, counted from ``-reach`` on."""
     # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Where the
-    # number of masses is odd, the last one is there twice.
+    # number of masses is odd, the last one is there twice, and its second copy has no place.
     dofs = layout.dofs
     masses = np.minimum(np.arange(dofs + dofs % 2), dofs - 1)
     blocks = np.column_stack([masses, masses + dofs]).reshape(-1, 4)
@@ -211,12 +214,10 @@ def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
         starts.append(starts[-1] + len(row) + extra)
         places.append(np.pad(row * layout.owned + column - reach, (0, extra), mode="edge"))
         values.append(np.pad(entries[block][:, row, column].T, [(0, extra), (0, 0)]))
-    return SparseRows(
-        blocks=blocks * layout.owned,
-        starts=np.array(starts),
-        places=np.concatenate(places),
-        values=np.concatenate(values),
-    )
+    to = blocks * layout.owned
+    if dofs % 2:
+        to[-1, 2:] = -1
+    return SparseRows(blocks=to, starts=np.array(starts), places=np.concatenate(places), values=np.concatenate(values))
 
 
 def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
@@ -326,6 +327,14 @@ def _add_terms(
 
 
 @kernel
+def _output(y: np.ndarray, place: int, begin: int, size: int, spare: np.ndarray) -> np.ndarray:
+    """Return ``size`` outputs of ``y`` from ``place`` + ``begin`` on; of ``spare`` for an output without a place."""
+    if place < 0:
+        return spare[:size]
+    return y[place + begin :][:size]
+
+
+@kernel
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
     """Put P(H) times the lattice's ``state``, whose halo is ``columns``, into ``out`` (2 dof, owned cell)."""
     # On flat arrays, in which row r of cell i is at r cells + i.
@@ -351,10 +360,10 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                     places[terms],
                     values[terms],
                     begin,
-                    y[to[b, 0] + begin :][:size],
-                    y[to[b, 1] + begin :][:size],
-                    y[to[b, 2] + begin :][:size],
-                    y[to[b, 3] + begin :][:size],
+                    _output(y, to[b, 0], begin, size, stencil.spare[0]),
+                    _output(y, to[b, 1], begin, size, stencil.spare[1]),
+                    _output(y, to[b, 2], begin, size, stencil.spare[2]),
+                    _output(y, to[b, 3], begin, size, stencil.spare[3]),
                 )
 
     for column, cell, table in stencil.border_cells:
