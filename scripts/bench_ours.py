@@ -17,6 +17,7 @@ from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Guard, Ledger, Setup
 from vipetsc.dynamics.run import ENGINES, Begin, Run
+from vipetsc.endings import Ending
 from vipetsc.io.store import RunMemory
 
 
@@ -70,11 +71,11 @@ class EngineRun:
                 sampled[k] = self.engine.state.array_r[d * n : 2 * d * n].reshape(d, n)
             return sampled.swapaxes(1, 2), time.process_time() - begin
 
-        ending, sentence = self._run.advance()
+        ended = self._run.advance()
         seconds = time.process_time() - begin
-        if ending != "complete":
-            raise RuntimeError(sentence)
-        self._run.finish(ending, sentence, Begin(wall=0.0, cpu=0.0), {})
+        if ended.ending is not Ending.COMPLETE:
+            raise RuntimeError(ended.sentence)
+        self._run.finish(ended, Begin(wall=0.0, cpu=0.0), {})
         assert self.output.dataset is not None
         return self.output.dataset.velocity.values, seconds
 

@@ -161,7 +161,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks)
         (("run", "--set", "time.sample_interval=0.01"), "too coarse for the bands"),
         (("run", "--set", "lattice.cell.masses=[1.0, -1.0]"), "lattice.cell"),
         (("run", "--force", "--resume"), "exclude each other"),
-        (("fly",), "invalid choice: 'fly'"),
+        (("fly",), "'fly' is not a verb"),
         (("plot", "nowhere"), "contains no run.h5"),
         (("run", "--resume", "--out", "new"), "contains no run to resume"),
     ],
