@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.conftest import small_case
 from vipetsc.case import Model
-from vipetsc.contact.law import CLOSED, PERMANENT, create_contacts
+from vipetsc.contact.law import CLOSED, LANDED, PERMANENT, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.nodes import collocation
@@ -102,6 +102,7 @@ def pressed_mass(gap: float, side: int = 1) -> Record:
     cluster.contacts["clearance"] = gap
     cluster.contacts["clearance_minus"] = gap
     cluster.contacts["scale"] = 0.5
+    cluster.contacts["tolerance"] = 0.5 * LANDED
 
     # Accelerations need a second term of the response, which is zero as the mass is free between its contacts.
     response = np.append(cluster.response, np.zeros((1, 1, 1)), axis=2)

@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import registry, sources, sweep_members, transfer, wavenumber_bins
+from vipetsc.figures import registry, sweep_members, transfer, wavenumber_bins
 from vipetsc.figures.registry import FIGURES, specified_drawings
 from vipetsc.figures.style import Drawing, Shown, rc_style
 from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps, from_series
 from vipetsc.figures.warning_lines import warning_lines
+from vipetsc.io import kinds
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.studies import backbone
@@ -177,7 +178,7 @@ def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
 def test_a_page_without_members_has_the_warnings_of_its_sweeps():
     """A picture without members, which shows whole sweeps, has the warnings of these sweeps."""
     sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
-    spec = registry.FigureSpec("a_figure", sources.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
+    spec = registry.FigureSpec("a_figure", kinds.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
     with Files() as files:
         (drawing,) = specified_drawings(spec, [sweep], files)
     assert drawing.draw().get_label() == "of the sweep"
@@ -236,7 +237,7 @@ def test_spectra_of_two_cells_have_room_on_their_axis(peaks, limits):
 def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:
     """Return the warnings below a picture of that ``series``."""
     monkeypatch.setattr(sweep_members, "series_of", lambda sweeps, *needs: iter([series]))
-    spec = registry.FigureSpec("a_figure", sources.SWEEP, figure_of_series)
+    spec = registry.FigureSpec("a_figure", kinds.SWEEP, figure_of_series)
     with Files() as files:
         (drawing,) = specified_drawings(spec, [], files)
     return drawing.draw().get_label().splitlines()

@@ -35,11 +35,11 @@ from vipetsc.modes.response.isolated import (
 )
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.over_key import StatesOverKey
-from vipetsc.modes.response.special_curves import SpecialCurve, SpecialSteps, crosses_amplitude
 from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
+from vipetsc.modes.special_curves import SpecialCurve, SpecialSteps, crosses_amplitude
 from vipetsc.modes.stability import Perturbations
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
