@@ -136,16 +136,14 @@ class SampledModel:
         if not result.complete:
             raise MotionError(result.sentence)
 
-        data = memory.dataset
-        assert data is not None
-        motion = [data[f"points/{name}"].values for name in ("displacement", "velocity", "acceleration")]
+        motion = [memory.values(f"points/{name}") for name in ("displacement", "velocity", "acceleration")]
         return _Run(
-            displacement=data["displacement"].values,
-            velocity=data["velocity"].values,
+            displacement=memory.values("displacement"),
+            velocity=memory.values("velocity"),
             motion=np.stack(motion, axis=2),
-            onset=data["impacts/onset"].values,
-            site=data["impacts/site"].values - 1,
-            side=data["impacts/side"].values,
+            onset=memory.values("impacts/onset"),
+            site=memory.values("impacts/site") - 1,
+            side=memory.values("impacts/side"),
         )
 
     def _reached(self, run: "_Run", interval: float) -> np.ndarray:

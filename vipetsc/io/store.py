@@ -260,8 +260,6 @@ class RunMemory:
 
     Attributes
     ----------
-    dataset
-        The run as of ``open_run``, on rank 0; None on the others and before the end.
     states
         The parts of each checkpoint (checkpoint, rank), on all ranks.
     end
@@ -285,7 +283,8 @@ class RunMemory:
             self.chunk_length = sys.maxsize
         self.states: list[list[Arrays]] = []
         self.count = 0
-        self.dataset: xr.Dataset | None = None
+        self._variables: dict[str, xr.Variable] | None = None
+        self._attributes: Mapping[str, Any] = {}
         self.end: np.ndarray | None = None
 
     def begin(self, case: str) -> None:
@@ -295,8 +294,10 @@ class RunMemory:
         self.states = []
         self._rows = 0
         self._chunks: list[Arrays] = []
-        # The fields of the run before, kept by ``cached_property``.
-        vars(self).pop("_fields", None)
+        self._variables = None
+        # What belongs to the run before, kept by ``cached_property``.
+        for name in ("_fields", "dataset"):
+            vars(self).pop(name, None)
 
     @cached_property
     def _fields(self) -> np.ndarray:
@@ -339,7 +340,9 @@ class RunMemory:
         """Return None: a run in memory cannot be resumed."""
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
-        """Create the dataset; all ranks must call it."""
+        """Keep what the dataset consists of; all ranks must call it."""
+        import xarray as xr
+
         if self.comm.rank == 0:
             variables = chunks.small_variables(self)
             large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(chunks.read_log(self))}
@@ -350,10 +353,24 @@ class RunMemory:
                 large |= {"end/displacement": displacement, "end/velocity": velocity}
             for name, values in large.items():
                 description = chunks.described(name, variables)
-                variables[name] = (description.dims, values, description.attributes)
-            # In one call, since xarray compares the dimensions of all variables whenever some are added.
-            self.dataset = with_point_names(chunks.run_dataset(self, variables, attributes))
+                variables[name] = xr.Variable(description.dims, values, description.attributes)
+            self._variables = variables
+            self._attributes = attributes
         self._chunks = []
+
+    # Who takes a few arrays of thousands of runs, as ``identify`` does, needs no dataset.
+    @cached_property
+    def dataset(self) -> xr.Dataset | None:
+        """The run as of ``open_run``, on rank 0; None on the others and before the end."""
+        if self._variables is None:
+            return None
+        # In one call, since xarray compares the dimensions of all variables whenever some are added.
+        return with_point_names(chunks.run_dataset(self, self._variables, self._attributes))
+
+    def values(self, name: str) -> np.ndarray:
+        """The values of a variable of a run that has ended, on rank 0."""
+        assert self._variables is not None
+        return np.asarray(self._variables[name].values)
 
 
 RunOutput = RunFolder | RunMemory
