@@ -141,3 +141,15 @@ def test_what_is_not_driven_has_no_drive(in_process):
     assert re.search(r"^  drive +none$", shown, flags=re.M)
     assert re.search(r"^  end +0.7 s$", shown, flags=re.M)
     assert "burst" not in shown
+
+
+@pytest.mark.mpirun
+def test_ranks_agree_on_what_is_drawn(vipetsc, tmp_path):
+    """Pictures and a movie of a run on two ranks: what one rank finds in a folder is sent to the other."""
+    case = tmp_path / "case.toml"
+    case.write_text(RUN)
+    out = tmp_path / "out"
+    assert vipetsc(2, "run", case, "--out", out).returncode == 0
+    again = vipetsc(2, "plot", out, "--movie", "--format", "gif", "--width", "320")
+    assert again.returncode == 0, again.stderr
+    assert list((out / "figures").glob("movie-*.gif"))

@@ -84,7 +84,7 @@ def draw_pictures(
 def report(pictures: Pictures, comm: MPI.Comm, sentences: Sequence[str]) -> None:
     """Print ``sentences`` about pictures that are left out, on rank 0."""
     for sentence in sentences:
-        if pictures.kind is SWEEP:
+        if pictures.kind == SWEEP:
             echo(comm, f"vipetsc: {sentence}", sys.stderr)
         else:
             # No warning: a lattice without sites, for example, has no picture of impacts.
@@ -140,7 +140,7 @@ def sentences_on(
         listed = "; ".join(f"--fig {name}: {next(iter(missing[name].values()))}" for name in asked)
         raise FolderError(f"{folders[0]}: {listed}")
     sentences = _by_reason(pictures, folders, left_out)
-    if pictures.kind is not SWEEP:
+    if pictures.kind != SWEEP:
         return sentences
 
     # Only one page shows branches, and perhaps not all curves of the sweep.
@@ -165,7 +165,7 @@ def _by_reason(pictures: Pictures, folders: Sequence[Path], left_out: "LeftOut")
             continue
         # Each branch is a result of its own; a measure that one of the sweeps has gives its figure pages.
         for stem, reason in reasons.items():
-            if pictures.kind is BRANCHES:
+            if pictures.kind == BRANCHES:
                 by_reason.setdefault(reason, []).append(stem)
             elif name not in left_out.drawn and name not in by_reason.setdefault(reason, []):
                 by_reason[reason].append(name)

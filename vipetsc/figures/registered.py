@@ -17,7 +17,7 @@ from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
 
 MOST_PIXELS = 20_000  # 1.6 GB for a square picture
-RESULTS = tuple(kind.file for kind in KINDS if kind is not PAPER)
+RESULTS = tuple(kind.file for kind in KINDS if kind != PAPER)
 
 
 def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, Callable[..., Any]], str]:

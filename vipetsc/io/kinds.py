@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ResultKind:
-    """A kind of results; patterns of names are those of ``Path.glob``.
+    """A kind of results, compared by its values, since ranks send copies; patterns of names are those of ``Path.glob``.
 
     Attributes
     ----------

@@ -131,7 +131,7 @@ def film(
     from vipetsc.io.netcdf import naming_spoilt, open_netcdf
     from vipetsc.io.read import open_run
 
-    if pictures.kind is not RUN:
+    if pictures.kind != RUN:
         raise FolderError(
             f"--movie: {folder} contains no run; for a sweep, repeat a member with run CASE --member ID and plot"
             f" that run"
