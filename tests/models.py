@@ -35,6 +35,16 @@ def kerschen_system() -> System:
     return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring.between(None, 0, cubic=0.5)])
 
 
+# The system of ``kerschen_system`` as the table [nnm.own]. A step along its branches takes milliseconds.
+KERSCHEN = {
+    "masses": [1.0, 1.0],
+    "springs": [
+        {"start": 0, "end": 1, "stiffness": 1.0},
+        {"start": 1, "end": 2, "stiffness": 1.0},
+        {"start": 0, "end": 2, "stiffness": 1.0},
+    ],
+    "smooth": [{"start": 0, "end": 1, "cubic": 0.5}],
+}
 # Two masses, of which the first one is joined to the first one of the next cell; a lattice of them is symmetric under
 # reflection.
 TWO_MASS_CELL = {

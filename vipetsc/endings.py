@@ -42,7 +42,7 @@ class Ending(Enum):
         return self not in INTERRUPTIONS
 
     def with_numbers(self, **values: Any) -> "Ended":
-        """The ending with its sentence, in which the places have the ``values``."""
+        """Return the ending with its sentence, in which the places have the ``values``."""
         return Ended(self, self.value.format(**values))
 
 

@@ -28,9 +28,11 @@ GROUP = "vipetsc.plugins"  # of entry points
 NEVER_RESULTS = (register.FIGURE,)  # kinds of parts on which no number depends
 # Errors of a program rather than of its numbers: what is wrong with one run is wrong with all others. KeyError is among
 # them, since functions of modules ask by name for what runs contain. IndexError is not, since lists may be empty in one
-# run and not in the next. The second line has RuntimeErrors, which otherwise say that a run has failed.
-PROGRAMMING: tuple[type[Exception], ...] = (TypeError, AttributeError, NameError, ImportError, SyntaxError, KeyError)
-PROGRAMMING += (NotImplementedError, RecursionError)
+# run and not in the next. The last two are RuntimeErrors, which otherwise say that a run has failed.
+PROGRAMMING: tuple[type[Exception], ...] = (
+    *(TypeError, AttributeError, NameError, ImportError, SyntaxError, KeyError),
+    *(NotImplementedError, RecursionError),
+)
 
 
 class PartFailure(PartError):

@@ -95,6 +95,13 @@ def test_closed_streams_are_no_failure(by_shell, tmp_path, redirection):
     assert "complete: " not in ended.stderr
 
 
+def test_an_error_without_stderr_is_not_an_answer(by_shell):
+    """Bad input ends with 2 also where its sentence cannot be printed; stdout stays empty."""
+    for words in (("rnu",), ("run", "--nonsense")):
+        ended = by_shell(words, "2>&-")
+        assert (ended.returncode, ended.stdout) == (2, "")
+
+
 def assert_reader_hears_nothing_more(ended: subprocess.CompletedProcess) -> None:
     """The exit code is 141 (128 + SIGPIPE), and nothing is said."""
     assert ended.returncode == 141

@@ -10,6 +10,7 @@ from mpi4py import MPI
 import h5py
 import pytest
 
+from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
@@ -17,23 +18,12 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.growth import Listener
 from vipetsc.parallel import StopRequest
 
-# A step along a branch of these two masses, one on a cubic spring, takes milliseconds.
-TWO_MASSES = {
-    "masses": [1.0, 1.0],
-    "springs": [
-        {"start": 0, "end": 1, "stiffness": 1.0},
-        {"start": 1, "end": 2, "stiffness": 1.0},
-        {"start": 0, "end": 2, "stiffness": 1.0},
-    ],
-    "smooth": [{"start": 0, "end": 1, "cubic": 0.5}],
-}
-
 
 def follow(folder: Path, listener: Listener | None = None, stop: StopRequest | None = None, **nnm: Any) -> Branch[Any]:
     """The out-of-phase branch of the two masses in ``folder``, begun or continued; ``nnm`` updates its table [nnm]."""
     folder.mkdir(exist_ok=True)
     nnm = {"modes": [2], "start_energy": 1.0, "energy": [0.5, 20.0], "first_step": 0.05} | nnm
-    case = NnmCase.from_table({"name": "x", "nnm": {"system": "own", "own": TWO_MASSES} | nnm})
+    case = NnmCase.from_table({"name": "x", "nnm": {"system": "own", "own": KERSCHEN} | nnm})
     (branch,) = follow_all(case, folder, MPI.COMM_SELF, resume=True, listener=listener, stop=stop)
     return branch
 

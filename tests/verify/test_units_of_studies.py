@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.models import KERSCHEN
 from tests.units import HUGE, TINY, Units
 from tests.zoo import PAIR
 from vipetsc.case import LawCase
@@ -24,15 +25,6 @@ pytestmark = pytest.mark.slow
 
 SITE = {"law": "bilinear", "stiffness": 1e7, "sites": [9], "clearance": 3e-4}
 LATTICE = {"cells": 24, "cell": PAIR}
-CUBIC = {
-    "masses": [1.0, 1.0],
-    "springs": [
-        {"start": 0, "end": 1, "stiffness": 1.0},
-        {"start": 1, "end": 2, "stiffness": 1.0},
-        {"start": 0, "end": 2, "stiffness": 1.0},
-    ],
-    "smooth": [{"start": 0, "end": 1, "cubic": 0.5}],
-}
 
 
 def branches(case: Any, folder: Path) -> None:
@@ -53,7 +45,7 @@ def nnm(**options: Any) -> dict[str, Any]:
 # The studies by name: the table of a case, its class, what computes it, and the tolerance of its numbers. Harmonics
 # pass through eigenvalue problems, whose rounding differs with the size of the numbers.
 STUDIES: dict[str, tuple[dict[str, Any], Any, Callable[[Any, Path], None], float]] = {
-    "smooth modes": (nnm(system="own", own=CUBIC, start_energy=1e-3, energy=[0.0, 10.0]), NnmCase, branches, 0.0),
+    "smooth modes": (nnm(system="own", own=KERSCHEN, start_energy=1e-3, energy=[0.0, 10.0]), NnmCase, branches, 0.0),
     "modes in contact": ({"lattice": LATTICE, "contacts": SITE, **nnm()}, NnmCase, branches, 0.0),
     "breathers": (
         {"lattice": LATTICE, "contacts": SITE, **nnm(system="condensed", start_frequency=[1400.0])},

@@ -18,7 +18,7 @@ from vipetsc.case.names import distinct
 from vipetsc.case.nfrc_ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
-from vipetsc.case.response_measures import RESPONSE, measures_of
+from vipetsc.case.response_measures import RESPONSE, ResponseMeasure, measures_of
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
@@ -96,7 +96,7 @@ class NfrcCase(Case):
             update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
             is_odd = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
-            # Of a motion with w(t + T/2) = -w(t) and an even number of the drive's periods the drive is none.
+            # In half of an even number of its periods the drive does not change its sign, as such a motion would.
             update["symmetric"] = is_odd and nfrc.subharmonic % 2 == 1
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
@@ -194,7 +194,7 @@ class NfrcCase(Case):
             remedy = f"the drive is harmonic {nfrc.subharmonic} of a motion with nfrc.subharmonic periods; increase it"
             yield Problem("nfrc.harmonics", nfrc.harmonics, remedy)
         if nfrc.symmetric and nfrc.subharmonic % 2 == 0:
-            yield Problem("nfrc.symmetric", True, "motions of an even number of periods have even harmonics; omit it")
+            yield Problem("nfrc.symmetric", True, "motions of an even number of periods have even harmonics; remove it")
         if not nfrc.smallest_step < nfrc.largest_step:
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
 
@@ -278,6 +278,10 @@ class NfrcCase(Case):
             return [(FamilyMember("", {}, {}), self)]
         family, _ = family_of(self.table | {"nfrc": self.table["nfrc"] | {"points": self.nfrc.points}})
         return [(member, NfrcCase.from_table(member.table | {"name": self.name})) for member in family.members]
+
+    def measures(self) -> dict[str, ResponseMeasure]:
+        """Return the measures of its curves, by name: of its sites, and of what ``[output]`` asks for."""
+        return measures_of(self.nfrc, self.lattice, self.output, self.model().chain)
 
     def every_curve(self) -> list[ResponseCurve]:
         """The curves of all members of the family; of a case without one its own."""

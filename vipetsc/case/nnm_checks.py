@@ -219,7 +219,7 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem("nnm.method", "damped", 'needs all masses: nnm.system = "chain", "reduced" or "own"')
         for key in ("switch", "orbits_at", "start_frequency", "start_sites", "multipliers"):
             if getattr(nnm, key):
-                yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; omit it")
+                yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; remove it")
         return
     if nnm.system == "condensed" or nnm.method == "condensed":
         method = "shot"

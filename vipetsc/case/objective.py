@@ -9,7 +9,7 @@ from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.response_measures import RESPONSE, response_measures
+from vipetsc.case.response_measures import RESPONSE
 from vipetsc.case.schema import Finite, Positive, PositiveRange
 from vipetsc.case.section import described
 from vipetsc.lattice import pass_bands, wave_bands
@@ -204,7 +204,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
         yield Problem(f"{at}.measure", name, remedy)
         return
 
-    measures = response_measures(case)
+    measures = case.measures()
     if name not in measures:
         remedy = f"is not a measure of these responses; {_nearest(name, [*measures])}"
         if not case.output.points:

@@ -28,15 +28,10 @@ class ResponseMeasure(NamedTuple):
     unit: str
 
 
-def response_measures(case: Any) -> dict[str, ResponseMeasure]:
-    """The measures, by name, of the curves of an ``NfrcCase``: of its sites, and of what ``[output]`` asks for."""
-    return measures_of(case.nfrc, case.lattice, case.output, case.model().chain)
-
-
 def measures_of(
     nfrc: NfrcTable, lattice: LatticeTable, output: OutputTable, chain: Chain
 ) -> dict[str, ResponseMeasure]:
-    """The measures, by name, of the curves of a case with these sections and this ``chain``."""
+    """Return the measures, by name, of curves with these sections and this ``chain``: of its sites and outputs."""
     sites = [str(number) for number in range(1, len(chain.sites) + 1)]
     members: dict[str, list[str]] = {}
     if sites:
@@ -69,9 +64,9 @@ def measures_of(
 
 
 def value_of(measures: Mapping[str, ResponseMeasure], name: str, quantities: Mapping[str, Any]) -> float:
-    """The value of a measure, by its name without ``RESPONSE``, in a state with these ``quantities``.
+    """Return the value of a measure, by its name without ``RESPONSE``, in a state with these ``quantities``.
 
-    Names that are no measure of a whole curve, such as ``frequency``, are those of a quantity that is one number.
+    A name without a measure, such as ``frequency``, is that of a quantity that is one number.
     """
     measure = measures.get(f"{RESPONSE}{name}")
     if measure is None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from mpi4py import MPI
 
@@ -30,23 +30,24 @@ class Parser(argparse.ArgumentParser):
 
     error_in_print: OSError | None = None
 
-    def say(self, text: str, file: Any = None) -> None:
-        """Print ``text`` on rank 0, to stdout or another ``file``."""
-        if MPI.COMM_WORLD.rank != 0:
+    def say(self, text: str, stream: TextIO | None) -> None:
+        """Print ``text`` to a ``stream`` on rank 0; to none if that was closed, for which Python has None."""
+        if MPI.COMM_WORLD.rank != 0 or stream is None:
             return
         try:
-            print(text, end="", file=file, flush=True)
+            print(text, end="", file=stream, flush=True)
         except OSError as error:
-            discard(sys.stdout)
+            discard(stream)
             self.error_in_print = error
 
     def print_help(self, file: Any = None) -> None:
-        """Print the help on rank 0."""
-        self.say(self.format_help(), file)
+        """Print the help on rank 0, to stdout or another ``file``."""
+        self.say(self.format_help(), file or sys.stdout)
 
-    def print_usage(self, file: Any = None) -> None:
-        """Print how the verb is called, on rank 0."""
-        self.say(self.format_usage(), file)
+    def error(self, message: str) -> NoReturn:
+        """End the program for bad input, with the usage and a ``message`` on stderr."""
+        self.say(self.format_usage(), sys.stderr)
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with ``status``; if that is 0, with the code of a failure to print the help."""
@@ -60,7 +61,7 @@ class ShowVersion(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print on rank 0; argparse's own action prints on every rank."""
         assert isinstance(parser, Parser)
-        parser.say(f"vipetsc {vipetsc.__version__}\n")
+        parser.say(f"vipetsc {vipetsc.__version__}\n", sys.stdout)
         parser.exit()
 
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.case.response_measures import RESPONSE, response_measures
+from vipetsc.case.response_measures import RESPONSE
 from vipetsc.figures import panels, style
 from vipetsc.figures.stability import StabilityLook, draw_states
 from vipetsc.spectra.measures import row_of
@@ -219,7 +219,7 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
     if objective.below:
         axes.axhline(objective.below, color=style.GREY, lw=0.5, ls=style.DASHED)
     case = plan.responses(plan.base)
-    unit = response_measures(case)[str(objective.measure)].unit
+    unit = case.measures()[str(objective.measure)].unit
     label = str(objective.measure).removeprefix(RESPONSE)
     over = case.nfrc.over.capitalize()
     if case.nfrc.over == "frequency":

@@ -175,7 +175,7 @@ def _set_aside(path: Path, kind: ResultKind) -> None:
 
 def _holds_another_kind(path: Path, kind: ResultKind) -> bool:
     """Return whether ``path`` holds results of a kind other than ``kind``."""
-    return any(other.is_in(path) for other in KINDS if other is not kind)
+    return any(other.is_in(path) for other in KINDS if other != kind)
 
 
 def _results(folder: Path) -> list[Path]:

@@ -368,7 +368,7 @@ class RunMemory:
         return with_point_names(chunks.run_dataset(self, self._variables, self._attributes))
 
     def values(self, name: str) -> np.ndarray:
-        """The values of a variable of a run that has ended, on rank 0."""
+        """Return the values of a variable of a run that has ended, on rank 0."""
         assert self._variables is not None
         return np.asarray(self._variables[name].values)
 

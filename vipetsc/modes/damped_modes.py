@@ -49,28 +49,28 @@ class DampedFrame(BalanceFrame):
         self.xi = np.concatenate([x / self.size, [zeta, 1.0]])
 
     def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Harmonics (n,) in m, damping ratio and frequency in rad/s at the unknowns ``xi`` (n + 2,)."""
+        """Return the harmonics (n,) in m, damping ratio and frequency in rad/s at the unknowns ``xi`` (n + 2,)."""
         return xi[:-2] * self.size, float(xi[-2]), float(xi[-1] * self.omega)
 
     def encode(self, point: Point) -> np.ndarray:
-        """The unknowns (n + 2,) of another motion."""
+        """Return the unknowns (n + 2,) of another motion."""
         return np.concatenate([point.x[:-1] / self.size, [point.x[-1], 2 * np.pi / point.period / self.omega]])
 
     def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction (n + 2,) at another motion, of any length."""
+        """Return the branch's direction (n + 2,) at another motion, of any length."""
         # dOm = -2 pi/period^2 dperiod.
         by_omega = -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega
         return np.concatenate([point.tangent[:-2] / self.size, [point.tangent[-2], by_omega]])
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n + 1,) over the force of inertia of the size; raises FlowError at another frequency."""
+        """Return the residual (n + 1,) over the force of inertia of the size; raises FlowError at another frequency."""
         if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
             raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
         x, zeta, omega = self.motion(xi)
         return np.append(self.modes.residual(x, zeta, omega) / self._force, self.modes.phase_row @ xi[:-2])
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n + 1, n + 2) of the residual."""
+        """Return the derivative (n + 1, n + 2) of the residual."""
         x, zeta, omega = self.motion(xi)
         by_x, by_zeta, by_omega = self.modes.jacobian(x, zeta, omega)
         rows = np.column_stack([by_x * self.size, by_zeta, by_omega * self.omega]) / self._force
@@ -81,7 +81,7 @@ class DampedFrame(BalanceFrame):
         return float(self.size * self.omega**2 * self.modes.system.masses.max())
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The point that an attempt has converged to; ``direction`` (n + 2,) is the branch's unit tangent there."""
+        """Return the point of an attempt that converged; ``direction`` (n + 2,) is the branch's unit tangent there."""
         modes = self.modes
         x, zeta, omega = self.motion(attempt.xi)
         period = 2 * np.pi / omega
@@ -155,11 +155,11 @@ class DampedModes:
         self.phase_row = unit(self.pack(quarter))
 
     def pack(self, u: np.ndarray) -> np.ndarray:
-        """Unknowns (n,) of harmonics (masses, K + 1) complex."""
+        """Return the unknowns (n,) of harmonics (masses, K + 1) complex."""
         return np.hstack([u[:, self.orders].real, u[:, self._sines].imag]).ravel()
 
     def unpack(self, x: np.ndarray) -> np.ndarray:
-        """Harmonics (masses, K + 1) complex of unknowns."""
+        """Return the harmonics (masses, K + 1) complex of unknowns."""
         u = np.zeros((self.system.dofs, self.order + 1), complex)
         parts = x.reshape(self.system.dofs, -1)
         u.real[:, self.orders] = parts[:, : len(self.orders)]
@@ -167,25 +167,25 @@ class DampedModes:
         return u
 
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
-        """The forces at the elongations of a motion."""
+        """Return the forces at the elongations of a motion."""
         return self.forces.series(self.rows @ self.unpack(x), omega)
 
     def _dynamic(self, zeta: float, omega: float) -> np.ndarray:
-        """The dynamic stiffness (order, masses, masses) of the linear system with the negative damping."""
+        """Return the dynamic stiffness (order, masses, masses) of the linear system with the negative damping."""
         rates = (self.orders * omega)[:, None, None]
         masses = np.diag(self.system.masses)
         linear = self.system.stiffness_at_rest + 1j * rates * (self.damping - 2 * zeta * omega * masses)
         return np.asarray(linear - rates**2 * masses)
 
     def residual(self, x: np.ndarray, zeta: float, omega: float) -> np.ndarray:
-        """The residual (n,) in N of the harmonics of all masses."""
+        """Return the residual (n,) in N of the harmonics of all masses."""
         u = self.unpack(x)
         out = self.rows.T @ self.series(x, omega).forces[:, : self.order + 1]
         out[:, self.orders] += np.einsum("kij,jk->ik", self._dynamic(zeta, omega), u[:, self.orders])
         return self.pack(out)
 
     def jacobian(self, x: np.ndarray, zeta: float, omega: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The derivatives of the residual by x (n, n), by zeta (n,) and by omega (n,)."""
+        """Return the derivatives of the residual by x (n, n), by zeta (n,) and by omega (n,)."""
         count = len(self.orders)
         skipped = count - len(self._sines)
         # Forces by the harmonics of orders k and -k, which are conjugate to each other; the mean has one alone.
@@ -214,12 +214,12 @@ class DampedModes:
         return by_x, self.pack(by_zeta), self.pack(by_omega)
 
     def kinetic_energy(self, x: np.ndarray, omega: float) -> float:
-        """Mean kinetic energy in J over a period."""
+        """Return the mean kinetic energy in J over a period."""
         speeds = np.abs(self.unpack(x) * np.arange(self.order + 1) * omega) ** 2
         return float(self.system.masses @ speeds.sum(axis=1) / 4)
 
     def energy(self, x: np.ndarray, omega: float) -> float:
-        """Mean mechanical energy in J over a period."""
+        """Return the mean mechanical energy in J over a period."""
         u = self.unpack(x)
         means = np.where(np.arange(self.order + 1) == 0, 0.5, 0.25)
         stored = np.einsum("ik,ij,jk->k", u.conj(), self.system.stiffness_at_rest, u).real
@@ -233,7 +233,7 @@ class DampedModes:
         return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())
 
     def start(self, energy: float) -> Point:
-        """The motion of about an ``energy`` in J near the linear mode; raises ContinuationError without one."""
+        """Return the motion of about an ``energy`` in J near the linear mode; raises ContinuationError without one."""
         frequencies, shapes = self.system.linear_modes()
         omega = float(frequencies[self.mode])
         shape = shapes[:, self.mode]
@@ -250,37 +250,37 @@ class DampedModes:
         return frame.measures(attempt)
 
     def frame(self, point: Point, chart: str = "auto") -> DampedFrame:
-        """The frame at a motion; there is one ``chart``."""
+        """Return the frame at a motion; there is one ``chart``."""
         frame = DampedFrame(self, point.x[:-1], float(point.x[-1]), 2 * np.pi / point.period)
         if point.tangent.size:
             frame.tangent = unit(frame.direction(point))
         return frame
 
     def first_tangent(self, start: Point, direction: int) -> np.ndarray:
-        """Tangent d(x, zeta, period) at a motion, towards growing (+1) or falling (-1) energy."""
+        """Return the tangent d(x, zeta, period) at a motion, towards growing (+1) or falling (-1) energy."""
         frame = self.frame(start)
         null_vector = np.linalg.svd(frame.jacobian(frame.xi))[2][-1]
         first = frame.measures(Attempt(converged=True, reason="", history=[], xi=frame.xi), null_vector)
         return first.tangent * ((np.sign(first.energy_tangent) or 1.0) * direction)
 
     def turn(self, before: Point, after: Point) -> float:
-        """0: there is one chart, whose angles each step guards."""
+        """Return 0: there is one chart, whose angles each step guards."""
         return 0.0
 
     def departures(self, point: Point) -> list[Departure]:
-        """The times in which contacts are not what they are at rest."""
+        """Return the times in which contacts are not what they are at rest."""
         return departures_of(self.forces, self.series(point.x[:-1], 2 * np.pi / point.period).episodes)
 
     def grazing(self, point: Point) -> list[int]:
-        """No contact: at a touch nothing limits the steps."""
+        """Return no contact: at a touch nothing limits the steps."""
         return []
 
     def acceleration(self, point: Point) -> float:
-        """Infinity: a damped motion is nowhere at rest."""
+        """Return infinity: a damped motion is nowhere at rest."""
         return np.inf
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency, between two motions that are not linear."""
+        """Yield folds of the energy and of the frequency, between two motions that are not linear."""
         if not self.forces.is_linear_at_rest or (left.episodes and right.episodes):
             yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))

@@ -136,3 +136,15 @@ class PeriodicProblem(Protocol[S]):
 def unit(vector: np.ndarray) -> np.ndarray:
     """The vector (n,) divided by its length."""
     return vector / np.linalg.norm(vector)
+
+
+def nearest_on_chords(
+    place: np.ndarray, starts: np.ndarray, ends: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the positions (0 to 1) on chords nearest to ``place``, the distances there, and the lengths of chords."""
+    chords = ends - starts
+    squared = np.einsum("ij,ij->i", chords, chords)
+    # Two equal points leave a chord without a length: the floor makes its position 0 and not a NaN.
+    position = np.clip(np.einsum("ij,ij->i", place - starts, chords) / np.maximum(squared, 1e-300), 0, 1)
+    distance = np.linalg.norm(starts + position[:, None] * chords - place, axis=1)
+    return position, distance, np.sqrt(squared)

@@ -73,19 +73,19 @@ class SpecialCurve(UserProblem):
         self._size = float(np.linalg.norm(self._slope(self.first[:-1], self.first[-1]))) or 1.0
 
     def start(self, side: int) -> Response:
-        """The point of the amplitude of the curve, with the tangent of one ``side`` (1 or -1)."""
+        """Return the point of the amplitude of the curve, with the tangent of one ``side`` (1 or -1)."""
         attempt = self.solve(self.first, np.eye(len(self.first))[-2], 1.0)
         if not attempt.converged:
             raise ContinuationError(f"no {self.kind} is found again: {attempt.reason}; residuals {attempt.residuals}")
         return Response(xi=attempt.xi, tangent=side * self.null_vectors(attempt.xi)[0])
 
     def frame(self, point: Response, chart: str = "auto") -> UserFrame:
-        """The frame at a point, near which the vectors b and c and the pair's exponent are those at the point."""
+        """Return the frame at a point, whose vectors b and c and exponent of a pair serve near it."""
         self._prepare(point.xi)
         return super().frame(point, chart)
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Where the amplitude turns back: with the frequency at a cusp, alone where an isolated curve begins."""
+        """Yield where the amplitude turns back: with the frequency at a cusp, alone where an isolated curve begins."""
 
         def is_cusp(point: Response) -> bool:
             return bool(abs(point.tangent[-1]) < AT_CUSP)
@@ -96,12 +96,12 @@ class SpecialCurve(UserProblem):
         )
 
     def measured(self, xi: np.ndarray) -> Measures:
-        """The measures of a point; its stability is undecided, since it changes there."""
+        """Return the measures of a point; its stability is undecided, since it changes there."""
         states, inner = self._at(xi[:-1], xi[-1])
         return states.measured(inner, Perturbations(-1, None))
 
     def _at(self, y: np.ndarray, p: float) -> tuple[SteadyStates, np.ndarray]:
-        """The equations at the amplitude in ``y``, harmonics and amplitude, and the unknowns of these equations."""
+        """Return the equations at the amplitude, the last number of ``y``, and the unknowns of these equations."""
         amplitude = float(y[-1] * self._amplitude)
         return self._latest.get(amplitude, lambda: self._states_at(amplitude)), np.append(y[:-1], p)
 
@@ -121,12 +121,12 @@ class SpecialCurve(UserProblem):
             self._exponent = states.pair_near(inner, self._exponent)
 
     def _equations(self, y: np.ndarray, p: float) -> np.ndarray:
-        """R (n,) and g."""
+        """Return R (n,) and g."""
         states, inner = self._at(y, p)
         return np.append(states.residual(inner, self._shift), self._test(y, p) / self._size)
 
     def _derivative(self, y: np.ndarray, p: float) -> np.ndarray:
-        """Derivative (n + 1, n + 1) by harmonics and amplitude."""
+        """Return the derivative (n + 1, n + 1) by harmonics and amplitude."""
         states, inner = self._at(y, p)
         step = DIFFERENCE * np.eye(len(y))[-1]
         residuals = []
@@ -138,7 +138,7 @@ class SpecialCurve(UserProblem):
         return np.vstack([rows, self._slope(y, p)[:-1] / self._size])
 
     def _test(self, y: np.ndarray, p: float) -> float:
-        """The number g."""
+        """Return the number g."""
         if self.kind == FOLD:
             g, _, _ = self._bordered(y, p)
             return g
@@ -164,7 +164,7 @@ class SpecialCurve(UserProblem):
         return float(v[-1]), v[:-1], w[:-1]
 
     def _slope(self, y: np.ndarray, p: float) -> np.ndarray:
-        """Derivative (n + 2,) of g by harmonics, amplitude and frequency."""
+        """Return the derivative (n + 2,) of g by harmonics, amplitude and frequency."""
         steps = DIFFERENCE * np.eye(len(y) + 1)
         xi = np.append(y, p)
         if self.kind != FOLD:
@@ -195,7 +195,7 @@ class SpecialSteps(UserSteps):
         self.reach = options.isola_reach
 
     def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
-        """The point at which the range of frequencies ends, or the first beyond the range of amplitudes."""
+        """Return the point at which the range of frequencies ends, or the first beyond the range of amplitudes."""
         over = point.xi[-2]
         if not 1 / self.reach <= over <= self.reach:
             return point, Ending.END_OF_AMPLITUDES.with_numbers(end=over * self.amplitude)
@@ -206,7 +206,7 @@ class SpecialSteps(UserSteps):
 
 
 def crosses_amplitude(points: list[Response], special: Response) -> bool:
-    """Whether a curve of special ``points`` passes a ``special`` point of a curve over the frequency."""
+    """Return whether a curve of special ``points`` passes a ``special`` point of a curve over the frequency."""
     for before, after in pairwise(point.xi for point in points):
         if (before[-2] - 1) * (after[-2] - 1) > 0 or before[-2] == after[-2]:
             continue

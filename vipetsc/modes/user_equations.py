@@ -14,7 +14,6 @@ As equilibria of x' = F(x, p), points are stable if no eigenvalue of dF/dx has a
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -22,10 +21,18 @@ import numpy as np
 
 from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Continuation, Verdict, locate
-from vipetsc.modes.continuation.crossing import crossing_row
+from vipetsc.modes.continuation.crossing import crossing_row, step_across
 from vipetsc.modes.continuation.turning import BoundedTurn
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError, SpecialKind, unit
+from vipetsc.modes.problem import (
+    Attempt,
+    ContinuationError,
+    FlowError,
+    NoMotionError,
+    SpecialKind,
+    nearest_on_chords,
+    unit,
+)
 from vipetsc.modes.response.state import Response, returned
 
 if TYPE_CHECKING:
@@ -38,9 +45,8 @@ DIFFERENCE = 6e-6
 # A direction is a null direction if its singular value is below this fraction of the largest: at a located branch point
 # it is 1e-9 or less, at the points of the tests next to one 1e-3.
 SINGULAR = 1e-6
-# First steps along a crossing curve that are tried, over ``largest_step``, and the longest correction over the step.
+# First steps along a crossing curve that are tried, over ``largest_step``.
 FRACTIONS = np.array([1.0, 0.1, 0.01])
-ASTRAY = 1.0
 # Branch points nearer than this in unknowns of order one are the same.
 SAME = 1e-4
 # The first point on a crossing curve belongs to a curve that is nearer to it than this fraction of its distance from
@@ -57,11 +63,11 @@ class UserFrame:
         self.tangent = tangent
 
     def encode(self, point: Response) -> np.ndarray:
-        """The unknowns (n + 1,) of another point."""
+        """Return the unknowns (n + 1,) of another point."""
         return point.xi
 
     def direction(self, point: Response) -> np.ndarray:
-        """The curve's direction (n + 1,) at another point."""
+        """Return the curve's direction (n + 1,) at another point."""
         return point.tangent
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
@@ -69,7 +75,7 @@ class UserFrame:
         return self.problem.solve(guess, self.tangent, self.tangent @ (self.xi + arclength * self.tangent))
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution, on the side of the frame's own.
+        """Return the unit tangent (n + 1,) at a solution, on the side of the frame's own.
 
         At a branch point, which has two null vectors, it is the frame's tangent projected on their plane.
         """
@@ -77,7 +83,7 @@ class UserFrame:
         return unit(null_vectors.T @ (null_vectors @ self.tangent))
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
-        """The point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
+        """Return the point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
         return Response(xi=attempt.xi, tangent=direction)
 
 
@@ -115,7 +121,7 @@ class UserProblem:
         return values / self.unit
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """The derivative (n, n + 1) of ``residual``."""
+        """Return the derivative (n, n + 1) of ``residual``."""
         steps = DIFFERENCE * np.eye(len(xi))
         if self.derivative is None:
             return np.column_stack([self._difference(xi, step) for step in steps])
@@ -131,7 +137,7 @@ class UserProblem:
         return self.newton.solve(self, guess, row, value, self.tolerance)
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
-        """Unknowns (n + 1,) of the solution at the scaled parameter ``p``; raises ContinuationError without one."""
+        """Return the unknowns (n + 1,) of the solution at the scaled parameter ``p``, or raise ContinuationError."""
         attempt = self.solve(np.append(guess[:-1], p), np.eye(len(guess))[-1], p)
         if not attempt.converged:
             value = p * self.scales[-1]
@@ -153,11 +159,11 @@ class UserProblem:
         return int(np.sum(eigenvalues.real > 1e-9 * np.abs(eigenvalues).max()))
 
     def frame(self, point: Response, chart: str = "auto") -> UserFrame:
-        """The frame at a point; there is one ``chart``."""
+        """Return the frame at a point; there is one ``chart``."""
         return UserFrame(self, point.xi, point.tangent)
 
     def first_tangent(self, start: Response, direction: int) -> np.ndarray:
-        """Tangent (n + 1,) at the first point, along which p grows (``direction`` 1) or falls (-1)."""
+        """Return the tangent (n + 1,) at the first point, along which p grows (``direction`` 1) or falls (-1)."""
         return UserFrame(self, start.xi, np.eye(len(start.xi))[-1] * direction).tangent_at(start.xi)
 
     def turn(self, before: Response, after: Response) -> float:
@@ -165,7 +171,7 @@ class UserProblem:
         return 0.0
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds and branch points."""
+        """Yield folds and branch points."""
         yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
         _, size = self._determinant(left)
 
@@ -193,7 +199,7 @@ class UserSteps(BoundedTurn[Response]):
         self.ends = ends
 
     def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
-        """The first point, to which the curve comes back, or that on the end of the range, where it passes that."""
+        """Return the first point if the curve comes back to it, or that on the end of the range if it passes it."""
         if returned(self.first, before, point):
             first = replace(self.first, index=point.index, step=point.step, next_step=point.next_step)
             return first, Ending.CLOSED.with_numbers()
@@ -207,7 +213,7 @@ class UserSteps(BoundedTurn[Response]):
         return last, Ending.END_OF_PARAMETER.with_numbers(end=bound * self.problem.scales[-1])
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Where and why the curve cannot go on."""
+        """Return where and why the curve cannot go on."""
         p = last.xi[-1] * self.problem.scales[-1]
         why = verdict.why or "the next step is too short"
         return f"no step from the last good point, p = {p:.8g}: {why}; change scale, largest_step or tolerance"
@@ -272,17 +278,14 @@ def follow(
 
 
 def _passes(curve: list[Response], first: list[Response]) -> bool:
-    """Whether a ``curve`` passes the last of the points ``first``, nearer than a part of its distance to the first."""
+    """Return whether a ``curve`` passes the last of the points ``first``: nearer than a part of their distance."""
     nodes = np.array([point.xi for point in curve])
-    chords = np.diff(nodes, axis=0)
-    to_point = first[-1].xi - nodes[:-1]
-    along = np.clip(np.sum(to_point * chords, axis=1) / np.maximum(np.sum(chords**2, axis=1), 1e-300), 0, 1)
-    distances = np.linalg.norm(to_point - along[:, np.newaxis] * chords, axis=1)
+    _, distances, _ = nearest_on_chords(first[-1].xi, nodes[:-1], nodes[1:])
     return bool(distances.min(initial=np.inf) < NEAR * np.linalg.norm(first[-1].xi - first[0].xi))
 
 
 def _followed(problem: UserProblem, first: list[Response], rule: UserSteps) -> tuple[list[Response], str]:
-    """All points of a curve that begins with the points ``first``, and how it ended."""
+    """Return all points of a curve that begins with the points ``first``, and how it ended."""
     solutions = [*first]
     curve = Continuation(problem, first[-1], rule)
     before = None
@@ -293,31 +296,26 @@ def _followed(problem: UserProblem, first: list[Response], rule: UserSteps) -> t
             before = last
             last = point
     except NoMotionError as error:
-        return solutions, f"failed: {error}"
+        return solutions, Ending.FAILED.with_numbers(reason=error).sentence
     if not curve.finished:
         return solutions, f"{rule.points} points reached"
     return solutions, curve.ended.sentence
 
 
 def _halves(problem: UserProblem, point: Response, largest_step: float) -> Iterator[Response]:
-    """First points, with tangents, on the two halves of the curve that crosses at a branch ``point``."""
+    """Yield first points, with tangents, on the two halves of the curve that crosses at a branch ``point``."""
     null_vectors = problem.null_vectors(point.xi)
     if len(null_vectors) != 2:
         return
     row = crossing_row(null_vectors, point.tangent)
     for side in (row, -row):
-        for step in largest_step * FRACTIONS:
-            guess = point.xi + step * side
-            attempt = problem.solve(guess, side, side @ guess)
-            if not attempt.converged or np.linalg.norm(attempt.xi - guess) > ASTRAY * step:
-                continue
-            with suppress(NoMotionError):
-                yield Response(xi=attempt.xi, tangent=UserFrame(problem, attempt.xi, side).tangent_at(attempt.xi))
-                break
+        attempt, _ = step_across(problem.solve, point.xi, side, largest_step * FRACTIONS)
+        if attempt.converged:
+            yield Response(xi=attempt.xi, tangent=UserFrame(problem, attempt.xi, side).tangent_at(attempt.xi))
 
 
 def _dataset(problem: UserProblem, solutions: list[Response], name: str, ending: str) -> "xr.Dataset":
-    """The points of a curve as a dataset."""
+    """Return the points of a curve as a dataset."""
     import xarray as xr
 
     xi = np.array([point.xi for point in solutions]) * problem.scales

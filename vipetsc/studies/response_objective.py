@@ -9,7 +9,7 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import MeasuredTable
-from vipetsc.case.response_measures import ResponseMeasure, response_measures
+from vipetsc.case.response_measures import ResponseMeasure
 from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import follow_all
@@ -46,7 +46,7 @@ def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[Me
         if reason:
             raise RuntimeError(f"curve {branch.name}: {reason}")
 
-    measures = response_measures(case)
+    measures = case.measures()
     values: dict[str, list[float]] = {}
     for table in tables:
         response = measures[str(table.measure)]

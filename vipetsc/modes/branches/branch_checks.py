@@ -6,6 +6,7 @@ from vipetsc.case.nnm_table import Guards
 from vipetsc.endings import Ended, Ending
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.point import Point
+from vipetsc.modes.problem import nearest_on_chords
 from vipetsc.modes.shooting import Shooting, repetitions, sample_orbit
 
 # Points between two checks whether a branch has passed on to another one; each check integrates fifteen arcs.
@@ -21,16 +22,6 @@ SAME_DIRECTION = 0.999
 # latest steps that are looked at then lie 1.2 of the point's own steps away, or more.
 LATEST = 6
 FEWEST = 10
-
-
-def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (0 to 1) on chords that are nearest to ``place``, the distances there, and the chords' lengths."""
-    chords = ends - starts
-    squared = np.einsum("ij,ij->i", chords, chords)
-    # Two equal points leave a chord without a length: the floor makes its position 0 and not a NaN.
-    position = np.clip(np.einsum("ij,ij->i", place - starts, chords) / np.maximum(squared, 1e-300), 0, 1)
-    distance = np.linalg.norm(starts + position[:, None] * chords - place, axis=1)
-    return position, distance, np.sqrt(squared)
 
 
 class BranchMonitor:
@@ -113,7 +104,7 @@ class BranchMonitor:
 
         starts = starts[near]
         ends = ends[near]
-        _, distance, length = _nearest(here, starts, ends)
+        _, distance, length = nearest_on_chords(here, starts, ends)
         i = int(distance.argmin())
         along = (ends[i] - starts[i]) @ step / max(length[i] * size, 1e-300)
 

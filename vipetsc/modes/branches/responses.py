@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase, ResponseCurve
-from vipetsc.case.response_measures import FRACTIONS, WALLS, response_measures, value_of
+from vipetsc.case.response_measures import FRACTIONS, WALLS, value_of
 from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
@@ -240,7 +240,7 @@ class ResponseMethod(Method[Response]):
             return []
         assert isinstance(problem, SteadyStates | StatesOverKey)
         options = self.case.nfrc
-        of_curve = response_measures(self.case)
+        of_curve = self.case.measures()
         low, high = (bound / problem.parameter.scale for bound in options.range)
         rounding = 1e-9 * (high - low)
         # All values of all quantities are compared at the same few states.

@@ -6,9 +6,15 @@ orthogonal to t, and a small step s, the equations H(xi) = 0, r . (xi - xi_0) = 
 and none on the old one, along which r . (xi - xi_0) is of second order.
 """
 
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
 import numpy as np
 
-from vipetsc.modes.problem import unit
+from vipetsc.modes.problem import Attempt, unit
+
+# The longest correction of a first point on the crossing branch over the step to it.
+ASTRAY = 1.0
 
 
 def crossing_row(null_vectors: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -19,3 +25,22 @@ def crossing_row(null_vectors: np.ndarray, along: np.ndarray) -> np.ndarray:
     # The old direction has the coordinates (first, second) in the plane. Turned by 90 deg it is r.
     first, second = null_vectors @ along
     return unit(null_vectors.T @ np.array([-second, first]))
+
+
+def step_across(
+    solve: Callable[[np.ndarray, np.ndarray, float], Attempt],
+    begin: np.ndarray,
+    row: np.ndarray,
+    steps: Iterable[float],
+) -> tuple[Attempt, float]:
+    """Return Newton's attempt at a first point of the crossing branch, with the first of ``steps`` that leads to it.
+
+    ``solve`` seeks the solution with row . xi = value from a guess; ``begin`` (n + 1,) is the point at which branches
+    cross, ``row`` (n + 1,) is r. If no step leads there, the last attempt is returned as one that did not converge.
+    """
+    for step in steps:
+        guess = begin + step * row
+        attempt = solve(guess, row, row @ guess)
+        if attempt.converged and np.linalg.norm(attempt.xi - guess) <= ASTRAY * step:
+            return attempt, step
+    return replace(attempt, converged=False), step

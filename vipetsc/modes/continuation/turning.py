@@ -39,7 +39,7 @@ class BoundedTurn(ABC, Generic[S]):
         self.largest_step = largest_step
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """The verdict on a failed attempt: half the step."""
+        """Return the verdict on a failed attempt: half the step."""
         residuals = attempt.residuals or "none"
         why = f"Newton's method ended with {attempt.reason} (residuals {residuals})"
         return Verdict(accepted=False, step=step / 2, why=why)
@@ -60,7 +60,7 @@ class BoundedTurn(ABC, Generic[S]):
 
     @abstractmethod
     def end(self, before: S, point: S) -> tuple[S, Ended] | None:
-        """The last point of the curve and how it ended, if it ends at ``point``; else None."""
+        """Return the last point of the curve and how it ended, if it ends at ``point``; else None."""
 
     @abstractmethod
     def stuck(self, last: S, attempt: Attempt | None, verdict: Verdict) -> str:

@@ -14,21 +14,20 @@ from typing import TypeVar
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.modes.continuation.crossing import crossing_row
+from vipetsc.modes.continuation.crossing import crossing_row, step_across
 from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.response.equations import SteadyEquations, SteadyFrame
 from vipetsc.modes.response.stability_changes import PERIOD_DOUBLING
 from vipetsc.modes.response.state import Response
 
-# First steps that are tried, over the size of the motion, and the longest correction over the step.
+# First steps that are tried, over the size of the motion.
 FRACTIONS = np.array([3e-2, 1e-2, 3e-3, 1e-3])
-ASTRAY = 1.0
 
 E = TypeVar("E", bound=SteadyEquations)
 
 
 def crossing_case(case: NfrcCase, kind: str) -> NfrcCase:
-    """The ``case`` of the curves that cross its curves at special points of a ``kind``: their harmonics."""
+    """Return the ``case`` of the curves that cross its curves at special points of a ``kind``: their harmonics."""
     doubled = 1 + (kind == PERIOD_DOUBLING)
     nfrc = case.nfrc
     update = {"symmetric": False, "subharmonic": doubled * nfrc.subharmonic, "harmonics": doubled * nfrc.harmonics}
@@ -39,7 +38,7 @@ def crossing_case(case: NfrcCase, kind: str) -> NfrcCase:
 
 
 def first_crossing(old: SteadyEquations, point: Response, new: E, side: int) -> tuple[E, Response]:
-    """The equations ``new`` and a first state, with its tangent, on the curve that crosses the one of ``old``.
+    """Return the equations ``new`` and a first state, with its tangent, on the curve that crosses the one of ``old``.
 
     ``side`` is 1 or -1, of the two directions in which the curve leaves. Raises ContinuationError without a state.
     """
@@ -51,23 +50,19 @@ def first_crossing(old: SteadyEquations, point: Response, new: E, side: int) -> 
     directions = np.linalg.svd(frame.jacobian(begin))[2]
     row = side * crossing_row(directions[-2:], along)
 
-    why = ""
-    for step in FRACTIONS * np.linalg.norm(begin[:-1]):
-        guess = begin + step * row
-        attempt = frame.solve(guess, row, row @ guess)
-        if attempt.converged and np.linalg.norm(attempt.xi - guess) <= ASTRAY * step:
-            tangent = SteadyFrame(new, attempt.xi, row).tangent_at(attempt.xi)
-            return new, Response(xi=attempt.xi, tangent=tangent, next_step=float(step))
-        why = f"{attempt.reason}; residuals {attempt.residuals}"
-    value = point.xi[-1] * old.parameter.scale
-    raise ContinuationError(
-        f"no state of a curve that crosses is found at the {point.kind}, {old.parameter.over} = {value:.8g} ({why}); "
-        "increase nfrc.harmonics or nfrc.max_newton"
-    )
+    attempt, step = step_across(frame.solve, begin, row, FRACTIONS * np.linalg.norm(begin[:-1]))
+    if not attempt.converged:
+        value = point.xi[-1] * old.parameter.scale
+        raise ContinuationError(
+            f"no state of a curve that crosses is found at the {point.kind}, {old.parameter.over} = {value:.8g} "
+            f"({attempt.reason}; residuals {attempt.residuals}); increase nfrc.harmonics or nfrc.max_newton"
+        )
+    tangent = SteadyFrame(new, attempt.xi, row).tangent_at(attempt.xi)
+    return new, Response(xi=attempt.xi, tangent=tangent, next_step=float(step))
 
 
 def _with_harmonics(old: SteadyEquations, new: SteadyEquations, xi: np.ndarray) -> np.ndarray:
-    """Unknowns of ``new``, which has further harmonics or the doubled period, from those of ``old``, (n + 1,)."""
+    """Return the unknowns (n + 1,) of ``new``, with further harmonics or the doubled period, of a state of ``old``."""
     z = old.balance.unpack(xi[:-1])
     more = np.zeros((len(z), new.balance.order + 1), complex)
     every = new.periods // old.periods
