@@ -138,8 +138,9 @@ range = [0.97, 1.01]
 harmonics = 3
 points = 5
 """
-# The parameter of the curves is a key of the case.
+# The parameter of the curves is a key of the case, and masses are named, whose harmonics are stored.
 OVER_KEY = NFRC.replace("range = [0.97, 1.01]", 'over = "contacts.clearance"\nrange = [1.2e-3, 1.8e-3]\nfixed = [2.0]')
+OVER_KEY += "[[output.points]]\nname = 'before'\ncell = 98\n[[output.points]]\nname = 'behind'\ncell = 102\nmass = 3\n"
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
 # One clearance is identified from a record with contacts, in two starts: one for each of two ranks.
