@@ -20,14 +20,15 @@ def breather_chain(ends: str = "fixed", sites: tuple[int, ...] = (BREATHER_SITE,
 
 
 def breather_case(**nnm: Any) -> NnmCase:
-    """The case of a branch of two points from the breather at ``BREATHER_FREQUENCY``, by shooting the whole lattice.
+    """The case of a branch of two points from the breather at ``BREATHER_FREQUENCY``, condensed onto its contact.
 
     ``nnm`` updates the section of that name.
     """
     section: dict[str, Any] = {
-        "system": "chain",
+        "system": "condensed",
         "start_frequency": [BREATHER_FREQUENCY],
-        "tolerance": 1e-12,
+        "truncation": 1e-7,
+        "tolerance": 1e-11,
         "points": 2,
     }
     table = {

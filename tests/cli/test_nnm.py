@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
 import h5py
 import pytest
 
-from tests.conftest import assert_same_bits, clean_environment, datasets, modified
+from tests.conftest import assert_same_bits, datasets, modified
 
 CASE = """
 [lattice]
@@ -103,47 +101,6 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert done.returncode == 1
     assert "change nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
-
-
-CHAIN = """
-[lattice]
-preset = "four-band"
-cells = 6
-[contacts]
-sites = [2]
-clearance = 1.8e-3
-[nnm]
-system = "chain"
-start_frequency = [1600.0]
-tolerance = 1e-12
-points = 3
-"""
-FAILS_ON_RANK_1 = """
-import sys
-from mpi4py import MPI
-from vipetsc.__main__ import main
-
-def fault(event, _):
-    if event == "vipetsc.step" and MPI.COMM_WORLD.rank == 1:
-        raise ValueError("of rank 1 alone")
-
-sys.addaudithook(fault)
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.mpirun
-def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tmp_path):
-    """An error on one of two ranks ends both with its message: neither waits for the other."""
-    (tmp_path / "fails.py").write_text(FAILS_ON_RANK_1)
-    (tmp_path / "chain.toml").write_text(CHAIN)
-    paths = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '.')}"
-    # Ranks that wait for each other would never end: the time is limited.
-    options = {"module": "fails", "env": clean_environment() | {"PYTHONPATH": paths}, "timeout": 100}
-
-    done = vipetsc(2, "nnm", tmp_path / "chain.toml", "--out", tmp_path / "out", **options)
-    assert done.returncode == 1
-    assert "of rank 1 alone" in done.stderr
 
 
 def test_a_file_that_is_no_branch_is_refused(in_process, tmp_path):

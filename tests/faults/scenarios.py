@@ -70,7 +70,7 @@ springs = [
 ]
 smooth = [{ start = 0, end = 1, cubic = 0.5 }]
 """
-# Branches of a lattice by both methods: harmonic balance of its sites, and shooting by all ranks together.
+# Branches of a lattice by harmonic balance of its sites.
 CONDENSED = """
 [lattice]
 preset = "four-band"
@@ -83,21 +83,6 @@ start_frequency = [1420.0, 3700.0]
 direction = "down"
 energy = [1e-4, 0.3]
 points = 4
-first_step = 1e-2
-"""
-SHOT = """
-[lattice]
-preset = "four-band"
-cells = 16
-[contacts]
-restitution = 1.0
-sites = [7]
-[nnm]
-system = "chain"
-start_frequency = [1600.0]
-frequency = [1508.0, 1822.0]
-energy = [1e-4, 10.0]
-points = 3
 first_step = 1e-2
 """
 DESIGN = """
@@ -235,7 +220,6 @@ SCENARIOS = {
         Scenario("sweep-team", TEAM, f"sweep {OUT}", ranks=3),
         Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
         Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
-        Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
         Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
         Scenario("nfrc-over-key", OVER_KEY, f"nfrc {OUT} {PLAIN}"),
         Scenario("design", DESIGN, f"design {OUT}", ranks=2),

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from mpi4py import MPI
 
-import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.lattice import lattice_flow
 from vipetsc.parallel import StopRequest
 
 
@@ -103,57 +101,6 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
         assert_same_bits(datasets(folder / name), datasets(whole / name))
 
 
-class StopWithin(StopRequest):
-    """A request to stop that this rank gets after so many ``looks``, of which it counts ``seen``."""
-
-    def __init__(self, looks: float) -> None:
-        self.looks = looks
-        self.seen = 0
-
-    @property
-    def requested(self) -> bool:
-        self.seen += 1
-        return self.seen > self.looks
-
-
-@pytest.mark.parallel([1, 2])
-def test_a_lattice_that_is_stopped_within_an_arc_goes_on_to_the_same_bits(folder, monkeypatch):
-    """A request that one rank gets in the midst of an arc ends the branch on all, which then goes on to the same bits.
-
-    Here requests are looked at after each step of the flow, and after each product.
-    """
-    comm = MPI.COMM_WORLD
-    monkeypatch.setattr(lattice_flow, "CELLS_BETWEEN_LOOKS", 1)
-    table = {
-        "name": "lattice",
-        "lattice": {"preset": "four-band", "cells": 6},
-        "contacts": {"sites": [2], "clearance": 1.8e-3},
-        "nnm": {"system": "chain", "shooting": "krylov", "start_frequency": [1600.0], "tolerance": 1e-12, "points": 3},
-    }
-    case = NnmCase.from_table(table)
-    whole = folder / "whole"
-    parts = folder / "parts"
-    if comm.rank == 0:
-        whole.mkdir()
-        parts.mkdir()
-    comm.Barrier()
-    never = StopWithin(np.inf)
-    follow_all(case, whole, comm, stop=never)
-
-    # On the last rank alone: the first request comes in the search for the start.
-    for looks in (10, 0.6 * never.seen):
-        stop = StopWithin(looks if comm.rank == comm.size - 1 else np.inf)
-        stopped = follow_all(case, parts, comm, resume=True, stop=stop)
-        assert stop.seen < never.seen
-        for branch in stopped:
-            assert branch.ended.sentence.startswith("stopped on request")
-            assert len(branch.points) < 4
-    follow_all(case, parts, comm, resume=True)
-    comm.Barrier()
-    (name,) = (path.name for path in whole.glob("*.h5"))
-    assert_same_bits(datasets(parts / name), datasets(whole / name))
-
-
 @pytest.mark.parallel([2])
 def test_an_error_of_one_rank_is_raised_on_all_when_the_others_have_finished(folder):
     """An error that is no failure of the method, here of a listener, is raised on all ranks after all branches."""
@@ -170,20 +117,3 @@ def test_an_error_of_one_rank_is_raised_on_all_when_the_others_have_finished(fol
     comm.Barrier()
     if comm.rank == 0:
         assert len(read_branch(folder / "branch-mode-1.h5").points) == 4
-
-
-@pytest.mark.parallel([2])
-def test_an_error_of_the_listener_is_raised_on_all_ranks_that_follow_one_branch(folder):
-    """A listener is called on rank 0, between points that all ranks compute together; its error reaches all ranks."""
-
-    def listener(branch, point):
-        raise RuntimeError("of the listener")
-
-    # The lattice has as many cells as one time step couples.
-    table = {
-        "lattice": {"preset": "four-band", "cells": 6},
-        "contacts": {"sites": [2], "clearance": 1.8e-3},
-        "nnm": {"system": "chain", "shooting": "krylov", "start_frequency": [1600.0], "tolerance": 1e-12, "points": 2},
-    }
-    with pytest.raises(RuntimeError, match="of the listener"):
-        follow_all(NnmCase.from_table(table), folder, MPI.COMM_WORLD, listener=listener)

@@ -16,7 +16,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_tape, create_trial
+from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_trial
 from vipetsc.records import Record
 
 # The mass on a stop: its mass in kg, its velocity at the onset in m/s, and the stop's (k/m)^1/2 in rad/s.
@@ -75,7 +75,6 @@ def mass_on_stop(damping: float = 0.0) -> Record:
         history=np.zeros(1, HISTORY),
         state=np.zeros(1, SUBSTEP_STATE),
         trial=create_trial(1, 1),
-        tape=create_tape(0, 0),
     )
     return Record(cluster)
 

@@ -159,7 +159,8 @@ class StopWithin(StopRequest):
         self.looks = looks
         self.seen = 0
 
-    def agreed(self, comm: MPI.Comm) -> bool:
+    @property
+    def requested(self) -> bool:
         self.seen += 1
         return self.seen > self.looks
 

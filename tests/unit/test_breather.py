@@ -12,7 +12,6 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.special import ellipk
 
-from tests.breathers import breather_case
 from tests.condensed_branches import condensed_branch, condensed_breather
 from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
@@ -311,44 +310,18 @@ def test_bad_values_of_a_condensed_case_are_refused(change, key):
 @pytest.mark.parametrize(
     ("nnm", "message"),
     [
-        ({"start_frequency": [1600.0], "start_sites": [2]}, "site numbers from 1 to 1"),
-        ({"start_sites": [1]}, "begin at a start_frequency"),
+        ({"method": "condensed", "start_frequency": [1600.0], "start_sites": [2]}, "site numbers from 1 to 1"),
+        ({"start_sites": [1]}, "motions that are condensed"),
     ],
 )
-def test_start_sites_of_a_shot_lattice_are_there_and_begin_breathers(nnm, message):
-    """Start sites must exist and need a start frequency."""
+def test_start_sites_are_there_and_begin_condensed_motions(nnm, message):
+    """Start sites must exist, and belong to condensed motions."""
     lattice = {"preset": "four-band", "cells": 14}
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table({"lattice": lattice, "contacts": {"sites": [6]}, "nnm": {"system": "chain"} | nnm})
 
 
-@pytest.mark.parametrize("system", ["reduced", 'chain"\nshooting = "dense'])
-def test_branches_shot_with_dense_matrices_have_no_start_frequency(system):
+@pytest.mark.parametrize("system", ["reduced", "chain"])
+def test_branches_that_are_shot_have_no_start_frequency(system):
     with pytest.raises(CaseError, match=r"nnm.start_frequency"):
         chain_case(cells=3, site=2, system=system)
-
-
-@pytest.mark.parametrize(
-    ("nnm", "message"),
-    [
-        ({"shooting": "dense"}, "needs nnm.shooting"),
-        ({"switch": ["branch-point"]}, "needs dense matrices"),
-        ({"system": "reduced", "start_frequency": [], "multipliers": 3}, 'is for "chain"'),
-        ({"shooting": "newton"}, "nnm.shooting"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(nnm, message):
-    with pytest.raises(CaseError, match=message):
-        breather_case(**nnm)
-
-
-def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():
-    case = breather_case(system="condensed", points=1, truncation=1e-7)
-    table = case.model_dump(by_alias=True, exclude_none=True)
-    # A cell has four masses: the lattice has one cell more than the bound of 40,000 masses allows.
-    table["lattice"] |= {"cells": 10_001}
-    NnmCase.from_table(table)
-
-    table["nnm"] |= {"multipliers": 2}
-    with pytest.raises(CaseError, match=r"nnm\.multipliers.*multiplier_max needs only the motion of the sites"):
-        NnmCase.from_table(table)

@@ -1,12 +1,10 @@
 """PETSc's Newton method: exceptions of the equations reach the caller, and the solver can be used afterwards."""
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 import pytest
 
-from vipetsc.modes.lattice.krylov import KrylovNewton
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import FlowError
 
@@ -16,7 +14,7 @@ class Circle:
 
     def __init__(self, fails_at: dict[str, int] | None = None, error: BaseException | None = None) -> None:
         self.error = error
-        self.left = {"residual": 99, "jacobian": 99, "product": 99} | (fails_at or {})
+        self.left = {"residual": 99, "jacobian": 99} | (fails_at or {})
         self.failed = False
 
     def _count(self, name: str) -> None:
@@ -34,16 +32,11 @@ class Circle:
         self._count("jacobian")
         return 2 * xi[None]
 
-    def product(self, xi, change):
-        self._count("product")
-        return np.array([2 * xi @ change])
-
 
 ROW = np.array([1.0, -1.0])
 GUESS = np.array([0.8, 0.5])
 
-dense = pytest.param(lambda: DenseNewton(2, 20), ["residual", "jacobian"], id="dense")
-krylov = pytest.param(lambda: KrylovNewton([0, 2], MPI.COMM_SELF, 20), ["residual", "product"], id="krylov")
+NAMES = ["residual", "jacobian"]
 
 
 def meets_the_circle(newton) -> bool:
@@ -51,12 +44,11 @@ def meets_the_circle(newton) -> bool:
     return attempt.converged and np.allclose(attempt.xi, np.sqrt(0.5), atol=1e-10)
 
 
-@pytest.mark.parametrize("make, names", [dense, krylov])
 @pytest.mark.parametrize("error", [ZeroDivisionError("no such orbit"), KeyboardInterrupt("stop")])
-def test_what_the_equations_raise_comes_out(make, names, error):
+def test_what_the_equations_raise_comes_out(error):
     """An exception of the equations is raised by ``solve`` as the same object, and the solver works afterwards."""
-    newton = make()
-    for name in names:
+    newton = DenseNewton(2, 20)
+    for name in NAMES:
         for evaluations in (0, 1):
             with pytest.raises(type(error)) as caught:
                 newton.solve(Circle({name: evaluations}, error), GUESS, ROW, 0.0, 1e-12)
@@ -64,11 +56,10 @@ def test_what_the_equations_raise_comes_out(make, names, error):
             assert meets_the_circle(newton)
 
 
-@pytest.mark.parametrize("make, names", [dense, krylov])
-def test_leaving_the_domain_is_an_attempt_that_failed(make, names):
+def test_leaving_the_domain_is_an_attempt_that_failed():
     """A FlowError ends the attempt at its guess, with its text as the reason, and the solver works afterwards."""
-    newton = make()
-    for name in names:
+    newton = DenseNewton(2, 20)
+    for name in NAMES:
         for evaluations in (0, 1):
             attempt = newton.solve(Circle({name: evaluations}, FlowError("no flow")), GUESS, ROW, 0.0, 1e-12)
             assert not attempt.converged
@@ -79,21 +70,12 @@ def test_leaving_the_domain_is_an_attempt_that_failed(make, names):
             assert meets_the_circle(newton)
 
 
-def test_a_null_vector_that_cannot_be_computed_raises():
-    """A FlowError during the search for a null vector is raised, and the solver works afterwards."""
-    newton = KrylovNewton([0, 2], MPI.COMM_SELF, 20)
-    with pytest.raises(FlowError, match="no flow"):
-        newton.null_vector(Circle({"product": 0}, FlowError("no flow")), GUESS, ROW)
-    assert meets_the_circle(newton)
-
-
-@pytest.mark.parametrize("make", [dense.values[0], krylov.values[0]], ids=["dense", "krylov"])
 @pytest.mark.parametrize("asked", ["", "l2"])
-def test_there_is_no_line_search_that_no_option_asks_for(make, asked, petsc_options, tmp_path):
+def test_there_is_no_line_search_that_no_option_asks_for(asked, petsc_options, tmp_path):
     """Steps are not searched along unless an option asks for it, and the solver leaves no option of its own behind."""
     if asked:
         petsc_options(nnm_snes_linesearch_type=asked)
-    newton = make()
+    newton = DenseNewton(2, 20)
     assert meets_the_circle(newton)
     assert PETSc.Options().getAll().get("nnm_snes_linesearch_type", "") == asked
 
@@ -119,11 +101,10 @@ def test_errors_of_petsc_itself_pass(petsc_options):
         newton.solve(Circle(), GUESS, ROW, 0.0, 1e-12)
 
 
-@pytest.mark.parametrize("make, names", [dense, krylov])
 @pytest.mark.parametrize("residual", [np.nan, np.inf])
-def test_a_residual_that_is_not_finite_ends_the_attempt(make, names, residual):
+def test_a_residual_that_is_not_finite_ends_the_attempt(residual):
     """A residual of NaN or infinity ends the attempt without convergence."""
-    newton = make()
+    newton = DenseNewton(2, 20)
     # Most versions of PETSc check the residual themselves before they call the convergence test.
     assert newton._test(newton._snes, 1, (0.8, 0.1, residual)) < 0
 

@@ -9,9 +9,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_matrix
 
-from tests.models import TWO_MASS_CELL
 from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
 from vipetsc.case import NnmCase
@@ -19,7 +17,6 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
@@ -75,7 +72,7 @@ def test_losses_are_in_the_files_of_a_branch(shot):
 def test_free_decay_takes_the_loss(shot):
     """A free motion that SciPy integrates with dashpots and restitutions loses the branch's loss over one period."""
     branch, _ = shot
-    shooting = ShootingMethod(lossy_case(), MPI.COMM_SELF).shooting
+    shooting = ShootingMethod(lossy_case()).shooting
     lattice = independent_lattice()
     # The branch's motion is conservative; the independent lattice gets the dashpots and restitutions.
     damped = replace(
@@ -97,69 +94,12 @@ def test_free_decay_takes_the_loss(shot):
     assert lost == pytest.approx(point.loss, rel=1e-2)
 
 
-CHAIN: dict[str, Any] = {
-    "name": "chain",
-    "lattice": {"cells": 14, "cell": TWO_MASS_CELL, "damping": {"mass": 1.0, "stiffness": 1e-6}},
-}
-
-
-@pytest.mark.parametrize(
-    ("law", "stiffness", "stops", "omega"),
-    [
-        ("hertz", 1e7, {}, 4500.0),
-        ("hertz", 1e7, {"clearance_minus": 1.2e-4}, 4500.0),
-        ("bilinear", 1e5, {"side": "plus"}, 1600.0),
-    ],
-)
-def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, stops, omega):
-    """A breather's losses in dashpots and contacts are the same by the propagator and by a flow with dense matrices."""
-    contacts = {"law": law, "stiffness": stiffness, "sites": [7, 9], "clearance": [1e-4, 1.3e-4]} | stops
-    nnm = {"system": "chain", "tolerance": 1e-12, "forced": [6, 1]}
-
-    def case(shooting: str) -> NnmCase:
-        changes = {"contacts": contacts | {"restitution": 0.9}, "nnm": nnm | {"shooting": shooting, "modes": [1]}}
-        return NnmCase.from_table(CHAIN | changes)
-
-    method = LatticeMethod(case("krylov"), MPI.COMM_SELF)
-    breather = method.lattice.breather(omega)
-    assert breather.episodes >= 1
-    point = method.assess(method.lattice, breather)
-    dense = ShootingMethod(case("dense"), MPI.COMM_SELF)
-    expected = with_loss(dense.shooting, dense.dissipation, breather)
-    # The loss without dashpots is that in the contacts.
-    by_contacts = with_loss(dense.shooting, dense.dissipation._replace(damping=csr_matrix((28, 28))), breather)
-
-    # Both losses must matter: otherwise the comparison would hold with one of them left out.
-    assert 0.1 < by_contacts.loss / expected.loss < 0.95
-    assert point.loss == pytest.approx(expected.loss, rel=2e-7)
-    assert point.force == pytest.approx(expected.force, rel=2e-7)
-
-    # Three periods are taken as one, so that a site touches several times in the arc.
-    thrice = replace(breather, period=3 * breather.period)
-    expected = with_loss(dense.shooting, dense.dissipation, thrice)
-    assert method.assess(method.lattice, thrice).loss == pytest.approx(expected.loss, rel=2e-7)
-
-
-def test_a_linear_mode_of_a_lattice_without_matrices_has_its_damping_ratio():
-    """A harmonic motion has the damping ratio of Rayleigh damping, and a force F = loss/(pi a) at the amplitude a."""
-    nnm = {"system": "chain", "shooting": "krylov", "modes": [5], "forced": [4, 2], "start_energy": 1e-9}
-    contacts = {"law": "hertz", "stiffness": 1e7, "sites": [7], "clearance": 1e-3}
-    method = LatticeMethod(NnmCase.from_table(CHAIN | {"contacts": contacts, "nnm": nnm}), MPI.COMM_SELF)
-    point = method.assess(method.lattice, method.start(method.lattice, 4))
-
-    omega = 2 * np.pi / point.period
-    # Rayleigh's damping ratio of a mode.
-    assert point.damping_ratio == pytest.approx((1.0 / omega + 1e-6 * omega) / 2, rel=1e-11)
-    # In quadrature a force F does the work pi F a on the amplitude a.
-    assert point.force == pytest.approx(point.loss / (np.pi * abs(point.x[3 * 2 + 1])), rel=1e-11)
-
-
 @pytest.mark.slow
 def test_condensed_motions_lose_what_orbits_lose(shot):
     """A condensed motion, given by harmonics, has the loss and the force of the orbit that shooting finds."""
     branch, _ = shot
     method = CondensedMethod(
-        lossy_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2, start_energy=2.1e-4), MPI.COMM_SELF
+        lossy_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2, start_energy=2.1e-4)
     )
     point = list(Continuation(method.motions, method.start(method.motions, 3), method.options))[-1]
     point = method.assess(method.motions, point)
@@ -183,11 +123,11 @@ def test_harmonics_of_all_orders_count_in_the_loss():
     nnm |= {"energy": [0.0, 5.0]}
     table = {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"]}
     case = NnmCase.from_table(table | {"nnm": nnm})
-    method = CondensedMethod(case, MPI.COMM_SELF)
+    method = CondensedMethod(case)
     motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
     motion = method.assess(method.motions, motion)
 
-    shooting = ShootingMethod(NnmCase.from_table(table | {"nnm": nnm | {"method": "shooting"}}), MPI.COMM_SELF).shooting
+    shooting = ShootingMethod(NnmCase.from_table(table | {"nnm": nnm | {"method": "shooting"}})).shooting
     u = np.concatenate(list(state_of(method.motions, motion, 1).values()))
     frame = shooting.frame_at("relative", u, motion.period)
     row = np.append(u / np.linalg.norm(u), 0.0)
@@ -238,7 +178,7 @@ def test_losses_are_those_of_the_orbit_whichever_part_of_it_is_shot(name):
     }
     contacts = {"law": "bilinear", "stiffness": 2.0, "restitution": 0.99}
     nnm = {"system": "own", "own": own, "forced": [1], "max_newton": 20}
-    method = ShootingMethod(NnmCase.from_table({"name": "own", "contacts": contacts, "nnm": nnm}), MPI.COMM_SELF)
+    method = ShootingMethod(NnmCase.from_table({"name": "own", "contacts": contacts, "nnm": nnm}))
     quarter = method.shooting
     frame = quarter.relative_frame(np.array([-0.6, 0.5]), 2 * np.pi / 1.8)
     row = np.append(frame.xi[:-1], 0.0)
@@ -269,7 +209,7 @@ def test_the_force_holds_a_steady_state_in_quadrature(damping):
     case = NnmCase.from_table(
         {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"], "nnm": nnm | {"start_energy": 0.9}}
     )
-    method = CondensedMethod(case, MPI.COMM_SELF)
+    method = CondensedMethod(case)
     motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
     motion = method.assess(method.motions, motion)
     assert motion.episodes

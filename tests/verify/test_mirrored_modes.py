@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from vipetsc.case import NnmCase
-from vipetsc.lattice import Contact
 from vipetsc.modes import Branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.flow import Dop853Flow
-from vipetsc.modes.system import ContactPair, System
 
 WALL = 1000.0  # N/m, the spring of each of two masses of 1 kg to the ground
 BETWEEN = 500.0  # N/m, the spring between the two masses
@@ -141,29 +138,6 @@ def test_so_do_those_of_condensed_motions():
         assert "energy range" in branch.ended.sentence, branch.ended.sentence
         assert branch.regular()[-1].episodes == 2
     assert_halves(found["in-phase"], sides=1, rtol=1e-5)
-
-
-def test_so_do_those_of_orbits_shot_without_matrices():
-    """The left half of an in-phase orbit shot without matrices is an orbit of the left half lattice with a free end.
-
-    The compiled flow integrates that half, which is at rest again after half a period.
-    """
-    table = CHAIN | {"nnm": CHAIN["nnm"] | {"shooting": "krylov"}}
-    (branch,) = branches(table).values()
-    assert "points reached" in branch.ended.sentence, branch.ended.sentence
-    touching = [point for point in branch.regular() if point.episodes]
-    assert len(touching) > 2
-    assert all(point.episodes == 2 for point in touching)
-
-    half = CELLS // 2
-    springs = [(None, 0, WALL), *((i, i + 1, WALL) for i in range(half - 1))]
-    stop = ContactPair(None, SITES[0] - 1, CLEARANCE, Contact("bilinear", STOP), clearance_minus=np.inf)
-    flow = Dop853Flow(System.assemble(np.ones(half), springs, [stop]))
-    for point in touching:
-        start = np.append(point.x[:half], np.zeros(half))
-        end = flow.arc(start, point.period / 2, point.period).end
-        scale = np.abs(point.x).max() * 2 * np.pi / point.period
-        assert np.abs(end[half:]).max() < 1e-9 * scale
 
 
 @pytest.mark.parametrize("beyond", [0.0, 1e-7, 1e-4])

@@ -18,7 +18,6 @@ from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Contact
 from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_of
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.flow import MAPS, Dop853Flow
@@ -181,7 +180,7 @@ def grain_forces(u: np.ndarray) -> np.ndarray:
 def grains():
     """The shooting problem of a chain of grains, and the branch of its second mode."""
     case = NnmCase.from_table(GRAINS)
-    problem = ShootingMethod(case, MPI.COMM_SELF).shooting
+    problem = ShootingMethod(case).shooting
     start = linear_start(problem, 1, problem.system.grazing_energy(1) / 100)
     return problem, [start, *Continuation(problem, start, case.nnm)]
 
@@ -290,9 +289,9 @@ def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
             "precompression": depth,
             "sites": [1, 2, 3, 4],
         },
-        "nnm": {"system": "chain", "modes": [4], "shooting": "dense", "points": 3, "locate": False},
+        "nnm": {"system": "chain", "modes": [4], "points": 3, "locate": False},
     }
-    method = ShootingMethod(NnmCase.from_table(table), MPI.COMM_SELF)
+    method = ShootingMethod(NnmCase.from_table(table))
     start = method.start(method.shooting, 3)
     points = [start, *Continuation(method.shooting, start, method.options)]
 
@@ -325,7 +324,7 @@ SITES: dict[str, Any] = {
         "side": "plus",
         "precompression": 2e-4,
     },
-    "nnm": {"system": "chain", "shooting": "krylov", "modes": [28], "tolerance": 1e-12},
+    "nnm": {"system": "chain", "modes": [28], "tolerance": 1e-12},
 }
 # The frequency in rad/s of a breather whose contact opens, between the bands and the linear mode of a pressed site.
 OPENING = 8000.0
@@ -373,31 +372,6 @@ def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
     end = Dop853Flow(system).arc(np.append(u, 0 * u), point.period, point.period).end
     assert np.abs(end[: len(u)] - u).max() < 1e-4 * np.abs(u).max()
     assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
-
-
-def test_shooting_without_matrices_finds_the_orbit_of_pressed_sites(opening):
-    """Shooting without matrices finds the orbit of dense shooting; its variations pass the opening of a contact."""
-    condensed, point, system = opening
-    lattice = LatticeMethod(NnmCase.from_table(SITES), MPI.COMM_SELF).lattice
-    u = np.concatenate(list(state_of(condensed.motions, point, 2).values()))
-    orbit = corrected(lattice, u, point.period)
-    dense = corrected(Shooting(Dop853Flow(system), MAPS["half"], 1e-12), orbit.x, orbit.period)
-
-    assert dense.x == pytest.approx(orbit.x, abs=1e-8 * np.abs(orbit.x).max())
-    assert dense.period == pytest.approx(orbit.period, rel=1e-9)
-    assert dense.energy == pytest.approx(orbit.energy, rel=1e-9)
-    assert (orbit.episodes, dense.episodes) == (1, 1)
-    assert orbit.closed == pytest.approx(dense.closed, abs=1e-9)
-
-    flow = Dop853Flow(system)
-    start = np.append(orbit.x, 0 * orbit.x)
-    # Changes of velocities are larger by the frequency than those of displacements.
-    change = np.random.default_rng(1).standard_normal(len(start)) * np.repeat([1.0, OPENING], len(u))
-    moved = lattice.flow.gather(lattice.arc(orbit.x, orbit.period).move(lattice.flow.scatter(change[None])))[0]
-    expected = flow.arc(start, orbit.period / 2, orbit.period).sensitivity @ change
-    # Displacements and velocities are compared separately, since their sizes differ by a factor of 8,000.
-    for half in (slice(0, len(u)), slice(len(u), None)):
-        assert np.abs(moved - expected)[half].max() < 1e-6 * np.abs(expected[half]).max()
 
 
 def test_a_stop_that_touches_among_pressed_ones_is_refused():

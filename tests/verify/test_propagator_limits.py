@@ -9,13 +9,13 @@ import pytest
 
 from tests.conftest import small_case
 from tests.faults.mutations import run_shortly
+from tests.unrecorded import unrecorded_samples
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.step_choice import refusal
-from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 from vipetsc.io.store import RunMemory
 
 

@@ -16,7 +16,6 @@ from vipetsc.dynamics import simulate
 from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.propagator.groups import contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.step_choice import refusal, step_series
-from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.io.store import RunMemory
 
 pytestmark = pytest.mark.parallel(1)
@@ -156,8 +155,3 @@ def test_many_springs_go_to_ts():
 
     few = {"springs[1].cubic": {"cells": list(range(100, 125)), "value": 3e11}}
     assert refusal(sprung(lattice={"cells": 2000, "profiles": few}).model()) is None
-
-
-def test_variations_are_those_of_linear_springs():
-    """The engine that moves variations refuses lattices with nonlinear springs."""
-    assert "quadratic or cubic" in (TangentPropagator.refusal(sprung().model()) or "")

@@ -39,7 +39,7 @@ def over(key: str, low: float, high: float, table: dict[str, Any] = TWO_MASSES, 
 
 def equations(case: NfrcCase):
     """The equations of the only curve of a case."""
-    return ResponseMethod(case, MPI.COMM_SELF).problem(0)
+    return ResponseMethod(case).problem(0)
 
 
 @pytest.fixture(scope="module")

@@ -229,7 +229,7 @@ def test_a_lossy_run_settles_into_the_response():
 def test_curves_of_a_case_have_one_compliance():
     """All curves of a case use one compliance, so that the modes of the lattice are computed once."""
     nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.1, 0.2], "restitutions": [1.0, 0.7]}
-    method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), MPI.COMM_SELF)
+    method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}))
     assert len({id(method.problem(job).compliance) for job in range(4)}) == 1
 
 

@@ -254,7 +254,6 @@ SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
         (Case, {"drive": WALL, "initial": None}, "drive.end", "quadratic and cubic in cell 12"),
         (LawCase, {"law": {}, "initial": None}, 'lattice.profiles."springs[2].quadratic"', "depend on amplitude"),
         (NnmCase, {"nnm": {"system": "reduced"}}, 'lattice.profiles."springs[2].quadratic"', "has no such half"),
-        (NnmCase, {"nnm": {"system": "chain", "shooting": "krylov"}}, "nnm.shooting", "not through springs"),
     ],
 )
 def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):

@@ -95,7 +95,7 @@ def test_two_masses_on_a_stiff_spring_have_the_period_of_one():
 
 def test_a_residual_that_rounding_does_not_explain_is_no_orbit():
     """Newton's method from the orbit of a stiff system converges within its rounding, and not if that were smaller."""
-    method = ShootingMethod(NnmCase.from_table(CASE), MPI.COMM_SELF)
+    method = ShootingMethod(NnmCase.from_table(CASE))
     problem = method.shooting
     point = method.start(problem, 0)
     frame = problem.frame_at("relative", point.x, point.period)

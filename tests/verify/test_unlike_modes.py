@@ -23,7 +23,6 @@ from vipetsc.modes.branches.condensed import condensed_system, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.flow import MAPS, Dop853Flow
-from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
 from vipetsc.modes.system import ContactPair, System
 
@@ -200,20 +199,21 @@ def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch
 
 @pytest.fixture(scope="module")
 def one_sided():
-    """The chain, the stops and the breather of a site with a stop on one side, by shooting without matrices."""
+    """The chain, the stops and the breather of a site with a stop on one side, by shooting."""
     chain = breather_chain()
     stops = [Stops(four_band_contact("hertz"), CLEARANCE, np.inf)]
-    system = System.from_chain(chain, stops, dense=False)
+    system = System.from_chain(chain, stops)
+    motions = condensed_system(system, NnmTable(truncation=1e-6, tolerance=1e-11))
+    u = np.concatenate(list(state_of(motions, motions.in_gap(OMEGA, np.array([1.0])), chain.cell.dofs).values()))
     # The map is that of half a period, since a motion with a stop on one side has no symmetry of quarters.
-    problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, tolerance=1e-12, max_newton=12)
-    return chain, stops, problem.breather(OMEGA)
+    frame = Shooting(Dop853Flow(system), MAPS["half"], 1e-12).relative_frame(u, 2 * np.pi / OMEGA)
+    attempt = frame.solve(frame.xi, np.append(np.zeros(len(u)), 1.0), 1.0)
+    assert attempt.converged
+    return chain, stops, frame.measures(attempt)
 
 
-def test_a_breather_on_one_side_closes_by_the_dense_flow(one_sided):
-    """A breather with a stop on one side, found by the lattice's flow, returns after its period in the dense flow.
-
-    The two flows have no code in common.
-    """
+def test_a_breather_on_one_side_closes(one_sided):
+    """A breather with a stop on one side, found by half a period, returns after the whole one."""
     chain, stops, point = one_sided
     dense = Dop853Flow(System.from_chain(chain, stops))
     end = dense.arc(np.append(point.x, 0 * point.x), point.period, point.period).end
@@ -245,16 +245,14 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
     sites = (4, 13)
     chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
-    system = System.from_chain(chain, stops, dense=False)
-    problem = LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, tolerance=1e-12, max_newton=12)
+    control = NnmTable(truncation=1e-7, tolerance=1e-11)
+    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), control)
 
-    near = problem.breather(1600.0, [1])
-    far = problem.breather(1600.0, [2])
-    opposite = problem.breather(1600.0, [-2])
+    near, far, opposite = (problem.in_gap(1600.0, np.array(signs)) for signs in ([1, 0], [0, 1], [0, -1]))
 
-    assert np.abs(far.x).argmax() // chain.cell.dofs == sites[1]
-    assert np.abs(near.x).argmax() // chain.cell.dofs == sites[0]
-    assert system.contact_rows[1] @ far.x == pytest.approx(2 * (system.contact_rows[0] @ near.x), rel=1e-6)
+    fields = [state_of(problem, point, chain.cell.dofs) for point in (near, far)]
+    assert tuple(max(field, key=lambda cell: np.abs(field[cell]).max()) for field in fields) == sites
+    assert far.elongations[1] == pytest.approx(2 * near.elongations[0], rel=1e-6)
     # The energy is proportional to the square of the clearance.
     assert far.energy == pytest.approx(4 * near.energy, rel=1e-6)
     assert opposite.x == pytest.approx(-far.x, abs=1e-9 * np.abs(far.x).max())

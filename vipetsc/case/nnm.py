@@ -33,7 +33,6 @@ from vipetsc.case.nnm_checks import (
     check_lattice,
     check_options,
     check_reduced,
-    check_shooting,
     check_size,
     check_start_sites,
     rigid_motions,
@@ -169,9 +168,8 @@ class NnmCase(CaseFile):
         if nnm.system == "condensed":
             chain = build_chain(lattice, contacts).without_dashpots()
             return [*problems, *check_condensed(nnm, contacts, chain, valid)]
-        problems += check_shooting(nnm, lattice, cell)
         problems += check_start_sites(nnm, len(sites))
-        problems += check_size(nnm, lattice, cell)
+        problems += check_size(lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
         problems += check_damped(nnm, lattice.cells * cell.dofs)
         rigid = rigid_motions(lattice, contacts, cell, gaps)
@@ -181,15 +179,8 @@ class NnmCase(CaseFile):
         """Keys that a resumed branch must keep: the system and the shooting map."""
         nnm = self.nnm
         # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
-        begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
+        begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, begun
-
-    @property
-    def krylov(self) -> bool:
-        """Whether orbits are shot on all ranks together, by matrix-free Newton-Krylov."""
-        cell = self.lattice.unit_cell()
-        of_chain = self.nnm.system == "chain"
-        return of_chain and self.nnm.is_krylov(cell.dofs * self.lattice.cells, not self.lattice.nonlinear_keys)
 
     @property
     def condensed(self) -> bool:

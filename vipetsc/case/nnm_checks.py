@@ -7,7 +7,7 @@ from vipetsc.case.case_file import Problem, Valid
 from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites, path_of, values_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
-from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_DAMPED, MOST_OF_LATTICE, NnmTable
+from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
 from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
@@ -16,7 +16,6 @@ from vipetsc.lattice.cell import connected_groups
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 ONE_CONTACT = "the reduced model has one contact"
-NOT_VARIED = "not yet: variations of motions are moved through contacts, not through springs that are not linear"
 
 
 def check_options(nnm: NnmTable) -> Iterator[Problem]:
@@ -28,10 +27,6 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
         yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
 
     yield from check_method(nnm)
-    is_chain = nnm.system == "chain"
-    if not is_chain and (nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed")):
-        remedy = '"krylov" is for "chain", multipliers for that and "condensed"'
-        yield Problem("nnm.system", nnm.system, remedy)
     if not nnm.smallest_step < nnm.largest_step:
         yield Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step")
     if nnm.system != "own" or nnm.custom is None:
@@ -65,18 +60,12 @@ def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Prob
         yield Problem("nnm.forced", nnm.forced, f"is no mass; there are {masses} in each of {cells} cells")
 
 
-def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
-    """The problem of a chain of ``cell`` with more masses than the shooting method of ``nnm`` allows."""
-    most = MOST_MASSES
-    what = "with dense matrices"
+def check_size(lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
+    """The problem of a chain of ``cell`` with more masses than have all their modes computed."""
     dofs = lattice.cells * cell.dofs
-    if nnm.is_krylov(dofs, not lattice.nonlinear_keys):
-        most = MOST_OF_LATTICE
-        what = "on all ranks"
-
-    if dofs <= most:
+    if dofs <= MOST_MASSES:
         return []
-    remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
+    remedy = f'makes {dofs} masses, of at most {MOST_MASSES}; use nnm.system = "condensed" with a start_frequency'
     return [Problem("lattice.cells", lattice.cells, remedy)]
 
 
@@ -217,19 +206,13 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
     if nnm.method == "damped":
         if nnm.system == "condensed":
             yield Problem("nnm.method", "damped", 'needs all masses: nnm.system = "chain", "reduced" or "own"')
-        for key in ("switch", "orbits_at", "start_frequency", "start_sites", "multipliers"):
+        for key in ("switch", "orbits_at", "start_frequency", "start_sites"):
             if getattr(nnm, key):
                 yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; remove it")
         return
     if nnm.system == "condensed" or nnm.method == "condensed":
         method = "shot"
         foreign = ("switch",)
-    elif nnm.system == "chain" and nnm.start_frequency:
-        # Localised motions of a chain begin at this frequency and at the start sites: both keys apply.
-        return
-    elif nnm.system == "chain":
-        method = "that begin at a start_frequency"
-        foreign = ("start_sites",)
     else:
         method = "condensed"
         foreign = ("start_frequency", "start_sites")
@@ -259,13 +242,6 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
     if not chain.is_linear and unknowns > MOST_UNKNOWNS:
         remedy = f"{count} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
         yield Problem("nnm.harmonics", nnm.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
-    if nnm.multipliers and not chain.is_linear:
-        yield Problem("nnm.multipliers", nnm.multipliers, f"{NOT_VARIED}; omit it")
-    elif nnm.multipliers and masses > MOST_OF_LATTICE:
-        remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
-        yield Problem(
-            "nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs only the motion of the sites"
-        )
     # A motion whose frequency is in a band sends waves away, so that it is neither localised nor periodic.
     bands = wave_bands(cell)
     inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
@@ -287,26 +263,3 @@ def check_start_sites(nnm: NnmTable, count: int) -> Iterator[Problem]:
     outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
     if outside:
         yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
-
-
-def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with keys of [nnm] that do not fit the shooting method of a lattice of such cells."""
-    dofs = lattice.cells * cell.dofs
-    is_linear = not lattice.nonlinear_keys
-    krylov = nnm.is_krylov(dofs, is_linear)
-    if not is_linear and (krylov or nnm.multipliers or nnm.start_frequency):
-        key = next(key for key in ("multipliers", "start_frequency", "shooting") if getattr(nnm, key))
-        yield Problem(f"nnm.{key}", getattr(nnm, key), f'{NOT_VARIED}; omit it, or system = "condensed"')
-        return
-    if krylov:
-        for key in ("switch", "orbits_at"):
-            if getattr(nnm, key) != NnmTable.model_fields[key].default:
-                yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
-    if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
-        key = "start_frequency"
-        if nnm.multipliers:
-            key = "multipliers"
-        yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
-    # In larger lattices the linear modes, from which branches begin, are not computed.
-    if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
-        yield Problem("nnm.modes", nnm.modes, f"are computed up to {MOST_MASSES} masses: give nnm.start_frequency")

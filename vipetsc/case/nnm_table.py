@@ -12,14 +12,6 @@ from vipetsc.case.shapes import BY_SHAPE
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
 MOST_MASSES = 4000
-# Masses of a lattice whose orbits are shot without matrices. With so many, two points of a breather take 39 s of CPU,
-# including compilation, and 0.7 GB, of which 200 vectors of GMRES with 80,000 numbers each are 0.13 GB. More masses
-# have not been tried.
-MOST_OF_LATTICE = 40_000
-# Masses of a lattice beyond which "auto" shoots without matrices. Dense matrices give all multipliers and special
-# points, and cost the cube: six points in contact take 8, 25 and 237 s of CPU at 52, 100 and 200 masses, without
-# matrices 2 to 3.
-FEW_MASSES = 100
 # Last harmonic of damped modes at most; their number does not adapt to the motion.
 MOST_OF_DAMPED = 63
 
@@ -139,13 +131,6 @@ class NnmTable(Section):
     modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = described(
         "linear modes from which branches start; the lowest is 1", [1, 2], min_length=1
     )
-    shooting: Literal["auto", "dense", "krylov"] = described(
-        "solver for the orbits of a chain: dense matrices, or Newton-Krylov on all ranks (auto: beyond 100 masses)",
-        "auto",
-    )
-    multipliers: Annotated[bool | Annotated[int, Field(ge=1)], BY_SHAPE] = described(
-        "number of the largest Floquet multipliers of the whole lattice computed at each point; true: 8", False
-    )
     map: Literal["auto", "quarter", "half", "whole"] = described(
         "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
     )
@@ -182,10 +167,3 @@ class NnmTable(Section):
     switch_points: int = described("number of points of a crossing branch", 100, ge=1)
     switch_amplitude: Positive = described("first step onto a crossing branch, in units of the chart", 1e-3)
     guards: Guards = described("limits on a step", Guards())
-
-    def is_krylov(self, dofs: int, is_linear: bool = True) -> bool:
-        """Whether orbits of a lattice of so many masses, with linear springs or others, are shot without matrices."""
-        # Branch switching works on the whole matrix of derivatives.
-        needs_krylov = bool(self.start_frequency or self.multipliers)
-        is_chosen = is_linear and (needs_krylov or (dofs > FEW_MASSES and not self.switch))
-        return self.method == "shooting" and self.shooting != "dense" and (is_chosen or self.shooting == "krylov")

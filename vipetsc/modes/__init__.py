@@ -7,10 +7,9 @@ mode is a family of periodic orbits that begins at a linear mode (Kerschen et al
 orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns. ``shooting`` finds periodic orbits by
 integrating them with ``flow``, ``stability`` has their multipliers. Each of these begins with its equations.
 
-**Subpackages**, whose docstrings derive the methods. ``lattice`` finds orbits of whole lattices on all ranks,
-``balance`` finds periodic motions by their harmonics; ``continuation`` follows branches of any of them, ``branches``
-follows and stores the branches of a case. ``response`` has steady responses to a drive, which are not modes but are
-found by the same equations and the same continuation.
+**Subpackages**, whose docstrings derive the methods. ``balance`` finds periodic motions by their harmonics;
+``continuation`` follows branches of either method, ``branches`` follows and stores the branches of a case. ``response``
+has steady responses to a drive, which are not modes but are found by the same equations and the same continuation.
 
 A user-written loop (importing the package loads PETSc)::
 

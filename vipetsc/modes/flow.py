@@ -38,8 +38,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel
@@ -62,12 +60,11 @@ class ArcLimits:
     """Limits of the arcs of one flow, which calls ``check`` as it makes its steps.
 
     They act within a block of ``attempt`` alone. ``every`` is the number of steps, those of several arcs counted
-    together, between two looks at requests to stop. Of a flow on several ranks, ``comm``, all make the same steps.
+    together, between two looks at requests to stop.
     """
 
-    def __init__(self, every: int, comm: MPI.Comm = MPI.COMM_SELF) -> None:
+    def __init__(self, every: int) -> None:
         self._every = every
-        self._comm = comm
         self._stop = StopRequest()
         self._is_attempt = False
         self._longest = UNLIMITED
@@ -120,7 +117,7 @@ class ArcLimits:
         if self._since < self._every:
             return
         self._since = 0
-        if self._is_attempt and self._stop.agreed(self._comm):
+        if self._is_attempt and self._stop.requested:
             raise StoppedError("stopped on request; continue with --resume")
 
 

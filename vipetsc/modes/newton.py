@@ -8,14 +8,12 @@ step solves
 **Exceptions of callbacks** (``CallbackErrors``). An exception that passes through PETSc's own functions leaves vectors
 locked behind. With some versions of PETSc it arrives unchanged, with others as "error code -1" or "error code 101". A
 callback that fails therefore returns NaN, on which the solver gives up, and the exception is raised when the solver has
-returned. This is safe only if the callback fails on all ranks of the solver. An exception of one rank alone, while the
-others wait in a collective call of the same callback, is raised at once; it ends the program on all ranks.
+returned.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 from petsc4py import PETSc
 
@@ -23,10 +21,6 @@ import numpy as np
 
 from vipetsc.dynamics.options import set_from_options
 from vipetsc.modes.problem import Attempt, FlowError
-from vipetsc.parallel import StoppedError
-
-# Errors that all ranks of a solver raise, or none.
-OF_ALL_RANKS = FlowError, StoppedError
 
 
 class CallbackErrors:
@@ -42,9 +36,8 @@ class CallbackErrors:
     def keep(self, callback: Callable[..., None]) -> Callable[..., None]:
         """The function to give to PETSc in place of ``callback(solver, x, result, ...)``.
 
-        All ranks or none must raise a FlowError or a StoppedError in the callback; any other exception may be one
-        rank's own. After the first failure the callback is not called again, since its arguments would follow from NaN;
-        the results are NaN.
+        After the first failure the callback is not called again, since its arguments would follow from NaN; the results
+        are NaN.
         """
 
         def call(solver: object, x: PETSc.Vec, result: PETSc.Vec | PETSc.Mat, *others: object) -> None:
@@ -53,8 +46,6 @@ class CallbackErrors:
                     return callback(solver, x, result, *others)
                 except BaseException as error:
                     self._first = error
-                    if x.comm.size > 1 and not isinstance(error, OF_ALL_RANKS):
-                        raise
             if isinstance(result, PETSc.Vec):
                 result.set(np.nan)
             else:
@@ -95,25 +86,18 @@ NOT_FINITE = next(
 )
 
 
-class Equations(Protocol):
+class DenseEquations(Protocol):
     """n equations in the n + 1 unknowns xi."""
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
         """The residual (n,), which vanishes at a solution."""
 
-
-class DenseEquations(Equations, Protocol):
-    """Equations with a matrix for a derivative."""
-
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
         """Derivative (n, n + 1) of the residual."""
 
 
-E = TypeVar("E", bound=Equations)
-
-
-class BorderedNewton(ABC, Generic[E]):
-    """Solves residual(xi) = 0 (size - 1,) and row . xi = value; a subclass chooses matrices and vectors.
+class DenseNewton:
+    """Solves residual(xi) = 0 (size - 1,) and row . xi = value with a dense matrix, on one rank.
 
     It ends at a residual of ``tolerance``, or of ``LARGEST_RESIDUAL`` after a step below ``STEP_TOLERANCE``, where the
     residual stagnates within its ``rounding``, or after ``max_newton`` steps. Options of PETSc have the prefix
@@ -123,28 +107,40 @@ class BorderedNewton(ABC, Generic[E]):
     def __init__(self, size: int, max_newton: int = 7) -> None:
         self.max_newton = max_newton
         self._errors = CallbackErrors()
-        self._xi, jacobian = self._allocate(size)
-        self._snes = snes = PETSc.SNES().create(self._xi.comm)
+        # A branch is followed by one rank alone while the others follow theirs: nothing here may be collective.
+        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
+        jacobian = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
+        jacobian.setUp()
+
+        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
         snes.setOptionsPrefix("nnm_")
         snes.setFunction(self._errors.keep(self._evaluate), self._xi.duplicate())
         snes.setJacobian(self._errors.keep(self._differentiate), jacobian)
         snes.setTolerances(max_it=max_newton)
         # PETSc's own test would also accept a residual that has fallen by 1e-8, whatever the tolerance of the problem.
         snes.setConvergenceTest(self._test)
-        self._configure(snes.getKSP())
+        # Options of PETSc, which are read afterwards, may replace the linear solver.
+        snes.getKSP().setType("preonly")
+        snes.getKSP().getPC().setType("lu")
 
         # A line search would change which arc a step ends on; step control is the continuation's business.
         set_from_options(snes, "nnm_snes_linesearch_type", "basic")
 
         # Data of one call of ``solve``: PETSc passes vectors and matrices alone to the callbacks.
-        self._equations: E
+        self._equations: DenseEquations
         self._row: tuple[np.ndarray, float]
         self._tolerance = 0.0
         self._rounding = 0.0
         self._history: list[float] = []
 
     def solve(
-        self, equations: E, guess: np.ndarray, row: np.ndarray, value: float, tolerance: float, rounding: float = 0.0
+        self,
+        equations: DenseEquations,
+        guess: np.ndarray,
+        row: np.ndarray,
+        value: float,
+        tolerance: float,
+        rounding: float = 0.0,
     ) -> Attempt:
         """Newton's method from ``guess`` (size,) to a residual of ``tolerance`` on the plane row . xi = value.
 
@@ -155,43 +151,27 @@ class BorderedNewton(ABC, Generic[E]):
         self._tolerance = tolerance
         self._rounding = rounding
         self._history = []
-        self._xi.setArray(self._local(guess))
+        self._xi.setArray(guess)
         try:
             with self._errors.raised_after():
                 self._snes.solve(None, self._xi)
         except FlowError as error:
-            # Raised on all ranks that solve together, so that all leave the collective solve here.
             return Attempt(False, str(error), self._history, guess, left_domain=True)
 
         reason = self._snes.getConvergedReason()
-        # On one rank the array is a view of the vector, which the next call overwrites.
-        xi = self._whole(self._xi).copy()
+        # The array is a view of the vector, which the next call overwrites.
+        xi = np.array(self._xi.getArray(readonly=True))
         return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, xi)
 
-    @abstractmethod
-    def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
-        """The vector of unknowns, and the matrix for the derivative."""
-
-    @abstractmethod
-    def _configure(self, ksp: PETSc.KSP) -> None:
-        """Choose the linear solver; options of PETSc, which are read afterwards, may replace it."""
-
-    @abstractmethod
-    def _local(self, array: np.ndarray) -> np.ndarray:
-        """The part of an ``array`` (size,) that this rank's part of a vector holds."""
-
-    @abstractmethod
-    def _whole(self, vector: PETSc.Vec) -> np.ndarray:
-        """All entries of a vector, on every rank."""
-
-    @abstractmethod
-    def _differentiate(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        """Set ``matrix`` to the bordered derivative at ``x``."""
-
     def _evaluate(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        xi = self._whole(x)
+        xi = x.getArray(readonly=True)
         row, value = self._row
-        f.setArray(self._local(np.append(self._equations.residual(xi), row @ xi - value)))
+        f.setArray(np.append(self._equations.residual(xi), row @ xi - value))
+
+    def _differentiate(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
+        xi = x.getArray(readonly=True)
+        matrix.getDenseArray()[:] = np.vstack([self._equations.jacobian(xi), self._row[0]])
+        matrix.assemble()
 
     def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | bool:
         _, step, residual = norms
@@ -210,31 +190,6 @@ class BorderedNewton(ABC, Generic[E]):
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL
         return reasons.ITERATING
-
-
-class DenseNewton(BorderedNewton[DenseEquations]):
-    """Newton's method with a dense matrix, on one rank."""
-
-    def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
-        # A branch is followed by one rank alone while the others follow theirs: nothing here may be collective.
-        dense = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
-        dense.setUp()
-        return PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF), dense
-
-    def _configure(self, ksp: PETSc.KSP) -> None:
-        ksp.setType("preonly")
-        ksp.getPC().setType("lu")
-
-    def _local(self, array: np.ndarray) -> np.ndarray:
-        return array
-
-    def _whole(self, vector: PETSc.Vec) -> np.ndarray:
-        return np.asarray(vector.getArray(readonly=True))
-
-    def _differentiate(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        xi = x.getArray(readonly=True)
-        matrix.getDenseArray()[:] = np.vstack([self._equations.jacobian(xi), self._row[0]])
-        matrix.assemble()
 
 
 # petsc4py names the reasons as attributes of a class; messages need the name of a number.

@@ -38,10 +38,9 @@ class Point(Solution):
     """A periodic orbit on a branch.
 
     ``x`` are initial displacements (n,) in m (velocities in m/s for maps from the centre), or the unknowns of harmonic
-    balance in m; ``tangent`` is d(x, period). Only orbits shot with dense matrices have ``half_traces`` (n - 1,);
-    ``multipliers`` (number, 2) are the largest ones of a lattice's orbit and their residuals. Harmonic balance gives
-    the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at phase 0.
-    ``QUANTITIES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something dissipates.
+    balance in m; ``tangent`` is d(x, period). Orbits that are shot have ``half_traces`` (n - 1,). Harmonic balance
+    gives the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at
+    phase 0. ``QUANTITIES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something dissipates.
     """
 
     x: np.ndarray
@@ -61,7 +60,6 @@ class Point(Solution):
     next_step: float = np.nan
     kind: str = "regular"
     resonance: int = 0
-    multipliers: np.ndarray = field(default_factory=lambda: np.empty((0, 2), complex))
     order: int = 0
     truncation: float = np.nan
     elongations: np.ndarray = field(default_factory=lambda: np.empty(0))

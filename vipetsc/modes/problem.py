@@ -25,7 +25,7 @@ class ContinuationError(NoMotionError):
 
 
 class StartError(NoMotionError):
-    """There is no periodic orbit to begin a branch with; raised on all ranks that search for one together."""
+    """There is no periodic orbit to begin a branch with."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,8 +8,7 @@ the orbit u(t + T/2) = -u(t) passes the centre u = 0 at T/4: a quarter is enough
     H(x, T) = u(T/4; x, 0) = 0,    dH/dx = A,    dH/dT = v(T/4)/4,    S = [[A, B], [C, D]].
 
 The n equations for n + 1 unknowns leave a curve of solutions, the branch. The whole period may be shot as well, for
-comparison, but its equations are worse conditioned (``MAPS``). ``ShootingEquations`` are those of any flow and
-derivative. ``Shooting`` has the matrix of the flow's sensitivities; ``modes.lattice`` does without a matrix.
+comparison, but its equations are worse conditioned (``MAPS``).
 
 **Charts** are the unknowns xi (n + 1,) of order one in place of x (n,) and T. A chart belongs to a point of the branch,
 with the initial values x_0 and the period T_0. It encodes (x, T) as xi, decodes it, and gives d(x, T)/dxi (n + 1,
@@ -30,16 +29,15 @@ infinite: tangents turn without bound there. In y the change is of the order y^(
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from vipetsc.modes.departures import Departure, within_arc
-from vipetsc.modes.flow import MOST_LONGER, Arc, ArcLimits, Flow, ShootingMap
+from vipetsc.modes.flow import MOST_LONGER, Arc, Flow, ShootingMap
 from vipetsc.modes.latest import LatestValues
-from vipetsc.modes.newton import BorderedNewton, DenseNewton
+from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, StartError, unit
 from vipetsc.modes.shared_frequencies import check_start
@@ -102,18 +100,6 @@ class Chart(ABC):
         """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
 
     @abstractmethod
-    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
-
-    @abstractmethod
-    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
-
-
-class DenseChart(Chart):
-    """A chart with the matrix of its derivative."""
-
-    @abstractmethod
     def derivative(self, xi: np.ndarray) -> np.ndarray:
         """The matrix d(x, period)/d xi (n + 1, n + 1) at the unknowns ``xi`` (n + 1,)."""
 
@@ -126,7 +112,7 @@ class DenseChart(Chart):
         return np.linalg.solve(self.derivative(xi), changes)
 
 
-class Relative(DenseChart):
+class Relative(Chart):
     """Initial values over the largest one, and elongations of contacts over a scale of their own.
 
     The scale of w is max(|w_0|, |D|), with the smaller clearance D of the contact, and ``size`` at most. Over ``size``
@@ -166,7 +152,7 @@ class Relative(DenseChart):
         return self._derivative
 
 
-class Grazing(DenseChart):
+class Grazing(Chart):
     """Initial values over the largest one, with y for the contact that is nearest to its clearance.
 
     Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. If it has no stop on that side,
@@ -237,33 +223,22 @@ def near_grazing(system: System, x: np.ndarray) -> bool:
     return bool(distance.min(initial=np.inf) < NEAR_GRAZING)
 
 
-class AnyArc(Protocol):
-    """Interface of the arcs of all flows: the quantities of the orbit."""
-
-    @property
-    def duration(self) -> float:
-        """Length of the arc in s."""
-
-    @property
-    def steps(self) -> int:
-        """Number of steps that the flow has tried."""
-
-    @property
-    def episodes(self) -> int:
-        """Number of contact episodes in the arc."""
-
-    @property
-    def closed(self) -> float:
-        """Time in s with a contact closed."""
-
-    def spans(self) -> Iterable[tuple[float, float]]:
-        """Begin and end in s of every contact episode, cut off at the arc's start and end."""
+# A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
+# this of the level, on either side, a change of sign is rounding and no special point.
+LEAST_CROSSING = 1e-6
+# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``). Those of two masses, of
+# chains and of pressed contacts with r from 7 to 2,400 are up to 3.6 times that in the map of half a period, 6 times
+# in that of the whole, and 0.7 times in that of a quarter.
+ROUNDING = 8
+# If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
+# and the tangent is not unique.
+DEGENERATE = 1e-12
+# Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
+# than ``TOUCH``.
+SAMPLES = 2000
 
 
-A = TypeVar("A", bound=AnyArc)
-
-
-class ShootingFrame(Generic[A]):
+class ShootingFrame:
     """The shooting equations in the unknowns of a ``chart`` at one orbit.
 
     The argument ``tangent`` (n + 1,) is d(x, period) along the branch, of any length, or empty where there is none yet.
@@ -274,9 +249,7 @@ class ShootingFrame(Generic[A]):
 
     tangent: np.ndarray
 
-    def __init__(
-        self, problem: "ShootingEquations[A]", chart: Chart, x: np.ndarray, period: float, tangent: np.ndarray
-    ) -> None:
+    def __init__(self, problem: "Shooting", chart: Chart, x: np.ndarray, period: float, tangent: np.ndarray) -> None:
         self.problem = problem
         self.chart = chart
         self.unit = chart.size * problem.map.end_unit(period)
@@ -292,7 +265,7 @@ class ShootingFrame(Generic[A]):
         """The branch's direction (n + 1,) at another orbit, of any length."""
         return self.chart.to_unknowns(self.encode(point), point.tangent)
 
-    def arc(self, xi: np.ndarray) -> A:
+    def arc(self, xi: np.ndarray) -> Arc:
         """The arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
         if np.all(np.isfinite(xi)):
             x, period = self.chart.decode(xi)
@@ -324,9 +297,25 @@ class ShootingFrame(Generic[A]):
             rounding = problem.rounding(self.chart.period)
             return problem.newton.solve(self, guess, row, value, problem.tolerance, rounding)
 
-    @abstractmethod
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        return self.jacobian_of(self.arc(xi), xi)
+
+    def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
+        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
+
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
         """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+        return self.tangent_towards(xi, self.tangent)
+
+    def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
+        # The null vector, of either sign.
+        direction = np.linalg.svd(self.jacobian(xi))[2][-1]
+        if direction @ reference < 0:
+            return -direction
+        return direction
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
         """The orbit that an attempt has converged to; ``direction`` (n + 1,) is the branch's unit tangent or None."""
@@ -363,28 +352,34 @@ class ShootingFrame(Generic[A]):
         )
 
 
-class ShootingEquations(ABC, Generic[A]):
-    """Periodic orbits of a ``system``: initial values x (n,) and a period.
+class Shooting:
+    """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
 
     The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
-    the centre; for an orbit half of the state vanishes at its end. ``limits`` are those of the flow's arcs. x are
-    displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre. Raises
-    ValueError if the map needs an odd system and the system is not.
+    the centre; for an orbit half of the state vanishes at its end. x are displacements in m for a map that starts at
+    rest, velocities in m/s for one that starts at the centre.
+
+    Newton's method solves the n equations and one more linear row in the unknowns of a chart; it ends at a scaled
+    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within its
+    ``rounding``, or after ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
     """
 
-    guards: frozenset[str]
-    limits: ArcLimits
-    newton: BorderedNewton[Any]
+    guards = frozenset({"half_trace", "turn_relative"})
 
-    def __init__(self, system: System, shooting_map: ShootingMap, tolerance: float) -> None:
+    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
+        system = flow.system
         if "centre" in (shooting_map.start, shooting_map.end) and not system.odd:
             raise ValueError(
                 f"the {shooting_map.name} map needs forces that change sign with the displacement; "
                 "this system's do not: use map = 'half'"
             )
+        self.flow = flow
         self.system = system
         self.map = shooting_map
         self.tolerance = tolerance
+        self.limits = flow.limits
+        self.newton = DenseNewton(system.dofs + 1, max_newton)
+
         n = system.dofs
         displacements = slice(0, n)
         velocities = slice(n, 2 * n)
@@ -395,7 +390,15 @@ class ShootingEquations(ABC, Generic[A]):
         self.zero = displacements
         if shooting_map.ends_at_rest:
             self.zero = velocities
-        self._latest: tuple[bytes, float, A] | None = None
+
+        # If nothing holds the system, its momentum stays 0 in an arc from rest to rest, whatever the start: one
+        # equation is lost. The centre of mass is kept in its place instead. An arc that starts at the centre (u = 0)
+        # has it there.
+        self._kept = None
+        if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
+            self._kept = system.mean_motion
+        self._arcs: LatestValues[tuple[bytes, float], Arc] = LatestValues(1)
+        self._frames: LatestValues[tuple[Point, str], ShootingFrame] = LatestValues(1)
 
     def start(self, x: np.ndarray) -> np.ndarray:
         """The state (2n,) at the start of the arc from initial values ``x``."""
@@ -403,38 +406,49 @@ class ShootingEquations(ABC, Generic[A]):
         state[self.free] = x
         return state
 
-    def arc(self, x: np.ndarray, period: float) -> A:
+    def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
         # Bytes are compared faster than arrays of a few numbers.
-        values = x.tobytes()
-        if self._latest is None or self._latest[:2] != (values, period):
-            self._latest = values, period, self._integrate(self.start(x), period)
-        return self._latest[2]
-
-    @abstractmethod
-    def _integrate(self, start: np.ndarray, period: float) -> A:
-        """The arc from a state ``start`` (2n,) over the map's fraction of the ``period``."""
+        duration = self.map.fraction * period
+        return self._arcs.get((x.tobytes(), period), lambda: self.flow.arc(self.start(x), duration, period))
 
     def rounding(self, period: float) -> float:
-        """The largest scaled residual that rounding may leave of an orbit of a ``period`` in s; 0 if it is unknown."""
-        return 0.0
+        """The largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
 
-    @abstractmethod
-    def end(self, arc: A) -> np.ndarray:
-        """The state (2n,) at an arc's end."""
+        Let the fastest mode be r times as fast as the orbit. A step of the flow is a radian of that mode or less, and
+        rounds its velocity, which may be r times that of the orbit, to eps r. The mode sums the errors of some r steps
+        as a random walk, to eps r^(3/2) of the orbit's velocity.
+        """
+        ratio = self.flow.omega_ref(period) * period / (2 * np.pi)
+        return float(ROUNDING * np.finfo(float).eps * ratio**1.5)
 
-    @abstractmethod
-    def stability(self, arc: A) -> tuple[np.ndarray, float]:
-        """Half-traces of an orbit, and the largest modulus of its multipliers; empty and NaN without a matrix."""
+    def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
+        """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
+        traces = half_traces(self.system, self.map, arc)
+        # A single mass has the trivial pair alone, whose multiplier is 1.
+        return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
 
-    def residual(self, arc: A) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit: displacements in m or velocities in m/s."""
-        return self.end(arc)[self.zero]
+    def residual(self, arc: Arc) -> np.ndarray:
+        """What vanishes at the arc's end for an orbit (n,): displacements in m or velocities in m/s.
 
-    def end_rate(self, arc: A) -> np.ndarray:
+        In a system that nothing holds, the displacement of the centre of mass times a frequency is added.
+        """
+        end = arc.end[self.zero]
+        if self._kept is None:
+            return end
+        return end + self.flow.omega * (self._kept @ arc.start[self.free])
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+        sensitivity = arc.sensitivity[self.zero, self.free]
+        if self._kept is not None:
+            sensitivity = sensitivity + self.flow.omega * self._kept
+        return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
+
+    def end_rate(self, arc: Arc) -> np.ndarray:
         """Time derivative (n,) of what should vanish at the arc's end."""
         n = self.system.dofs
-        end = self.end(arc)
+        end = arc.end
         # At rest velocities should vanish, whose rates are accelerations; at the centre displacements.
         if self.map.ends_at_rest:
             return -self.system.forces(end[:n]) / self.system.masses
@@ -453,50 +467,49 @@ class ShootingEquations(ABC, Generic[A]):
             return self.system.forces(x)
         return self.system.masses * x
 
-    @abstractmethod
-    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
-        """The frame at any initial values ``x`` (n,) and period; ``tangent`` (n + 1,) may be empty."""
-
-    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
+    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame:
         """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
-        if chart == "auto":
-            chart = "relative"
-            if self.map.starts_at_rest and near_grazing(self.system, point.x):
-                chart = "grazing"
-        return self.frame_at(chart, point.x, point.period, point.tangent)
 
-    def departures(self, point: Point) -> list[Departure]:
-        """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
+        def make() -> ShootingFrame:
+            name = chart
+            if chart == "auto":
+                name = "relative"
+                if self.map.starts_at_rest and near_grazing(self.system, point.x):
+                    name = "grazing"
+            return self.frame_at(name, point.x, point.period, point.tangent)
 
-        Raises FlowError if the arc cannot be integrated.
+        # A step of a branch and the search for its special points begin at the same orbit.
+        return self._frames.get((point, chart), make)
+
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> ShootingFrame:
+        """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
+        if tangent is None:
+            tangent = np.empty(0)
+        return ShootingFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
+
+    def relative_frame(self, x: np.ndarray, period: float) -> ShootingFrame:
+        """The unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
+        return ShootingFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
+
+    def relative_chart(self, x: np.ndarray, period: float) -> Relative:
+        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+
+        It has the gaps of contacts only where the map starts at rest.
         """
-        spans = self.arc(point.x, point.period).spans()
-        in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
-        return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
+        return Relative(self.system, x, period, rest=self.map.starts_at_rest)
 
-    def grazing(self, point: Point) -> list[int]:
-        """No contact: a subclass whose orbits have all masses on one rank may look for those that graze."""
-        return []
-
-    def acceleration(self, point: Point) -> float:
-        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
-
-        It is 0 at an equilibrium, and infinite for maps from centre to centre. Of two rests the smaller value counts.
-        All ranks must call it.
-        """
-        n = self.system.dofs
-        rests = []
-        if self.map.starts_at_rest:
-            rests.append(point.x)
-        if self.map.ends_at_rest and self.map.fraction < 1:
-            rests.append(self.end(self.arc(point.x, point.period))[:n])
-        accelerations = [np.abs(self.system.forces(u) / self.system.masses).max() for u in rests]
-        size = max((np.abs(u).max() for u in rests), default=1.0)
-        return float(min(accelerations, default=np.inf) / size * (point.period / (2 * np.pi)) ** 2)
-
-    @abstractmethod
     def null_vector(self, start: Point) -> np.ndarray:
         """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+        chart = CHARTS["relative"](self.system, start.x, start.period)
+        xi = chart.encode(start.x, start.period)
+        matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
+        values, directions = np.linalg.svd(matrix)[1:]
+        if values[-1] < DEGENERATE * values[0]:
+            raise ContinuationError(
+                f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values "
+                f"{values}; start at another energy (nnm.start_energy) or switch branches there"
+            )
+        return chart.derivative(xi) @ directions[-1]
 
     def first_tangent(self, start: Point, direction: int) -> np.ndarray:
         """Tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
@@ -519,24 +532,70 @@ class ShootingEquations(ABC, Generic[A]):
         # The product of two unit vectors may be beyond 1 by rounding.
         return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
 
-    @abstractmethod
-    def relative_chart(self, x: np.ndarray, period: float) -> Chart:
-        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+    def departures(self, point: Point) -> list[Departure]:
+        """The times in the arc of an orbit in which contacts are not what they are at rest.
 
-        It has the gaps of contacts only where they are at the start of the map.
+        Raises FlowError if the arc cannot be integrated.
         """
+        spans = self.arc(point.x, point.period).spans()
+        in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
+        return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
+
+    def grazing(self, point: Point) -> list[int]:
+        """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
+        start = self.arc(point.x, point.period).start
+        interval = self.map.fraction * point.period / SAMPLES
+        u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
+        return grazing_contacts(self.system, u)
+
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+
+        It is 0 at an equilibrium, and infinite for maps from centre to centre. Of two rests the smaller value counts.
+        """
+        n = self.system.dofs
+        rests = []
+        if self.map.starts_at_rest:
+            rests.append(point.x)
+        if self.map.ends_at_rest and self.map.fraction < 1:
+            rests.append(self.arc(point.x, point.period).end[:n])
+        accelerations = [np.abs(self.system.forces(u) / self.system.masses).max() for u in rests]
+        size = max((np.abs(u).max() for u in rests), default=1.0)
+        return float(min(accelerations, default=np.inf) / size * (point.period / (2 * np.pi)) ** 2)
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency."""
+        """Folds, what the half-traces tell, and a contact that just touches.
+
+        A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
+        doubles the period (the others); 0 doubles the period of quarter-period orbits.
+        """
         # Where all contacts are as at rest an orbit may lie on a linear branch, whose energy and frequency turn by
         # rounding alone: folds are then sought between two orbits that both have contacts which close or open.
         if not self.system.is_linear_at_rest or (left.episodes and right.episodes):
-            yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
+            yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self._with_resonance)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
+        if self.system.is_linear_at_rest and not (left.episodes or right.episodes):
+            return
+        # The half-traces of a quarter map belong to half a period. There a multiplier of -1 returns after the whole
+        # period, which breaks the symmetry; multipliers +-i, half-trace 0, are -1 over the period and double it.
+        levels = {1.0: "branch-point", -1.0: "period-doubling"}
+        if self.map.quarter:
+            levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
+        # Each search takes a dozen integrations: half-traces that are complex at both points are left out. Two real
+        # ones may meet within the step and be complex in between, so that a point that is found must have a real one.
+        for level, name in levels.items():
+            for i in real_half_traces(left, right):
+                test = HalfTraceAbove(i, level)
+                yield SpecialKind(name, test, floor=LEAST_CROSSING, accept=test.is_real)
 
-    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
-        """The ``fold`` of the energy; a subclass may add the resonance whose tongue it begins or ends."""
-        return fold
+        # Several contacts may begin within one step, one after the other or, by a symmetry, at one point.
+        fewest, most = sorted((left.episodes, right.episodes))
+        for count in range(fewest + 1, most + 1):
+            yield touch_of(count)
+
+    def _with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
+        """A fold of the energy with the resonance whose tongue it begins or ends."""
+        return replace(fold, resonance=resonance(self, fold))
 
 
 # An orbit that comes back after a part of its period to within this fraction of its size repeats itself. On in-phase
@@ -548,25 +607,7 @@ SAME = 1e-6
 PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
 
 
-class ShotOrbits(Protocol):
-    """Orbits shot with sensitivities: what of ``Shooting`` is needed to look at one of them."""
-
-    flow: Flow
-    map: ShootingMap
-    system: System
-    free: slice
-
-    def arc(self, x: np.ndarray, period: float) -> Arc:
-        """The arc from initial values ``x`` (n,)."""
-
-    def residual(self, arc: Arc) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit."""
-
-    def jacobian(self, arc: Arc) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
-
-
-def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
+def sample_orbit(problem: Shooting, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
     """Displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
 
     Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
@@ -593,7 +634,7 @@ def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, pari
     return part[:samples]
 
 
-def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
+def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
     """The number k of the k:1 internal resonance to whose tongue an orbit belongs; 1 without a resonance.
 
     It is the number of zeros in half a period of the contacts' relative motion, or, without contacts, of displacements:
@@ -611,7 +652,7 @@ def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
     return int(passes.max()) // 2
 
 
-def repetitions(problem: ShotOrbits, point: Point) -> int:
+def repetitions(problem: Shooting, point: Point) -> int:
     """How often an orbit passes the same motion in its period: the smallest such number among ``PRIMES``, else 1.
 
     Along a branch from a linear mode it is 1, except where a tongue of a k:1 internal resonance crosses the branch of
@@ -632,181 +673,6 @@ def repetitions(problem: ShotOrbits, point: Point) -> int:
     return 1
 
 
-# A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
-# this of the level, on either side, a change of sign is rounding and no special point.
-LEAST_CROSSING = 1e-6
-# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``). Those of two masses, of
-# chains and of pressed contacts with r from 7 to 2,400 are up to 3.6 times that in the map of half a period, 6 times
-# in that of the whole, and 0.7 times in that of a quarter.
-ROUNDING = 8
-# If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
-# and the tangent is not unique.
-DEGENERATE = 1e-12
-# Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
-# than ``TOUCH``.
-SAMPLES = 2000
-
-
-class DenseFrame(ShootingFrame[Arc]):
-    """Shooting equations with the matrix of their derivative."""
-
-    problem: "Shooting"
-    chart: DenseChart
-
-    def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
-        return self.jacobian_of(self.arc(xi), xi)
-
-    def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
-        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
-
-    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
-        return self.tangent_towards(xi, self.tangent)
-
-    def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
-        # The null vector, of either sign.
-        direction = np.linalg.svd(self.jacobian(xi))[2][-1]
-        if direction @ reference < 0:
-            return -direction
-        return direction
-
-
-class Shooting(ShootingEquations[Arc]):
-    """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
-
-    Newton's method solves the n equations and one more linear row in the unknowns of a chart; it ends at a scaled
-    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where the residual stagnates within its
-    ``rounding``, or after ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
-    """
-
-    guards = frozenset({"half_trace", "turn_relative"})
-
-    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
-        super().__init__(flow.system, shooting_map, tolerance)
-        self.flow = flow
-        self.limits = flow.limits
-        # If nothing holds the system, its momentum stays 0 in an arc from rest to rest, whatever the start: one
-        # equation is lost. The centre of mass is kept in its place instead. An arc that starts at the centre (u = 0)
-        # has it there.
-        self._kept = None
-        if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
-            self._kept = flow.system.mean_motion
-        self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
-        self._frames: LatestValues[tuple[Point, str], ShootingFrame[Arc]] = LatestValues(1)
-
-    def _integrate(self, start: np.ndarray, period: float) -> Arc:
-        return self.flow.arc(start, self.map.fraction * period, period)
-
-    def end(self, arc: Arc) -> np.ndarray:
-        """The state (2n,) at an arc's end."""
-        return arc.end
-
-    def rounding(self, period: float) -> float:
-        """The largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
-
-        Let the fastest mode be r times as fast as the orbit. A step of the flow is a radian of that mode or less, and
-        rounds its velocity, which may be r times that of the orbit, to eps r. The mode sums the errors of some r steps
-        as a random walk, to eps r^(3/2) of the orbit's velocity.
-        """
-        ratio = self.flow.omega_ref(period) * period / (2 * np.pi)
-        return float(ROUNDING * np.finfo(float).eps * ratio**1.5)
-
-    def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
-        """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
-        traces = half_traces(self.system, self.map, arc)
-        # A single mass has the trivial pair alone, whose multiplier is 1.
-        return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
-
-    def residual(self, arc: Arc) -> np.ndarray:
-        """Values (n,) that vanish at the arc's end, plus the displacement of the centre of mass times a frequency."""
-        end = super().residual(arc)
-        if self._kept is None:
-            return end
-        return end + self.flow.omega * (self._kept @ arc.start[self.free])
-
-    def jacobian(self, arc: Arc) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
-        sensitivity = arc.sensitivity[self.zero, self.free]
-        if self._kept is not None:
-            sensitivity = sensitivity + self.flow.omega * self._kept
-        return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
-
-    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[Arc]:
-        """The frame at an orbit, as ``ShootingEquations.frame`` describes it; the latest one is kept."""
-        # A step of a branch and the search for its special points begin at the same orbit.
-        return self._frames.get((point, chart), lambda: super(Shooting, self).frame(point, chart))
-
-    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
-        """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
-        if tangent is None:
-            tangent = np.empty(0)
-        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
-
-    def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
-        """The unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
-        return DenseFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
-
-    def relative_chart(self, x: np.ndarray, period: float) -> Relative:
-        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
-
-        It has the gaps of contacts only where the map starts at rest.
-        """
-        return Relative(self.system, x, period, rest=self.map.starts_at_rest)
-
-    def null_vector(self, start: Point) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
-        chart = CHARTS["relative"](self.system, start.x, start.period)
-        xi = chart.encode(start.x, start.period)
-        matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
-        values, directions = np.linalg.svd(matrix)[1:]
-        if values[-1] < DEGENERATE * values[0]:
-            raise ContinuationError(
-                f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values "
-                f"{values}; start at another energy (nnm.start_energy) or switch branches there"
-            )
-        return chart.derivative(xi) @ directions[-1]
-
-    def grazing(self, point: Point) -> list[int]:
-        """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
-        start = self.arc(point.x, point.period).start
-        interval = self.map.fraction * point.period / SAMPLES
-        u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
-        return grazing_contacts(self.system, u)
-
-    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds, what the half-traces tell, and a contact that just touches.
-
-        A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
-        doubles the period (the others); 0 doubles the period of quarter-period orbits.
-        """
-        yield from super().special_kinds(left, right)
-        if self.system.is_linear_at_rest and not (left.episodes or right.episodes):
-            return
-        # The half-traces of a quarter map belong to half a period. There a multiplier of -1 returns after the whole
-        # period, which breaks the symmetry; multipliers +-i, half-trace 0, are -1 over the period and double it.
-        levels = {1.0: "branch-point", -1.0: "period-doubling"}
-        if self.map.quarter:
-            levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
-        # Each search takes a dozen integrations: half-traces that are complex at both points are left out. Two real
-        # ones may meet within the step and be complex in between, so that a point that is found must have a real one.
-        for level, name in levels.items():
-            for i in real_half_traces(left, right):
-                test = HalfTraceAbove(i, level)
-                yield SpecialKind(name, test, floor=LEAST_CROSSING, accept=test.is_real)
-
-        # Several contacts may begin within one step, one after the other or, by a symmetry, at one point.
-        fewest, most = sorted((left.episodes, right.episodes))
-        for count in range(fewest + 1, most + 1):
-            yield touch_of(count)
-
-    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
-        """A fold of the energy with the resonance whose tongue it begins or ends."""
-        return replace(fold, resonance=resonance(self, fold))
-
-
 def touch_of(count: int) -> SpecialKind[Point]:
     """Points at which the number of contact episodes becomes ``count``, or falls below it.
 
@@ -819,7 +685,7 @@ def touch_of(count: int) -> SpecialKind[Point]:
     return SpecialKind("grazing", above, finish=lambda point, left, right: replace(point, episodes=count - 1))
 
 
-def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Point:
+def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
     Raises StartError if the mode has no stiffness, if other modes share its frequency, or if Newton's method does not

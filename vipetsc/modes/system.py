@@ -7,7 +7,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.sparse import issparse
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, nonlinear_places
@@ -75,7 +74,7 @@ class System:
         n = len(self.masses)
         if not (np.all(np.isfinite(self.masses)) and np.all(np.asarray(self.masses) > 0)):
             raise ValueError(f"masses {self.masses!r} must be positive (kg)")
-        if self.stiffness.shape != (n, n) or not _is_symmetric(self.stiffness):
+        if self.stiffness.shape != (n, n) or not np.allclose(self.stiffness, self.stiffness.T, rtol=1e-12):
             raise ValueError(f"the stiffness must be a symmetric matrix of shape ({n}, {n})")
 
         for pair in self.contacts:
@@ -132,11 +131,8 @@ class System:
         )
 
     @classmethod
-    def from_chain(cls, chain: Chain, stops: Sequence[Stops], dense: bool = True) -> Self:
-        """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots.
-
-        The stiffness is a ``dense`` matrix or a sparse one.
-        """
+    def from_chain(cls, chain: Chain, stops: Sequence[Stops]) -> Self:
+        """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots."""
         dofs = chain.cell.dofs
         pairs = []
         places = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, stops, strict=True)
@@ -144,11 +140,9 @@ class System:
             host = site * dofs + pair.host if pair.host >= 0 else None
             pairs.append(contact_pair(host, resonator_cell * dofs + pair.resonator, of_site))
 
-        # Shooting with matrices needs a dense one; of the 40,000 masses of a whole lattice it would take 13 GB.
-        stiffness = chain.stiffness_matrix()
         return cls(
             masses=chain.masses(),
-            stiffness=stiffness.toarray() if dense else stiffness,
+            stiffness=chain.stiffness_matrix().toarray(),
             contacts=tuple(pairs),
             springs=tuple(_nonlinear_springs(chain)),
         )
@@ -224,11 +218,10 @@ class System:
     @cached_property
     def stiffness_at_rest(self) -> np.ndarray:
         """Stiffness (n, n) in N/m for small motions, with the slope of each contact that is pressed at rest."""
-        stiffness = self.stiffness if isinstance(self.stiffness, np.ndarray) else self.stiffness.toarray()
         if not self.is_pressed.any():
-            return stiffness
+            return self.stiffness
         slopes = np.array([pair.stops.slope_at_rest for pair in self.contacts])
-        return np.asarray(stiffness + self.contact_rows.T @ (slopes[:, None] * self.contact_rows))
+        return np.asarray(self.stiffness + self.contact_rows.T @ (slopes[:, None] * self.contact_rows))
 
     @cached_property
     def mean_motion(self) -> np.ndarray | None:
@@ -249,7 +242,6 @@ class System:
 
     @cached_property
     def _small_motions(self) -> tuple[np.ndarray, np.ndarray]:
-        # Only dense solvers give all modes.
         squared, shapes = eigh(self.stiffness_at_rest, np.diag(self.masses))
         # eigh leaves the signs open: the largest displacement of each mode is positive.
         signs = np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
@@ -355,14 +347,6 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
         if start is not None:
             row[start] = -1.0
     return rows
-
-
-def _is_symmetric(matrix: np.ndarray) -> bool:
-    """Whether a dense or sparse matrix equals its transpose, to rounding."""
-    # ``allclose`` takes no sparse matrices.
-    if issparse(matrix):
-        return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())
-    return np.allclose(matrix, matrix.T, rtol=1e-12)
 
 
 def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:

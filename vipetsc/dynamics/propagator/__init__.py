@@ -73,13 +73,11 @@ beyond could only act by waves that travel there and back, which counts as entri
 neighbourhoods share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
 lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude that any cell's has.
 
-**9. Variations** of an orbit move by P and by one small matrix a step in contact: ``tangent``, ``tangent_kernels``.
-
-**10. What dashpots dissipate** is not computed from the motion: ``energies`` takes it from the balance, as the work
+**9. What dashpots dissipate** is not computed from the motion: ``energies`` takes it from the balance, as the work
 less what contacts have dissipated and less the energy of the lattice. ``observers.Ledger`` checks that it never falls,
 and compares it with a quadrature over the samples.
 
-**11. Nonlinear springs** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
+**10. Nonlinear springs** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
 elongation z, of which k belongs to K. The rest is a force on the DoF z = c u, with c as for the w of a site,
 
     F = -(k_2 z^2 + k_3 z^3),
@@ -94,7 +92,7 @@ of them count, and how far. ``groups``: contact DoFs and their groups. ``step_ch
 ``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
 tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
 ``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
-sample. ``tangent`` and ``tangent_kernels``: variations. ``orbit_tape``: contacts of an orbit.
+sample.
 
 References
 ----------

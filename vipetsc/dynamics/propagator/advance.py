@@ -39,7 +39,7 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, select_active, write_on_tape
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, select_active
 from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, on one of a site that is to rest instead, or
@@ -170,7 +170,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     update_taylor(cluster, trial, substep)
     state = cluster.state[0]
     # Drives are evaluated at the cluster's position, which is the substep's end for this call. Taking the length off
-    # again may leave a rounding error in it, for which comparisons of times allow (``substeps.SAME_TIME``).
+    # again may leave a rounding error in it.
     state.position += substep.length
     evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
@@ -339,7 +339,6 @@ def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
     state = cluster.state[0]
     accumulate_moments(cluster, trial, substep)
-    write_on_tape(cluster, trial, substep)
     for i in trial.closed:
         _update_extremes(cluster, trial, i, cluster.interval * substep.length)
     state.position += substep.length

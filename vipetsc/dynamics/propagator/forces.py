@@ -37,15 +37,7 @@ from vipetsc.dynamics.propagator.groups import Groups, contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.substeps import (
-    COUNTS,
-    HISTORY,
-    SPRING_DOF,
-    SUBSTEP_STATE,
-    Cluster,
-    create_tape,
-    create_trial,
-)
+from vipetsc.dynamics.propagator.substeps import COUNTS, HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_trial
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
 from vipetsc.records import PartRecords, Record
@@ -143,7 +135,8 @@ def follow_contacts(cluster: Cluster, tracks: Tracks, begin: float) -> tuple[boo
 class Forces:
     """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
 
-    ``dofs`` are their tables, ``clusters`` the record of all of them, ``tracker`` the modes of their sites and the log.
+    ``dofs`` are their tables, ``clusters`` the record of all of them, ``each`` those of single ones, and ``tracker``
+    has the modes of their sites and the log.
     ``logs`` (cluster,) marks those that this rank logs: every rank that a cluster reaches does the same sums on the
     same numbers, and the one that owns its first cell logs it.
     """
@@ -156,7 +149,8 @@ class Forces:
         self._numbers = groups.numbers
         self._cells = all_dofs["cell"][groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
-        self.use(_create_clusters(groups, self.dofs, model, series))
+        self.clusters = _create_clusters(groups, self.dofs, model, series)
+        self.each = self._each_cluster()
         self.tracker = ImpactTracker(self.clusters.contacts, _site_numbers(groups, model).tolist())
 
         leaders = all_dofs["cell"][groups.numbers[groups.first[:-1]]]
@@ -166,9 +160,8 @@ class Forces:
         self._logs_number = np.zeros(len(all_dofs), bool)
         self._logs_number[groups.numbers[self._is_logged]] = True
 
-    def use(self, clusters: Record) -> None:
-        """Make ``clusters`` those of the rank; ``each`` is the record of one of them, by its number."""
-        self.clusters = clusters
+    def _each_cluster(self) -> PartRecords:
+        """The record of each cluster, by its number."""
         first = self.dofs.first[:-1]
         stop = self.dofs.first[1:]
         last_site = first + self.dofs.sites
@@ -182,10 +175,7 @@ class Forces:
         }
         number = np.arange(len(first))
         bounds["state"] = (number, number + 1)
-        # A tape without rows has none for each cluster either, and nothing is written on it.
-        if clusters.tape.rows.shape[1] > 0:
-            bounds["tape"] = dict.fromkeys(clusters.tape._fields, (number, number + 1))
-        self.each = PartRecords(self.clusters, len(first), bounds)
+        return PartRecords(self.clusters, len(first), bounds)
 
     def begin(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
@@ -308,6 +298,5 @@ def _create_clusters(groups: Groups, dofs: Record, model: Model, series: StepSer
         history=np.zeros(count, HISTORY),
         state=state,
         trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
-        tape=create_tape(0, 0),
     )
     return Record(clusters)

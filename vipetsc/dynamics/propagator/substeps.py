@@ -1,11 +1,9 @@
-"""Records of a cluster that is advanced in substeps: where it stands, a substep that is tried, the tape of those taken.
+"""Records of a cluster that is advanced in substeps: where it stands, and a substep that is tried.
 
 A cluster (sec. 6 of the derivation in the package's docstring) goes through the step from t_0 to t_0 + H in substeps
 whose length follows its contacts. Each is computed in a ``Trial`` (sec. 3) and thrown away if its error is too large or
-if a site changes its mode inside (sec. 4); only a trial that is taken is written into the ``Cluster``. A lattice whose
-orbit is to be linearised also writes it on a ``Tape``, from which sec. 9 makes the derivative of the step later,
-without solving for the orbit once more. All are named tuples of arrays, because compiled code takes them as arguments
-and changes the arrays in place.
+if a site changes its mode inside (sec. 4); only a trial that is taken is written into the ``Cluster``. Both are named
+tuples of arrays, because compiled code takes them as arguments and changes the arrays in place.
 """
 
 from typing import NamedTuple
@@ -16,7 +14,6 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
-from vipetsc.dynamics.propagator.taylor import ROUNDING
 from vipetsc.dynamics.spring_law import SPRING_LAW
 
 COUNTS = ("substeps", "rejected", "landings", "switches", "missed", "forced")
@@ -33,17 +30,6 @@ SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
-
-TAPE_ROW = np.dtype(
-    [(name, float) for name in ("begin", "position", "length", "approach", "rate", "acceleration")]
-    + [(name, np.int64) for name in ("kind", "site", "mode", "onset")]
-)
-"""A closed site in a substep that was taken: the time in s at which the step begins; position and length of the
-substep in units of H; w'_minus of the contact and, at the substep's beginning, w' in m/s and w'' in m/s^2; the kind of
-nodes; the site's number in its cluster; its mode; whether the contact begins with this substep."""
-
-# Two equal times that were summed in another order differ by this many roundings of their size at the most.
-SAME_TIME = 4.0
 
 
 class Substep(NamedTuple):
@@ -97,18 +83,6 @@ class Trial(NamedTuple):
     sums: Sums
 
 
-class Tape(NamedTuple):
-    """Substeps that were taken while contacts were closed: ``rows`` (cluster, row) of dtype ``TAPE_ROW``.
-
-    ``motion`` (cluster, row, 2, node) holds w in m and w' in m/s at the nodes. ``used`` (cluster,) counts the rows that
-    were needed, which may be more than there are.
-    """
-
-    rows: np.ndarray
-    motion: np.ndarray
-    used: np.ndarray
-
-
 class Cluster(NamedTuple):
     """A cluster, or all clusters of a rank one after another: constants, and what changes as it is advanced.
 
@@ -124,7 +98,7 @@ class Cluster(NamedTuple):
     twice ``StepSeries.terms`` of them; ``site_motion`` (dof, 3) has w, w', w'' of the sites there. ``moments`` (dof,
     power) in N s, as many, are the integrals of the step's forces times (remaining time/H)^power up to its end,
     ``energy`` (dof,) in J is what sites dissipated and the work of drives. ``history`` (dof,) is of dtype ``HISTORY``,
-    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is workspace for the largest cluster, ``tape`` a log.
+    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is workspace for the largest cluster.
     """
 
     contacts: np.ndarray
@@ -144,7 +118,6 @@ class Cluster(NamedTuple):
     history: np.ndarray
     state: np.ndarray
     trial: Trial
-    tape: Tape
 
 
 def create_trial(dofs: int, terms: int) -> Trial:
@@ -173,15 +146,6 @@ def create_trial(dofs: int, terms: int) -> Trial:
         taylor=np.zeros((dofs, 2 * terms)),
         site_motion=np.zeros((dofs, 3)),
         sums=sums,
-    )
-
-
-def create_tape(clusters: int, rows: int) -> Tape:
-    """Create an empty tape; nothing is written on one without ``rows``."""
-    return Tape(
-        rows=np.zeros((clusters, rows), TAPE_ROW),
-        motion=np.zeros((clusters, rows, 2, NODES)),
-        used=np.zeros(clusters, np.int64),
     )
 
 
@@ -224,39 +188,3 @@ def select_active(cluster: Cluster) -> Trial:
         site_motion=room.site_motion,
         sums=room.sums,
     )
-
-
-@kernel
-def write_on_tape(cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Write a substep that is taken on the cluster's tape, one row for each closed site."""
-    tape = cluster.tape
-    state = cluster.state[0]
-    if tape.rows.shape[1] == 0:
-        return
-
-    for i in trial.closed:
-        # On a full tape rows are only counted: the caller then knows how many were wanted.
-        k = tape.used[0]
-        tape.used[0] += 1
-        if k >= tape.rows.shape[1]:
-            continue
-
-        site = cluster.contacts[i]
-        row = tape.rows[0, k]
-        row.begin = state.begin
-        row.position = state.position
-        row.length = substep.length
-        row.kind = substep.kind
-        row.site = i
-        row.mode = site.mode
-        row.approach = site.approach
-        row.rate = cluster.site_motion[i, 1]
-        row.acceleration = cluster.site_motion[i, 2]
-
-        # The onset was this same position, but trials since then added their lengths to it and took them off again.
-        time = state.begin + state.position * cluster.interval
-        row.onset = abs(time - cluster.history[i].onset) <= SAME_TIME * ROUNDING * (time + cluster.interval)
-
-        for node in range(NODES):
-            tape.motion[0, k, 0, node] = trial.w[i, node]
-            tape.motion[0, k, 1, node] = trial.v[i, node]

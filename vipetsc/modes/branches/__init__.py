@@ -1,4 +1,4 @@
-"""Branches of a case: followed one a rank or by all ranks together, checked, and written to files that resume them.
+"""Branches of a case: followed one a rank, checked, and written to files that resume them.
 
 ``branch`` is a branch in memory, ``files`` its file; ``regions`` are those of a backbone, with their power laws.
 ``branch_checks`` looks for a branch that retraces itself, stands still or passes on to another one; ``growth``

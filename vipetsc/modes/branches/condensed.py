@@ -6,8 +6,6 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 
 from vipetsc.case import NnmCase
@@ -26,8 +24,6 @@ from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.flow import MAPS, Dop853Flow
-from vipetsc.modes.lattice.floquet import with_multipliers
-from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import FlowError, NoMotionError, PeriodicProblem, StartError
 from vipetsc.modes.shared_frequencies import check_start
@@ -99,8 +95,8 @@ class CondensedMethod(NnmMethod):
     # Runs may begin with the states in the file: a branch that stopped or failed has them, too.
     finishes_interrupted = True
 
-    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
-        super().__init__(case, comm)
+    def __init__(self, case: NnmCase) -> None:
+        super().__init__(case)
         self.motions, self.chain, self.system, self.dofs = Condensed.from_case(case)
         self.dissipation = dissipation_of(case)
 
@@ -151,12 +147,10 @@ class CondensedMethod(NnmMethod):
         return guarded_steps(problem, options, done)
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
-        """The point with its largest multiplier, its loss, and the multipliers of Floquet if they are asked for."""
+        """The point with its largest multiplier, and its loss if anything dissipates."""
         largest = self._largest_multiplier(point)
         if self.dissipation.acts:
             point = with_condensed_loss(self.motions, self.dissipation, point, self.dofs)
-        if self.options.multipliers and self.chain is not None:
-            point = self._with_multipliers(point, self.chain)
         return replace(point, multiplier=largest)
 
     def _largest_multiplier(self, point: Point) -> float:
@@ -187,16 +181,6 @@ class CondensedMethod(NnmMethod):
         if self.motions.forces.odd:
             shooting_map = MAPS["quarter"]
         return Shooting(Dop853Flow(system), shooting_map)
-
-    def _with_multipliers(self, point: Point, chain: Chain) -> Point:
-        """The point with its largest Floquet multipliers, from the lattice's state at phase 0."""
-        cells = state_of(self.motions, point, self.dofs)
-        still = np.zeros(chain.cell.dofs)
-        u = np.array([cells.get(cell, still) for cell in range(chain.cells)]).ravel()
-        stops = elastic_stops(self.case)
-        system = System.from_chain(chain, stops, dense=False)
-        flow = LatticeFlow(chain, stops, self.comm)
-        return with_multipliers(flow, system, self.motions.forces.odd, point, u, self.options.multipliers)
 
     def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the states at phase 0 of the first and the last point, and of those asked for."""

@@ -1,7 +1,5 @@
 """Branches of damped modes: ``nnm.method = "damped"``."""
 
-from mpi4py import MPI
-
 import numpy as np
 
 from vipetsc.case import NnmCase
@@ -24,8 +22,8 @@ class DampedMethod(NnmMethod):
 
     kind = DAMPED
 
-    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
-        super().__init__(case, comm)
+    def __init__(self, case: NnmCase) -> None:
+        super().__init__(case)
         self.system = System.from_case(case)
 
     def new_branch(self, name: str) -> Branch[Point]:

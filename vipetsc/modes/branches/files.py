@@ -30,11 +30,6 @@ from vipetsc.modes.stability import UNSTABLE_BEYOND
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS
 
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 unknown"
-MULTIPLIERS = {
-    "multiplier": "largest Floquet multipliers, real part; NaN where fewer converged",
-    "multiplier_imaginary": "largest Floquet multipliers, imaginary part",
-    "multiplier_residual": "residual of the multiplier's vector over its size",
-}
 PHASE = (
     "the drive is A cos(Om t), and harmonics are those of exp(i k Om t); a run's drive is A sin(Om t), with which the "
     "harmonic k is to be multiplied by (-i)^k"
@@ -181,7 +176,7 @@ def _padded(rows: Sequence[np.ndarray], fill: float = np.nan) -> np.ndarray:
 
 
 def _nnm_variables(branch: Branch[Point]) -> Variables:
-    """Variables of all branches of normal modes: the quantities, the regions, losses and largest multipliers."""
+    """Variables of all branches of normal modes: the quantities, the regions and losses."""
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
     for name, (stored, _, units, text) in QUANTITIES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
@@ -189,19 +184,11 @@ def _nnm_variables(branch: Branch[Point]) -> Variables:
     tangent_period = np.array([p.tangent[-1] if p.tangent.size else np.nan for p in branch.points])
     data["tangent_period"] = variable("point", tangent_period, "s", "tangent of the branch: period")
 
-    # Motions along which nothing dissipates have no loss, and most have no list of multipliers.
+    # Motions along which nothing dissipates have no loss.
     for name, (units, text) in OF_LOSSES.items():
         values = branch.column(name).astype(float)
         if np.isfinite(values).any():
             data[name] = variable("point", values, units, text)
-    largest = _padded([p.multipliers.T for p in branch.points])
-    if largest.shape[-1]:
-        number = np.arange(1, largest.shape[-1] + 1)
-        text = "number of a multiplier, largest first"
-        data["multiplier_number"] = variable("multiplier_number", number, "1", text)
-        parts = largest[:, 0].real, largest[:, 0].imag, largest[:, 1].real
-        for part, (name, text) in zip(parts, MULTIPLIERS.items(), strict=True):
-            data[name] = variable(("point", "multiplier_number"), part, "1", text)
     return data
 
 
@@ -210,10 +197,6 @@ def _nnm_fields(data: xr.Dataset) -> list[dict[str, Any]]:
     columns: dict[str, Any] = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
     columns |= {name: data[name].values.tolist() for name in OF_LOSSES if name in data}
     columns["kind"] = stored_kinds(data)
-    if "multiplier" in data:
-        real, imaginary, residual = (data[name].values for name in MULTIPLIERS)
-        rows = np.stack([real + 1j * imaginary, residual], axis=-1)
-        columns["multipliers"] = [row[np.isfinite(row[:, 0])] for row in rows]
     # Properties of ``Point``, which follow from other fields.
     for name in ("frequency", "damping_ratio"):
         columns.pop(name, None)

@@ -49,7 +49,6 @@ from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.damped import DampedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
 from vipetsc.modes.branches.growth import Growth, Listener
-from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
@@ -67,8 +66,6 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
     """The method that finds the branches of a ``case``."""
     if isinstance(case, NfrcCase):
         return ResponseMethod
-    if case.krylov:
-        return LatticeMethod
     if case.nnm.method == "damped":
         return DampedMethod
     if case.condensed:
@@ -77,11 +74,9 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
 
 
 class Follower:
-    """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
+    """Follows branches of a case on one rank, into a folder or, without one, in memory alone.
 
-    ``about`` are attributes of the files. ``listener(branch, point)`` is called after each regular point on rank 0 of
-    ``comm``: of ``follow_all`` that is every rank with its own branches, unless all follow one together. All ranks of
-    ``comm`` call ``follow`` with the same jobs in the same order.
+    ``about`` are attributes of the files. ``listener(branch, point)`` is called after each regular point.
     """
 
     def __init__(
@@ -92,7 +87,6 @@ class Follower:
         listener: Listener | None = None,
         stop: StopRequest | None = None,
         resume: bool = False,
-        comm: MPI.Comm = MPI.COMM_SELF,
     ) -> None:
         sys.audit("vipetsc.set-up", case.name)
         self.case = case
@@ -100,9 +94,8 @@ class Follower:
         self.about = about
         self.stop = stop or StopRequest()
         self.resume = resume
-        self.comm = comm
-        self.method: Method[Any] = method_of(case)(case, comm)
-        self.growth = Growth(self.method, comm, self.write, listener, self.stop)
+        self.method: Method[Any] = method_of(case)(case)
+        self.growth = Growth(self.method, self.write, listener, self.stop)
 
     def follow(self, job: int) -> list[Branch[Any]]:
         """The branches of a ``job``, one for each direction, each with those that cross it, if asked for.
@@ -135,10 +128,9 @@ class Follower:
             self.write(branch)
 
     def write(self, branch: Branch[Any]) -> None:
-        """Write a branch into the folder; one that ranks follow together is written by one of them."""
-        folder = self.folder
-        if folder:
-            on_root(self.comm, lambda: write_branch(branch, folder, self.about))
+        """Write a branch into the folder."""
+        if self.folder:
+            write_branch(branch, self.folder, self.about)
 
     def _follow_one(self, branch: Branch[Any], job: int, direction: int) -> None:
         """Compute the points of a branch, then what its file holds of the whole branch (``Method.finish``)."""
@@ -168,32 +160,26 @@ class Follower:
         if folder is None:
             return new
         path = folder / f"branch-{name}.h5"
-        if not (self.resume and on_root(self.comm, path.exists)):
+        if not (self.resume and path.exists()):
             return new
 
         try:
-            # Read by one rank: the others must not find another file, or none.
-            stored = on_root(self.comm, lambda: read_branch(path))
-            source = on_root(self.comm, lambda: root_attributes(path, "branch").get("source"))
+            stored = read_branch(path)
+            source = root_attributes(path, "branch").get("source")
         except OSError as error:
-            self._warn(f"{error}; computed again")
+            logger.warning("vipetsc: warning: %s; computed again", error)
             return new
         if not stored.complete and source != source_key():
-            self._warn(f"{path} was begun by other sources of vipetsc; computed again")
+            logger.warning("vipetsc: warning: %s was begun by other sources of vipetsc; computed again", path)
             return new
         # The case's bounds may be new.
         branch = replace(stored, case=new.case, about=new.about, extra=new.extra)
         try:
             # A branch that is complete is not written again, and a table that is missing would stay away.
-            on_root(self.comm, lambda: restore_table(branch, folder))
+            restore_table(branch, folder)
         except OSError as error:
-            self._warn(f"the table of branch {name} is not written: {error}")
+            logger.warning("vipetsc: warning: the table of branch %s is not written: %s", name, error)
         return branch
-
-    def _warn(self, text: str) -> None:
-        """Log a warning that all ranks have, on one of them."""
-        if self.comm.rank == 0:
-            logger.warning("vipetsc: warning: %s", text)
 
     def _follow_crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
         """The branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
@@ -251,8 +237,7 @@ def follow_all(
     """All branches of ``case``, written into ``folder`` if there is one.
 
     Each branch is computed on one rank, so that its bits do not depend on the number of ranks: rank r of n follows the
-    branches r, r + n, r + 2n and so on. Where a lattice is shot without dense matrices, all ranks follow one branch
-    together, and then the next one.
+    branches r, r + n, r + 2n and so on.
 
     A branch that fails, by one of ``Method.failures``, is written as far as it came and says why (``Branch.ended``),
     and the others go on. A ``stop`` ends each branch at its next point, or earlier if an orbit's search takes long
@@ -262,28 +247,19 @@ def follow_all(
     of the case; an empty list on the others.
 
     Any other error of one rank, as where a file cannot be written, is raised on all ranks once the others have followed
-    their branches. Where all ranks follow one branch together, an error that one of them has alone leaves the others
-    waiting, unless it ends them too (``parallel.install_abort_hook``).
+    their branches.
     """
     if not isinstance(case, BranchCase):
         raise TypeError(f"follow_all takes a case of the class NnmCase or NfrcCase, not {type(case).__name__}")
-    follower = partial(Follower, case, folder, provenance(comm), listener, stop, resume)
+    about = provenance(comm)
     jobs = method_of(case).jobs(case)
-    # Collective calls inside: every rank follows the same branches in the same order.
-    if method_of(case).shared:
-        together = follower(comm)
-        branches = [branch for job in jobs for branch in together.follow(job)]
-        if comm.rank > 0:
-            return []
-        return branches
-
     # Neighbours in the list fall to different ranks; no rank waits for another until all are followed.
     numbers = range(comm.rank, len(jobs), comm.size)
 
     def follow_alone() -> dict[int, list[Branch[Any]]]:
         if not numbers:
             return {}
-        alone = follower(comm=MPI.COMM_SELF)
+        alone = Follower(case, folder, about, listener, stop, resume)
         return {number: alone.follow(jobs[number]) for number in numbers}
 
     followed = on_every_rank(comm, follow_alone)

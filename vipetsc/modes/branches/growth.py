@@ -11,14 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mpi4py import MPI
-
 from vipetsc.endings import Ended, Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method, Monitor
 from vipetsc.modes.continuation.arclength import Continuation, StepRule, locate
 from vipetsc.modes.problem import PeriodicProblem
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.parallel import StoppedError, StopRequest
 
 # Seconds between two writings of a growing branch: what a kill may lose.
 SAVE_EVERY = 10.0
@@ -29,15 +27,13 @@ RuleOf = Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]]
 
 @dataclass
 class Growth:
-    """Continues branches of a ``method`` on the ranks ``comm``, all of which call it together.
+    """Continues branches of a ``method``, one after the other.
 
-    ``write(branch)`` writes a branch as far as it has come. ``listener(branch, point)``, if there is one, is called on
-    rank 0 after each regular point; what it raises is raised on all ranks. A ``stop`` ends the branch at its next
-    point, or within a step that takes long.
+    ``write(branch)`` writes a branch as far as it has come. ``listener(branch, point)``, if there is one, is called
+    after each regular point. A ``stop`` ends the branch at its next point, or within a step that takes long.
     """
 
     method: Method[Any]
-    comm: MPI.Comm
     write: Callable[[Branch[Any]], None]
     listener: Listener | None
     stop: StopRequest
@@ -133,17 +129,16 @@ class Growth:
             branch.points += new_points
             assessed = new_points[-1]
             branch.next_step = continuation.step
-            self._show(branch, assessed)
+            if self.listener is not None:
+                self.listener(branch, assessed)
             ended = monitor(assessed)
             if ended is not None:
                 branch.findings.append(ended.sentence)
                 return ended
 
-            # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
-            if self.stop.agreed(self.comm) and not continuation.finished:
+            if self.stop.requested and not continuation.finished:
                 raise StoppedError
-            # One rank's clock decides for all: writing is collective.
-            is_due = self.comm.bcast(time.monotonic() - saved > SAVE_EVERY)
+            is_due = time.monotonic() - saved > SAVE_EVERY
             # A branch that has ended is written later, as complete: after a kill it would go on beyond its end.
             if is_due and not continuation.finished:
                 self.write(branch)
@@ -151,12 +146,3 @@ class Growth:
             one_before_last = last
             last = point
         return None
-
-    def _show(self, branch: Branch[Any], point: Any) -> None:
-        """Show a regular ``point`` to the listener on rank 0."""
-
-        def call() -> None:
-            if self.listener is not None:
-                self.listener(branch, point)
-
-        on_root(self.comm, call)

@@ -12,9 +12,7 @@ of phase; M. Peeters, G. Kerschen, J. C. Golinval, J. Sound Vib. 330 (2011) 486)
 
 Along an orbit that was shot with matrices the arc is integrated by Gauss's rule between its changes of contact. The
 rest of the period consists of images of the arc, some of them backwards in time, in which a contact begins with the
-velocity with which it ends in the arc. Along an orbit of a whole lattice, shot without matrices, v^T C v is averaged
-over uniform times of the arc. The mean of a smooth periodic function converges fast; with contacts it errs by 1e-9 to
-1e-7 (``FEWEST``). The integrals over contacts use the nodes of the substeps by which the orbit itself was integrated.
+velocity with which it ends in the arc.
 """
 
 import itertools
@@ -23,29 +21,19 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import trapezoid
 from scipy.sparse import csr_matrix
 
 from vipetsc.case import NnmCase
-from vipetsc.dynamics.propagator.orbit_tape import ClosedSubsteps
 from vipetsc.lattice import Contact
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.flow import SEPARATION, Arc
-from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Shooting, whole_period
+from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.system import elongation_rows
 
 # Nodes of Gauss's rule in a piece of an arc, and the longest piece in radians of the fastest motion. A contact that is
 # stiffer than all springs may be one piece: 12 nodes err by 1e-4 of its loss, 24 by 1e-12.
 NODES = 24
 LONGEST = 2.0
-# Times of a period at which the state of a whole lattice is looked at: FEWEST at least, and no more than BETWEEN
-# radians of the fastest motion apart. v^T C v has twice the frequency of that motion, and six samples in its period.
-FEWEST = 512
-BETWEEN = 0.5
-# A substep that ends within this fraction of the arc's duration from its end is the last one.
-AT_END = 1e-9
 
 
 class Dissipation(NamedTuple):
@@ -124,71 +112,6 @@ def with_loss(problem: Shooting, dissipation: Dissipation, point: Point) -> Poin
         harmonic = sum(m.weight * m.u[dissipation.forced] * np.cos(omega * m.time - lag) for m in moments)
         force = force_for(loss, 2 * images / point.period * float(harmonic))
     return replace(point, loss=loss, force=force)
-
-
-def with_lattice_loss(problem: LatticeShooting, dissipation: Dissipation, point: Point) -> Point:
-    """The ``point`` of a whole lattice with its loss and force, as ``with_loss``; all ranks call it together.
-
-    Raises FlowError on all ranks.
-    """
-    flow = problem.flow
-    part = problem.map.fraction
-    # A quarter of the period has a whole number of steps.
-    steps = -(-max(FEWEST, flow.steps(point.period, BETWEEN)) // 4) * 4
-    powers: list[float] = []
-    forced: list[float] = []
-
-    def look(block: np.ndarray) -> None:
-        u, v = np.split(flow.gather(block), 2)
-        powers.append(float(v @ (dissipation.damping @ v)))
-        forced.append(float(u[dissipation.forced or 0]))
-
-    loss = _loss_of_lattice_contacts(problem, dissipation.laws, point)
-    if dissipation.damping.nnz or dissipation.forced is not None:
-        flow.watch(flow.scatter(problem.start(point.x)), part * point.period, round(part * steps), look)
-        loss += trapezoid(powers, dx=point.period / steps) / part
-
-    force = np.nan
-    if dissipation.forced is not None:
-        motion = whole_period(np.array(forced), problem.map, steps, 1)
-        force = force_for(loss, 2 * float(np.fft.rfft(motion)[1].real) / steps)
-    return replace(point, loss=loss, force=force)
-
-
-def _loss_of_lattice_contacts(problem: LatticeShooting, laws: Sequence[Contact], point: Point) -> float:
-    """Energy in J that the contacts of a lattice take in a period; NaN if one that dissipates never separates."""
-    arc = problem.arc(point.x, point.period)
-    by_site: dict[int, float] = {}
-    for substeps in arc.engine.closed_substeps():
-        for number in np.unique(substeps.site).tolist():
-            if laws[number].damping:
-                contacts = _contacts_on_tape(substeps, problem.system.contacts[number].stops, number, arc.duration)
-                by_site[number] = _taken(laws[number], contacts)
-
-    # Summed in the order of the sites, on any number of ranks.
-    of_all: dict[int, float] = {}
-    for of_rank in problem.flow.comm.allgather(by_site):
-        of_all |= of_rank
-    return sum(of_all[number] for number in sorted(of_all)) / problem.map.fraction / 2
-
-
-def _contacts_on_tape(substeps: ClosedSubsteps, stops: Stops, number: int, duration: float) -> Iterator[_Contact]:
-    """The contacts of the site ``number`` in an arc of ``duration`` seconds, from its substeps."""
-    rows = np.flatnonzero(substeps.site == number)
-    begins = substeps.onset[rows]
-    begins[0] = True
-    for part in np.split(rows, np.flatnonzero(begins)[1:]):
-        side = substeps.side[part[0]]
-        depths = side * substeps.w[part] - stops.clearance_on(int(side))
-        densities = substeps.weights[part] * stops.law.elastic_force(depths) * substeps.rate[part] ** 2
-        # There is no speed where the contact is closed at the arc's start, or at its end.
-        onset = None
-        if substeps.onset[part[0]]:
-            onset = abs(float(substeps.first_rate[part[0]]))
-        separation = None
-        if substeps.end[part[-1]] <= (1 - AT_END) * duration:
-            separation = abs(float(substeps.last_rate[part[-1]]))
-        yield _Contact(float(densities.sum()), onset, separation)
 
 
 def _taken(law: Contact, contacts: Iterable[_Contact]) -> float:

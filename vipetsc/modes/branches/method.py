@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Generic, NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 
 from vipetsc.endings import Ended
@@ -43,15 +41,14 @@ class CrossingBranch(NamedTuple):
 class Method(ABC, Generic[S]):
     """A method that finds the branches of one case, which ``jobs`` numbers from 0 on.
 
-    ``kind`` is the kind of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and
-    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_interrupted``: a
-    branch that failed or was stopped has the additions to the file of a whole branch, too (``finish``). ``locates``:
-    special points are looked for between the regular ones, those where a contact grazes only with ``locates_grazing``.
-    ``counts_start``: the start is one of the points of which the case gives the largest number.
+    ``kind`` is the kind of their files. ``failures`` end a branch and not the program. ``keeps_empty``: a branch
+    without points leaves a file that says why. ``finishes_interrupted``: a branch that failed or was stopped has the
+    additions to the file of a whole branch, too (``finish``). ``locates``: special points are looked for between the
+    regular ones, those where a contact grazes only with ``locates_grazing``. ``counts_start``: the start is one of the
+    points of which the case gives the largest number.
     """
 
     kind: ClassVar[str]
-    shared: ClassVar[bool] = False
     # Where the derivative is singular a motion has no unique tangent.
     failures: ClassVar[tuple[type[Exception], ...]] = (NoMotionError, np.linalg.LinAlgError)
     counts_start: ClassVar[bool] = False
@@ -60,9 +57,8 @@ class Method(ABC, Generic[S]):
     locates_grazing: bool = False
     locates: bool = True
 
-    def __init__(self, case: Any, comm: MPI.Comm) -> None:
+    def __init__(self, case: Any) -> None:
         self.case = case
-        self.comm = comm
 
     @staticmethod
     def jobs(case: Any) -> list[int]:

@@ -1,4 +1,4 @@
-"""Branches of periodic orbits shot with dense matrices, each on one rank."""
+"""Branches of periodic orbits by shooting."""
 
 import itertools
 import math
@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import cast
-
-from mpi4py import MPI
 
 import numpy as np
 
@@ -24,7 +22,7 @@ from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem, SpecialKind
-from vipetsc.modes.shooting import Shooting, ShootingEquations, linear_start
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
 
@@ -44,8 +42,8 @@ class NnmMethod(Method[Point]):
 
     case: NnmCase
 
-    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
-        super().__init__(case, comm)
+    def __init__(self, case: NnmCase) -> None:
+        super().__init__(case)
         self.options = case.nnm
         self.locates = case.nnm.locate
 
@@ -58,7 +56,7 @@ class NnmMethod(Method[Point]):
 
         That of shot orbits is; the block has no effect on others.
         """
-        if isinstance(problem, ShootingEquations):
+        if isinstance(problem, Shooting):
             return problem.limits.stopped_by(stop)
         return super().stopped_by(problem, stop)
 
@@ -137,8 +135,8 @@ class ShootingMethod(NnmMethod):
 
     kind = ORBITS
 
-    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
-        super().__init__(case, comm)
+    def __init__(self, case: NnmCase) -> None:
+        super().__init__(case)
         options = case.nnm
         self.system = System.from_case(case)
         self.dissipation = dissipation_of(case)

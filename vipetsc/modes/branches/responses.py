@@ -6,8 +6,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 
 from vipetsc.case.keys import unit_of
@@ -60,8 +58,8 @@ class ResponseMethod(Method[Response]):
 
     case: NfrcCase
 
-    def __init__(self, case: NfrcCase, comm: MPI.Comm) -> None:
-        super().__init__(case, comm)
+    def __init__(self, case: NfrcCase) -> None:
+        super().__init__(case)
         self.curves = case.every_curve()
         # The latest compliance by the number of its member: the curves of a member follow each other.
         self._compliance: tuple[int, WaveCompliance | ModalCompliance] | None = None

@@ -72,7 +72,7 @@ class OrbitProblem(PeriodicProblem[Point], Protocol):
     """Equations whose solutions are orbits with contacts, as ``largest_change`` asks them."""
 
     def departures(self, point: Point) -> Sequence[Departure]:
-        """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
+        """The times in the arc of an orbit in which contacts are not what they are at rest.
 
         Raises FlowError if the arc cannot be integrated.
         """
@@ -80,13 +80,13 @@ class OrbitProblem(PeriodicProblem[Point], Protocol):
     def grazing(self, point: Point) -> list[int]:
         """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.
 
-        All ranks must call it. Raises FlowError if the arc cannot be integrated.
+        Raises FlowError if the arc cannot be integrated.
         """
 
     def acceleration(self, point: Point) -> float:
         """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
 
-        It is 0 at an equilibrium, and infinite where no rest of the orbit is known. All ranks must call it.
+        It is 0 at an equilibrium, and infinite where no rest of the orbit is known.
         """
 
 
@@ -103,7 +103,7 @@ def largest_change(
     """The largest change of a step, from ``before`` to ``after``, over its bound in ``control``.
 
     ``geometry`` has the fields of ``Geometry``: ``corrector`` and ``turn``. Which other changes are guarded
-    ``problem.guards`` says. All ranks must call it: contacts may be looked for on all of them.
+    ``problem.guards`` says.
     """
     changes = {"contacts": contact_changes(problem, before, after, control.guards.contacts), **geometry}
     if "half_trace" in problem.guards:

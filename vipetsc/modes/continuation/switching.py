@@ -25,7 +25,7 @@ from vipetsc.modes.continuation.crossing import crossing_row
 from vipetsc.modes.flow import MAPS
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError
-from vipetsc.modes.shooting import DenseFrame, Shooting, repetitions
+from vipetsc.modes.shooting import Shooting, ShootingFrame, repetitions
 
 # The numbers below were measured at eleven special points of the benchmark of Kerschen and Peeters and of the paper's
 # model with either law. At seven of these points another branch crosses.
@@ -59,7 +59,7 @@ class Crossing(NamedTuple):
     """
 
     problem: Shooting
-    frame: DenseFrame
+    frame: ShootingFrame
     row: np.ndarray
 
 
@@ -145,4 +145,4 @@ def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarra
     if old.map.start == new.map.start:
         return point.x, period
     # A map from the centre begins with the velocities there, at the end of the quarter from rest.
-    return old.end(old.arc(point.x, point.period))[old.system.dofs :], period
+    return old.arc(point.x, point.period).end[old.system.dofs :], period
