@@ -7,6 +7,7 @@
     analyse   the measures of a run: spectra, energies of the pass bands, entropy
     follow    solutions of your own equations F(x, p) = 0: folds, branch points, the branches that cross there
     open      result files as xarray datasets
+    impacts   the impacts of a run as a table of pandas: a row for each, with its loss, impulse and what it moved
     CaseError raised for an invalid case: key, value and remedy of every problem
     register  contact laws, dissipation factors, waveforms, measures and figures of a user's module, by name
 
@@ -31,6 +32,7 @@ __all__ = [
     "Sweep",
     "analyse",
     "follow",
+    "impacts",
     "install_abort_hook",
     "open",
     "register",
@@ -44,6 +46,7 @@ MODULES = {
     "Sweep": ("vipetsc.case", "Sweep"),
     "analyse": ("vipetsc.studies.analysis", "analyse"),
     "follow": ("vipetsc.modes.user_equations", "follow"),
+    "impacts": ("vipetsc.io.impacts", "impacts"),
     "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
     "open": ("vipetsc.io.read", "open_results"),
     "register": ("vipetsc", "register"),

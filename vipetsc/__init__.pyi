@@ -4,6 +4,7 @@ from vipetsc.case import Case as Case
 from vipetsc.case import CaseError as CaseError
 from vipetsc.case import Sweep as Sweep
 from vipetsc.dynamics.run import simulate as simulate
+from vipetsc.io.impacts import impacts as impacts
 from vipetsc.io.read import open_results as open
 from vipetsc.modes.user_equations import follow as follow
 from vipetsc.parallel import install_abort_hook as install_abort_hook
@@ -17,6 +18,7 @@ __all__ = [
     "Sweep",
     "analyse",
     "follow",
+    "impacts",
     "install_abort_hook",
     "open",
     "register",

@@ -160,12 +160,12 @@ def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
 
     # Pandas' faster parser loses the last digit.
     ledger = pd.read_csv(folder / "curves/run-time.csv", float_precision="round_trip")
-    impacts = pd.read_csv(folder / "curves/run-episode.csv", float_precision="round_trip")
+    impacts = pd.read_csv(folder / "curves/run-impacts.csv", float_precision="round_trip")
     with open_run(folder / "run.h5") as run:
         assert ledger["energy/work (J)"].values.tobytes() == run["energy/work"].values.tobytes()
         assert ledger["time (s)"].values.tobytes() == run["time"].values.tobytes()
-        assert impacts["impacts/force (N)"].values.tobytes() == run["impacts/force"].values.tobytes()
-        assert impacts["impacts/onset (s)"].values.tobytes() == run["impacts/onset"].values.tobytes()
+        assert impacts["force (N)"].values.tobytes() == run["impacts/force"].values.tobytes()
+        assert impacts["onset (s)"].values.tobytes() == run["impacts/onset"].values.tobytes()
 
     assert f"  {folder / 'run.xdmf'}" in ended.stdout.splitlines()
     assert_same_bits(before, datasets(folder / "run.h5"))

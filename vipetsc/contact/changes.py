@@ -82,12 +82,13 @@ class ModeChange(NamedTuple):
 class Extremes(NamedTuple):
     """Extremes of a contact in a step: largest ``indentation`` in m, largest and smallest force on the host in N.
 
-    Forces are positive where the contact pushes.
+    Forces are positive where the contact pushes. The ``impulse`` in N s is the integral of the force over the step.
     """
 
     indentation: float
     force: float
     smallest_force: float
+    impulse: float
 
 
 @kernel
@@ -285,11 +286,13 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
             deepest = max(deepest, side * evaluate(b, turn, room))
 
     # The smallest force only tells whether the contact has pulled: samples are exact enough.
-    largest = smallest = _push(contacts, i, b, d, 0.0, room)
+    largest = smallest = impulse = _push(contacts, i, b, d, 0.0, room)
     best = 0.0
     for k in range(1, _INTERVALS + 1):
         force = _push(contacts, i, b, d, k / _INTERVALS, room)
         smallest = min(smallest, force)
+        # Simpson's rule: 1, 4, 2, 4, ..., 4, 1.
+        impulse += force if k == _INTERVALS else (2.0 + 2.0 * (k % 2)) * force
         if force > largest:
             largest = force
             best = k / _INTERVALS
@@ -305,7 +308,8 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
         else:
             low = left
     largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
-    return Extremes(indentation=deepest - gap_of(contacts[i], side), force=largest, smallest_force=smallest)
+    impulse *= h / (3.0 * _INTERVALS)
+    return Extremes(deepest - gap_of(contacts[i], side), largest, smallest, impulse)
 
 
 @kernel

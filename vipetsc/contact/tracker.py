@@ -31,12 +31,13 @@ from vipetsc.contact.law import (
 # velocity, contacts that were clipped, and contacts that pulled.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
 COUNTS = np.dtype([(name, np.int64) for name in LIMITS])
-_REALS = ("onset", "approach_velocity", "separation", "indentation", "force", "loss")
+_REALS = ("onset", "approach_velocity", "separation", "indentation", "force", "impulse", "loss")
 EPISODE = np.dtype([("site", np.int64), ("side", np.int64), *((name, np.float64) for name in _REALS)])
 """One contact of one site: 0-based site, side (+1, -1), times of ``onset`` and ``separation`` in s.
 
-The ``approach_velocity`` is in m/s, the largest ``indentation`` in m, the largest ``force`` in N; ``loss`` is the
-energy in J that the contact has dissipated.
+The ``approach_velocity`` is in m/s, the largest ``indentation`` in m, the largest ``force`` in N; ``impulse`` is the
+integral of the force in N s, positive where the contact pushes; ``loss`` is the energy in J that the contact has
+dissipated.
 """
 TRACKED = np.dtype(
     [
@@ -119,9 +120,14 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
             # extremes would cost as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
-            episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
+            first = side * contact_force(contacts, i, start[i, 0], start[i, 1])[0]
+            last = side * contact_force(contacts, i, end[i, 0], end[i, 1])[0]
+            episode.force = max(episode.force, last)
+            episode.impulse += 0.5 * h * (first + last)
         elif in_episode(contacts[i].mode):
-            update_episode(contacts, tracks, i, extremes(contacts, i, start, end, h))
+            reached = extremes(contacts, i, start, end, h)
+            update_episode(contacts, tracks, i, reached)
+            tracks.sites[i].episode.impulse += reached.impulse
         any_open |= in_episode(contacts[i].mode)
     return any_open
 
@@ -220,6 +226,7 @@ def _begin_episode(site: Any, track: Any, w: float, rate: float, t: float, reste
     episode.separation = np.nan
     episode.indentation = 0.0
     episode.force = 0.0
+    episode.impulse = 0.0
 
 
 @kernel

@@ -60,6 +60,7 @@ LARGE = {
     "impacts/separation": ("episode", "s", "time of separation; NaN if still in contact"),
     "impacts/indentation": ("episode", "m", "largest indentation"),
     "impacts/force": ("episode", "N", "largest contact force"),
+    "impacts/impulse": ("episode", "N s", "integral of the contact force over the episode"),
     "impacts/loss": ("episode", "J", "energy dissipated in the episode"),
 }
 GIVEN = {

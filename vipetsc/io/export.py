@@ -11,6 +11,7 @@ import xarray as xr
 from vipetsc.io.atomic import atomic_write, write_text
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.chunks import FORCES, MOTION
+from vipetsc.io.impacts import impacts
 from vipetsc.io.read import field_time, open_results, open_run
 from vipetsc.wording import with_unit
 
@@ -105,6 +106,7 @@ def write_curves(path: Path) -> list[Path]:
 
     - designs of a search: a column for each variable, objective and constraint;
     - a frequency response: a column for each named mass, contact and wall;
+    - a run: ``run-impacts.csv``, a row for each impact (``vipetsc.io.impacts``);
     - a run with points or forces: ``run-points.csv`` and ``run-forces.csv``, a column for each point or site;
     - a run or an analysis, where the folder has ``analysis.h5``: the numbers in it, ``analysis-measures.csv``.
 
@@ -124,7 +126,8 @@ def write_curves(path: Path) -> list[Path]:
                 groups.setdefault(tuple(map(str, item.dims)), []).append(str(name))
 
         for dims, names in groups.items():
-            if np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
+            # The impacts of a run have a table of their own.
+            if dims == ("episode",) or np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
                 continue
             table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
             # CSV has no room for coordinates over other dimensions, such as the cells of sites.
@@ -137,6 +140,8 @@ def write_curves(path: Path) -> list[Path]:
             path_of_table = source.parent / "curves" / f"{stem}.csv"
             written.append(_write_table(path_of_table, table.drop_vars(foreign)))
         written += _write_wide(data, source)
+        if 0 < data.sizes.get("episode", 0) <= MOST_ROWS:
+            written.append(_write_impacts(source))
 
     # The numbers of a run are in another file of its folder.
     measured = source.with_name(ANALYSIS)
@@ -201,6 +206,14 @@ def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
             path = source.parent / "curves" / f"{source.stem}-{kind}.csv"
             written.append(_write_columns(path, {"time (s)": run["time"].values} | table))
     return written
+
+
+def _write_impacts(source: Path) -> Path:
+    """Write the table of impacts of the run in the file ``source`` as CSV, with units in its head; return the file."""
+    table = impacts(source)
+    heads = {name: with_unit(name, unit) for name, unit in table.attrs["units"].items()}
+    path = source.parent / "curves" / f"{source.stem}-impacts.csv"
+    return _write_frame(path, table.rename(columns=heads).reset_index())
 
 
 def _numbers(analysis: xr.Dataset) -> dict[str, list[Any]]:

@@ -31,6 +31,7 @@ RUN_NEEDS = (
     *(f"impacts/{name}" for name in ("site", "side", "onset", "approach_velocity", "separation")),
     *(f"impacts/{name}" for name in ("indentation", "force", "loss")),
 )
+PARTS = "bands/part", "part"  # dimensions of pass bands and the gaps between them, of one run and of a sweep
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
 
@@ -54,9 +55,28 @@ def with_point_names(run: xr.Dataset) -> xr.Dataset:
     if not any(str(name).startswith("points/") for name in run.variables):
         return run
     names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
-    named = run.assign_coords(point=("point", np.array(names, dtype=object), run["point"].attrs))
+    return _renamed(run, "point", names)
+
+
+def with_part_names(analysis: xr.Dataset) -> xr.Dataset:
+    """The ``analysis``, of a run or of a sweep, with the names of the parts of the frequency axis as their coordinate.
+
+    A part is, for instance, "band 2". Other results come back as they are.
+    """
+    for item in analysis.variables.values():
+        names = np.atleast_1d(item.attrs.get("parts", ()))
+        for dimension in PARTS:
+            if dimension in item.dims and len(names) == analysis.sizes[dimension]:
+                return _renamed(analysis, dimension, names.tolist())
+    return analysis
+
+
+def _renamed(data: xr.Dataset, dimension: str, names: list[str]) -> xr.Dataset:
+    """The ``data`` with ``names`` as the coordinate of a ``dimension``."""
+    attributes = data[dimension].attrs
+    named = data.assign_coords({dimension: (dimension, np.array(names, dtype=object), attributes)})
     # A dataset that is made from another one does not close its file.
-    named.set_close(run.close)
+    named.set_close(data.close)
     return named
 
 
@@ -69,7 +89,7 @@ def open_results(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     if path.is_dir() and (path / SWEEP.file).exists():
-        return open_ensemble(path)
+        return with_part_names(open_ensemble(path))
 
     files = [path]
     if path.is_dir():
@@ -80,7 +100,7 @@ def open_results(path: str | Path) -> xr.Dataset:
         raise ValueError(f"{path}: contains {contents}; name a file")
 
     data = open_netcdf(files[0], "result", needs=("case",))
-    data = with_point_names(data)
+    data = with_part_names(with_point_names(data))
     data.encoding["source"] = str(files[0])
     return data.set_coords([name for name in ("impacts/onset",) if name in data])
 

@@ -305,11 +305,11 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
 
 
 @kernel
-def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
-    """Update the extremes of the contact of site ``i`` by a substep of so many ``seconds``.
+def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float, kind: int) -> None:
+    """Update the history of the contact of site ``i`` by a substep of so many ``seconds`` and a ``kind`` of nodes.
 
-    They are the largest indentation in m and the largest and smallest force on the host in N, positive where the
-    contact pushes; the smallest one shows whether it has pulled.
+    It has the largest indentation in m, the largest and smallest force on the host in N, positive where the contact
+    pushes, and their integral; the smallest one shows whether it has pulled.
     """
     start = cluster.site_motion[i]
     end = trial.site_motion[i]
@@ -326,9 +326,10 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
         inside = -side * (trial.force[i, node] - cluster.contacts[i].preload)
         smallest = min(smallest, inside)
         largest = max(largest, inside)
+        history.impulse += seconds * cluster.nodes.weight[kind, node] * inside
     # The costly search within the substep only where a turn lies inside.
     if largest > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
-        depth, force, smallest = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
+        depth, force, smallest, _ = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
     history.indentation = max(history.indentation, depth)
     history.force = max(history.force, force)
     history.smallest_force = min(history.smallest_force, smallest)
@@ -340,7 +341,7 @@ def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     state = cluster.state[0]
     accumulate_moments(cluster, trial, substep)
     for i in trial.closed:
-        _update_extremes(cluster, trial, i, cluster.interval * substep.length)
+        _update_extremes(cluster, trial, i, cluster.interval * substep.length, substep.kind)
     state.position += substep.length
     copy(trial.taylor, cluster.taylor)
     copy(trial.site_motion, cluster.site_motion)

@@ -62,8 +62,9 @@ def _update_open_episodes(contacts: np.ndarray, histories: np.ndarray, tracks: T
     for i in range(contacts.size):
         if in_episode(contacts[i].mode):
             history = histories[i]
-            reached = Extremes(history.indentation, history.force, history.smallest_force)
+            reached = Extremes(history.indentation, history.force, history.smallest_force, history.impulse)
             update_episode(contacts, tracks, i, reached)
+            tracks.sites[i].episode.impulse = history.impulse
 
 
 @kernel
@@ -98,6 +99,7 @@ def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
     history.indentation = 0.0
     history.force = 0.0
     history.smallest_force = 0.0
+    history.impulse = 0.0
     state = cluster.state[0]
     state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
 

@@ -28,8 +28,10 @@ of substeps that end beside a change or with a kink inside, and of those taken a
 SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
 """A nonlinear spring: what its force has beyond the linear part; the size in m of elongations."""
 
-HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
-"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
+HISTORY = np.dtype(
+    [(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force", "impulse")]
+)
+"""A site's contact: its onset and expected duration in s, its extremes so far in m and N, its impulse so far in N s."""
 
 
 class Substep(NamedTuple):
