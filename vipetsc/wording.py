@@ -57,6 +57,13 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
     return near[0] if near else ""
 
 
+def key_name(path: str) -> str:
+    """Return the words for the ``path`` of a key of a case: "Drive amplitude" for "drive.amplitude"."""
+    words = path.replace("contacts.", "contact.").replace("_", " ").split(".")
+    text = " ".join(words)
+    return text[:1].upper() + text[1:]
+
+
 def with_unit(name: str, unit: str) -> str:
     """A ``name`` with its ``unit`` in brackets, as "time (s)"; without one where the unit is "1" or empty."""
     if unit in ("", "1"):

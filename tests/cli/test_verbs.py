@@ -187,7 +187,7 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
     assert pictures_of(folders)[0].kind.source == "sweep"
 
     (folders[0] / "ensemble.h5").rename(folders[0] / "law.h5")
-    with pytest.raises(FolderError, match="only sweeps and folders of branches can be drawn on one page"):
+    with pytest.raises(FolderError, match="sweeps and folders of branches, can be drawn on one page"):
         pictures_of(folders)
 
 

@@ -314,10 +314,11 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
     if count > MOST_SAMPLES:
         remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} are possible, and the bands need that many"
         return [Problem("time.end", given["time"].end, remedy)]
-    samples = given["time"].samples
-    if samples is None:
-        return []
-    return _too_coarse(given["lattice"].unit_cell(), time.sample_interval, "time.samples", samples)
+    for key in ("samples", "samples_per_period"):
+        samples = getattr(given["time"], key)
+        if samples is not None:
+            return _too_coarse(given["lattice"].unit_cell(), time.sample_interval, f"time.{key}", samples)
+    return []
 
 
 def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) -> Iterator[Problem]:
@@ -368,6 +369,9 @@ def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None,
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
     """Problems with an interval of samples that does not resolve the bands of ``cell``, or exceeds the run."""
     interval = time.sample_interval
+    per_period = time.samples_per_period
+    if per_period is not None and (interval != "auto" or time.samples is not None):
+        yield Problem("time.samples_per_period", per_period, "give it, time.sample_interval or time.samples alone")
     if interval == "auto" or not valid("time.sample_interval"):
         return
     if cell:

@@ -373,7 +373,8 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
     """Return the end and the sample interval in s of a lattice of ``cells`` cells under a resolved ``drive``.
 
     The end is a whole number of intervals: a last interval that is shorter would spoil every spectrum. An end in s is
-    kept, and the interval shortened; the end that follows from the wave is moved to the sample before it.
+    kept, and the interval shortened; the end that follows from the wave is moved to the sample before it. Samples that
+    are counted by the period of the drive end with a period.
     """
     end = time.end
     if end == "traverse":
@@ -382,7 +383,13 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
         end = settled + cells / packet_speed(cell, drive)
 
     interval = time.sample_interval
-    if time.samples is not None:
+    if time.samples_per_period is not None:
+        # The drive is resolved, and has a frequency.
+        assert drive.frequency
+        period = 2 * np.pi / drive.frequency
+        interval = period / time.samples_per_period
+        end = max(int(end / period * (1 + WHOLE)), 1) * period
+    elif time.samples is not None:
         # The first sample is at t = 0 and the last at the end.
         interval = end / (time.samples - 1)
     elif interval == "auto":
@@ -395,7 +402,8 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
             end = max(int(count), 1) * interval
         else:
             interval = end / int(np.ceil(count))
-    return time.model_copy(update={"end": float(end), "sample_interval": float(interval), "samples": None})
+    numbers = {"end": float(end), "sample_interval": float(interval)}
+    return time.model_copy(update=numbers | dict.fromkeys(("samples", "samples_per_period")))
 
 
 def _round_down(value: float) -> float:

@@ -312,6 +312,13 @@ class TimeTable(Section):
         unit="s",
     )
     samples: int | None = described("number of samples from 0 to the end, instead of an interval", None, ge=2, le=10**9)
+    samples_per_period: int | None = described(
+        "number of samples in a period of the drive, instead of an interval; the run ends with the last whole period"
+        " before `end`",
+        None,
+        ge=2,
+        le=10**6,
+    )
 
 
 class OutputTable(Section):

@@ -27,6 +27,9 @@ from vipetsc.wording import counted, shortened
 # takes about a second: 0.6 ms a member, 5 us a site.
 MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
+# Ramp of a drive that goes on from the run before, in periods: its force is 0 there and grows to 6e-3 of its amplitude
+# meanwhile. A ramp must be positive.
+SHORT_RAMP = 1e-3
 
 
 class SweepTable(Section):
@@ -40,6 +43,11 @@ class SweepTable(Section):
     fields: bool = described("whether fields and analysis of each run are stored", False)
     ranks: int = described("number of ranks per run", 1, ge=1)
     zip: list[list[str]] = described("groups of keys that vary together", [])
+    follow: Literal["none", "up", "down"] = described(
+        "whether each run begins where the one before it on the last axis ended, upwards or downwards in its values;"
+        " needs `fields`",
+        "none",
+    )
 
 
 @dataclass(frozen=True)
@@ -88,6 +96,9 @@ class Sweep(StudyCase):
             problems.append(Problem("sweep", None, remedy))
 
         axes, wrong = axes_of(values, options.zip)
+        if options.follow != "none" and not options.fields:
+            remedy = "needs the fields of each run, with which the next one begins: set sweep.fields = true"
+            problems.append(Problem("sweep.follow", options.follow, remedy))
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
             wrong.append(
@@ -173,6 +184,29 @@ class Sweep(StudyCase):
             return SweepMember(index=index, case=Case.from_table(table))
         except CaseError as error:
             return SweepMember(index=index, case=None, problems=error.problems)
+
+    def chains(self) -> list[list[int]]:
+        """The numbers of members that follow one another: along the last axis, in the order of its values.
+
+        Without ``follow`` each member is a chain of its own.
+        """
+        numbers = np.arange(self.count).reshape(*self.shape)
+        if self.options.follow == "none":
+            return numbers.reshape(-1, 1).tolist()
+        values = next(iter(self.axes[-1].values()))
+        order = sorted(range(len(values)), key=lambda i: values[i], reverse=self.options.follow == "down")
+        return numbers[..., order].reshape(-1, len(order)).tolist()
+
+    def following(self, number: int, path: str) -> Case:
+        """The case of the member ``number`` that begins with the last state of the run in ``path``.
+
+        Its harmonic drive is on from the beginning, since that of the run before was. Raises CaseError.
+        """
+        case = self.case(number)
+        changes: dict[str, Any] = {"initial": {"kind": "file", "path": path}}
+        if case.drive.ramp is not None and case.drive.frequency:
+            changes["drive"] = {"ramp": SHORT_RAMP * 2 * np.pi / case.drive.frequency}
+        return case.varied(without=["initial"], **changes)
 
     def number(self, name: str) -> int:
         """The number of the member ``name``, or of that number; raises CaseError if there is none."""

@@ -17,6 +17,7 @@ from vipetsc.io.kinds import BRANCHES, SWEEP, ResultKind
 from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
+    from vipetsc.figures.look import Look
     from vipetsc.figures.style import LeftOut
 
 
@@ -47,12 +48,15 @@ def draw_pictures(
     names: list[str] | None = None,
     formats: tuple[str, ...] = ("png",),
     afresh: bool = True,
+    look: "Look | None" = None,
+    records: Sequence[str] = (),
 ) -> list[Path]:
     """Draw the ``pictures`` of ``folders`` on all ranks; results without measures, or newer than these, are measured.
 
     ``names`` are the figures to draw, all by default. Unless ``afresh``, pictures stay that are newer than the files
-    that they show. Returns the files written on rank 0, and an empty list on the others. Raises FolderError for folders
-    that hold nothing to draw, and for a figure that does not exist. Collective.
+    that they show. ``look`` and ``records`` are as for ``figures.registry.draw``. Returns the files written on rank 0,
+    and an empty list on the others. Raises FolderError for folders that hold nothing to draw, and for a figure that
+    does not exist. Collective.
     """
     on_root(comm, lambda: prepare(pictures, folders, names))
     # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
@@ -70,7 +74,17 @@ def draw_pictures(
         # Pictures are listed by falling duration, so that ranks which take them in turn end at about the same time.
         turns = count(comm.rank, comm.size)
         with reading(pictures, folders):
-            return draw(pictures.kind.source, folders, names, formats, newest=newest, turns=turns, left_out=left_out)
+            return draw(
+                pictures.kind.source,
+                folders,
+                names,
+                formats,
+                newest=newest,
+                turns=turns,
+                left_out=left_out,
+                look=look,
+                records=records,
+            )
 
     drawn_here = on_every_rank(comm, draw_part)
 

@@ -181,7 +181,7 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
     """Draw ``curves`` over ``x``, without lines over categories, and a ring at the position and value of ``ring``."""
     # A case may have the values of a key in any order.
     order = np.argsort(x.positions, kind="stable")
-    for curve in curves:
+    for place, curve in enumerate(curves):
         shift = 0.0
         line = "-"
         if not x.is_number:
@@ -190,7 +190,9 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
             shift = 0.12 * (curve.number - 0.5 * (len(curves) - 1))
             line = ""
         positions = x.positions[order] + shift
-        axes.plot(positions, curve.values[order], label=curve.label, **curve.look | {"ls": line})
+        # Thinner from curve to curve: those that coincide are seen under one another.
+        look = curve.look | {"ls": line, "lw": 0.9 + 0.7 * (len(curves) - 1 - place)}
+        axes.plot(positions, curve.values[order], label=curve.label, **look)
         if curve.band:
             _draw_band(axes, x, positions, *(end[order] for end in curve.band), colour=curve.look["color"])
         # Of the curves the ring belongs to the one that has this value.
@@ -244,7 +246,9 @@ def draw_maps(
         # The ground shows where values are missing.
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
         edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
-        image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)
+        # Values of both signs have the two sides of a diverging map, white at 0.
+        cmap = "RdBu_r" if norm.vmin == -norm.vmax else "viridis"
+        image = axes.pcolormesh(*edges, values, norm=norm, cmap=cmap, rasterized=True)
         _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm, most_contours)
         label_positions(axes.yaxis, y, PANEL_HEIGHT)
         if common:
@@ -271,6 +275,8 @@ def _norm(values: np.ndarray) -> Normalize:
     high = float(finite.max())
     if low > 0 and high > LOG_RATIO * low:
         return LogNorm(low, high)
+    if low < 0 < high:
+        return Normalize(-max(-low, high), max(-low, high))
     # A field of one value still needs a scale.
     if high == low:
         high = low + 1
@@ -289,8 +295,9 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
     levels = [level for level in locator.tick_values(norm.vmin, norm.vmax) if finite.min() < level < finite.max()]
     if not levels:
         return
-    # The map is dark up to about 0.6 of its scale.
-    colours = ["white" if norm(level) < 0.6 else "black" for level in levels]
+    # The map is dark up to about 0.6 of its scale; a diverging one at both ends.
+    is_diverging = norm.vmin == -norm.vmax
+    colours = ["white" if norm(level) < (0.15 if is_diverging else 0.6) else "black" for level in levels]
     lines = axes.contour(x, y, np.ma.masked_invalid(values), levels=levels, colors=colours, linewidths=0.6)
     axes.clabel(lines, fmt="%.3g", fontsize=6)
 

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
@@ -167,6 +168,7 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
         position = plan.space.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
         variables.plot(position, np.arange(len(position)) + 0.12 * i, marker, color=colour, ms=3.5)
     sites.set(xlabel="Cell", ylabel="Clearance (mm)", ylim=(0, None), title="Sites")
+    sites.xaxis.set_major_locator(MaxNLocator(integer=True))
     sites.legend(loc="best")
 
     names = optimum["variable"].values

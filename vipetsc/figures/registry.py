@@ -23,19 +23,22 @@ from vipetsc.figures import (
     modal,
     nfrc,
     optimum,
+    points,
     predicted_energies,
     response_family,
     response_outputs,
     runs,
     scattering,
     schematics,
+    sections,
     transfer,
     transfer_curves,
     wavenumber_bins,
 )
+from vipetsc.figures.look import Look
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.style import Drawing, LeftOut, Shown, draw_each, rc_style, save
-from vipetsc.figures.sweep_members import Files, Sweeps, table
+from vipetsc.figures.sweep_members import Files, Sweeps, in_file_name, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
 from vipetsc.io.errors import ResultFileError
@@ -62,7 +65,10 @@ class FigureSpec(NamedTuple):
         What results must hold, for a figure that few results have: nothing is said where they do not hold it, unless
         the figure is asked for.
     together
-        Whether one picture shows all branches of all folders.
+        Whether one picture shows all branches, or runs, of all folders. The function of such a figure of runs is
+        (runs, records) -> Figure.
+    on_request
+        Whether it is drawn only if it is asked for.
     """
 
     name: str
@@ -71,6 +77,7 @@ class FigureSpec(NamedTuple):
     measure: str = ""
     needs: str = ""
     together: bool = False
+    on_request: bool = False
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -113,6 +120,7 @@ RUN_NEEDS = (
 # What sweeps must hold for a figure.
 WHOLE_MEMBERS = "members with their fields ([sweep] fields = true), contact sites and a band above the driven one"
 THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three values of drive.amplitude"
+POINTS_KEPT = "one swept number, members with their fields ([sweep] fields = true), points and time.samples_per_period"
 BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
 _SPECS = (
@@ -124,6 +132,12 @@ _SPECS = (
     FigureSpec("unit_cell", RUN, schematics.unit_cell),
     FigureSpec("impacts", RUN, impact_panels.impacts),
     FigureSpec("ledger", RUN, runs.ledger),
+    *(
+        FigureSpec(name, RUN, draw, needs="[output] points", together=True, on_request=name != "points")
+        for name, draw in points.FIGURES.items()
+    ),
+    FigureSpec("poincare", RUN, sections.poincare, needs="[output] points and time.samples_per_period"),
+    FigureSpec("bifurcation", SWEEP, sections.bifurcation, needs=POINTS_KEPT),
     FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("partition", SWEEP, wavenumber_bins.partition, measure="entropy", needs=THREE_AMPLITUDES),
@@ -178,7 +192,8 @@ def figure_names(
                 ensemble = opened.get(folder, open_ensemble)
                 measures |= {measure_pages.figure_name(name): name for name in measure_pages.measures_of(ensemble)}
     if names is None:
-        return [*(name for name in measures if not measure_pages.is_on_request(measures[name])), *specified]
+        shown = [name for name in measures if not measure_pages.is_on_request(measures[name])]
+        return [*shown, *(name for name in specified if name not in FIGURES or not FIGURES[name].on_request)]
 
     valid = [*measures, *specified]
     for name in names:
@@ -214,6 +229,8 @@ def draw(
     omit: Collection[str] = (),
     files: Files | None = None,
     left_out: LeftOut | None = None,
+    look: Look | None = None,
+    records: Sequence[str] = (),
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; return the files, each complete.
 
@@ -221,8 +238,8 @@ def draw(
     ----------
     source
         Contents of the folders, a name in ``vipetsc.io.kinds``: "sweep" (perhaps with folders of branches), "branches"
-        (those of one name side by side); of one folder "run", "design", "optimum", "identification", "law" or
-        "prediction".
+        (those of one name side by side), "run" (of several those figures that show them together); of one folder
+        "design", "optimum", "identification", "law" or "prediction".
     names
         Figures, and of sweeps measures; by default all figures, and the measures that most readers look at.
     turns
@@ -235,6 +252,10 @@ def draw(
         Results that the caller has opened and will close.
     left_out
         Gets the reasons of pictures that have nothing to show.
+    look
+        What a user asks of all pictures.
+    records
+        Records of named points to draw over runs, FILE or FILE:COLUMN=POINT.
 
     Raises
     ------
@@ -249,16 +270,17 @@ def draw(
     def keep(path: Path) -> bool:
         return newest is not None and path.exists() and path.stat().st_mtime >= newest
 
-    with rc_style(), Files() as opened_here:
+    with rc_style(look.style if look else None), Files() as opened_here:
         opened = opened_here if files is None else files
         with opened.naming_spoilt():
             return draw_each(
-                drawings(source, folders, opened, names, omit),
+                drawings(source, folders, opened, names, omit, records),
                 target=folders[0] / "figures",
                 formats=formats,
                 turns=itertools.count() if turns is None else turns,
                 keep=keep,
                 left_out=left_out,
+                look=look,
             )
 
 
@@ -270,7 +292,12 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 
 
 def drawings(
-    source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None, omit: Collection[str] = ()
+    source: str,
+    folders: Sequence[Path],
+    files: Files,
+    names: Sequence[str] | None = None,
+    omit: Collection[str] = (),
+    records: Sequence[str] = (),
 ) -> Iterator[Drawing]:
     """Return the drawings that ``draw`` draws with these arguments, in its order.
 
@@ -285,7 +312,7 @@ def drawings(
     if source == BRANCHES.source:
         return _branch_drawings(specs, folders, files)
     if source == RUN.source:
-        return _run_drawings(specs, folders[0], files)
+        return _run_drawings(specs, folders, files, records)
     return _file_drawings(specs, folders[0], files)
 
 
@@ -414,12 +441,30 @@ def every_branch(folders: Sequence[Path], files: Files) -> list[Path]:
     return [path for path in paths if has_points(open_branch(path, files))]
 
 
-def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
-    """Yield every figure that the run in ``folder`` has, whose analysis may be missing."""
-    run, analysis = run_and_analysis(folder, files)
-    results = [run] if analysis is None else [run, analysis]
+def _run_drawings(
+    specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files, records: Sequence[str]
+) -> Iterator[Drawing]:
+    """Yield every figure of the runs in ``folders``, whose analyses may be missing: of several runs, those of all."""
+    opened = [run_and_analysis(folder, files) for folder in folders]
+    names = [folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    if len(folders) == 1:
+        names = [""]
+    shown = [
+        Shown(name, [run] if analysis is None else [run, analysis])
+        for name, (run, analysis) in zip(names, opened, strict=True)
+    ]
+
     for spec in specs:
-        yield Drawing(spec.name, warned(partial(spec.function, run, analysis), [Shown("", results)]))
+        # The picture of several runs lies beside that of the first one.
+        stem = in_file_name("-".join([spec.name, *filter(None, names[1:])]))
+        if spec.together:
+            yield Drawing(stem, warned(partial(spec.function, shown, records), shown), figure=spec.name)
+        elif len(folders) == 1:
+            yield Drawing(stem, warned(partial(spec.function, *opened[0]), shown))
+        elif len(specs) == 1:
+            yield Drawing.without_picture(spec.name, "it shows one run; give one folder")
 
 
 def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:

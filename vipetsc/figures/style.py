@@ -17,6 +17,7 @@ from matplotlib.transforms import Bbox
 
 from vipetsc.figures.layout import apply_aspects, lay_out, without_engine
 from vipetsc.figures.log_ticks import label_log_axes
+from vipetsc.figures.look import Look
 from vipetsc.figures.prefixed_units import prefix_units
 from vipetsc.io.atomic import atomic_write
 
@@ -127,9 +128,17 @@ def band_number(part: str) -> int | None:
 
 
 @contextmanager
-def rc_style() -> Iterator[None]:
-    """Make and save figures in the house style within the block; then matplotlib's settings are as before."""
+def rc_style(style: str | None = None) -> Iterator[None]:
+    """Make and save figures in the house style within the block; then matplotlib's settings are as before.
+
+    What a user's ``matplotlibrc`` says has precedence over the house, and the file ``style`` over both.
+    """
     with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")):
+        own = mpl.rc_params_from_file(mpl.matplotlib_fname(), use_default_template=False)
+        # Where a user has no such file it is that of matplotlib, whose settings are the defaults.
+        mpl.rcParams.update({key: value for key, value in own.items() if value != mpl.rcParamsDefault[key]})
+        if style:
+            mpl.rcParams.update(mpl.rc_params_from_file(style, use_default_template=False))
         yield
 
 
@@ -211,6 +220,7 @@ def draw_each(
     note: str = "",
     keep: Callable[[Path], bool] = lambda path: False,
     left_out: LeftOut | None = None,
+    look: Look | None = None,
 ) -> list[Path]:
     """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``; return the files.
 
@@ -226,6 +236,8 @@ def draw_each(
         Whether the file at a path is to stay as it is.
     left_out
         Gets the reasons of pictures that have nothing to show.
+    look
+        What a user asks of all pictures.
     """
     if left_out is None:
         left_out = LeftOut()
@@ -241,6 +253,8 @@ def draw_each(
             if not all(keep(path) for path in paths):
                 sys.audit("vipetsc.draw", drawing.stem)
                 figure = drawing.draw()
+                if look:
+                    look.apply(figure)
                 written += [save(figure, path, note) for path in paths]
             left_out.drawn.add(name)
         except NoPicture as none:

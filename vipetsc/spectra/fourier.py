@@ -181,3 +181,28 @@ def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.nda
     step = frequency[1] - frequency[0]
     refined = frequency[peak[energetic]] + np.clip(offset, -0.5, 0.5) * step
     return spectrum.wavenumber[energetic], refined
+
+
+def amplitude_spectrum(values: np.ndarray, interval: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frequencies (k,) in rad/s and amplitudes (k,) of even samples (t,) at an ``interval`` in s.
+
+    A sine of amplitude a at one of the frequencies has a peak of the height a, and of .85 a or more between them: the
+    samples are weighted by Hann's window.
+    """
+    window = np.hanning(len(values) + 2)[1:-1]
+    amplitude = 2 * np.abs(fft.rfft(values * window)) / window.sum()
+    amplitude[0] /= 2
+    return 2 * np.pi * fft.rfftfreq(len(values), interval), amplitude
+
+
+def spectrogram(values: np.ndarray, interval: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times (m,) in s from the first sample, frequencies (k,) in rad/s, and amplitudes (m, k) about each time.
+
+    Each is an ``amplitude_spectrum`` of about twice the root of the number of samples (t,), which resolves time and
+    frequency equally well; neighbouring ones share three quarters of these.
+    """
+    length = min(len(values), max(8, 4 * round(np.sqrt(len(values)) / 2)))
+    begins = np.arange(0, len(values) - length + 1, max(1, length // 4))
+    rows = [amplitude_spectrum(values[begin : begin + length], interval) for begin in begins]
+    amplitudes = np.stack([amplitude for _, amplitude in rows])
+    return (begins + 0.5 * length) * interval, rows[0][0], amplitudes

@@ -179,7 +179,7 @@ class RecordedRuns:
             on_root(self.team, lambda: append(key, timed))
 
         def append(key: Key, record: Record) -> None:
-            whole = self._append(key, record, kind)
+            whole = self.append(key, record, kind)
             if keep:
                 recorded[key] = whole
 
@@ -193,7 +193,7 @@ class RecordedRuns:
             self.records |= records
         return done
 
-    def _append(self, key: Key, record: Record, kind: str) -> Record:
+    def append(self, key: Key, record: Record, kind: str) -> Record:
         """Append the ``record`` of ``key`` to this rank's file; returns it with its key, its kind and the version."""
         whole = {"kind": kind, "key": key, "source": source_key()} | record
         self.file.append(whole)
@@ -204,7 +204,7 @@ class RecordedRuns:
 
         All ranks of the team must call it. Raises OSError on all if the disk is full.
         """
-        on_root(self.team, lambda: self._append(key, record, kind))
+        on_root(self.team, lambda: self.append(key, record, kind))
 
     def simulate(self, case: Case, output: RunOutput) -> Result:
         """Run ``case`` on all ranks of the team into ``output``.

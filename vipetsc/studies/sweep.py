@@ -192,7 +192,10 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     needed, runs.linear = on_root(comm, look)
     runs.make_linear(needed)
     order = on_root(comm, lambda: surveys[0].order(runs.linear))
-    computed = runs.make_members(order, progress)
+    if plan.options.follow == "none":
+        computed = runs.make_members(order, progress)
+    else:
+        computed = runs.make_chains(order, progress)
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(runs.recorded.pool.busy / seconds))
@@ -297,7 +300,11 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
         case = plan.member(number).case
         if case:
             drawn.append(DrawnMember(number, case, linear_name(case)))
-    return _Survey(results=results, missing=missing, drawn=drawn, needed=_needed_runs(plan, results, drawn), lost=lost)
+    needed: dict[str, NeededRun] = {}
+    # Members that follow one another are not scaled from linear runs.
+    if plan.options.follow == "none":
+        needed = _needed_runs(plan, results, drawn)
+    return _Survey(results=results, missing=missing, drawn=drawn, needed=needed, lost=lost)
 
 
 def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:

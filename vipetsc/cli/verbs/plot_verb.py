@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -18,10 +18,15 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import RUN
 from vipetsc.parallel import StopRequest, on_root
 
+if TYPE_CHECKING:
+    from vipetsc.figures.look import Look
+
 NARROWEST = 320  # pixels, at which the type can still be read
 WIDEST = 3840  # pixels of the largest screens
 FASTEST = 50.0  # frames per second of a GIF, which counts hundredths of a second: viewers slow down shorter frames
 MOVIE_FORMATS = "gif", "mp4"
+LENGTHS = {"mm": 1 / 25.4, "cm": 1 / 2.54, "in": 1.0, "pt": 1 / 72}  # in inches
+PAGE_WIDTHS = 1.0, 40.0  # of a picture, in inches
 
 
 def positive(text: str) -> float:
@@ -41,6 +46,35 @@ def window(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
+def width(text: str) -> int | float:
+    """The width in ``text``: an integer, of pixels of a movie, or with a unit inches of a picture, a float.
+
+    Raises ArgumentTypeError for another text.
+    """
+    if text.isdigit():
+        return int(text)
+    unit = text[-2:]
+    narrowest, widest = PAGE_WIDTHS
+    try:
+        inches = float(text[:-2]) * LENGTHS[unit]
+    except (KeyError, ValueError):
+        inches = 0.0
+    if not narrowest <= inches <= widest:
+        raise argparse.ArgumentTypeError(
+            f"{text} is neither a width with a unit, such as 86mm (1in to 40in; {', '.join(LENGTHS)}), nor pixels of a"
+            " movie"
+        )
+    return inches
+
+
+def label(text: str) -> tuple[str, str]:
+    """The key and the text of ``KEY=TEXT``; raises ArgumentTypeError for another text."""
+    key, separator, value = text.partition("=")
+    if not (key and separator):
+        raise argparse.ArgumentTypeError(f'{text} is not of the form KEY=TEXT, as in drive.amplitude="Force"')
+    return key, value
+
+
 # Arguments of movies, by the field of `figures.movie_frames.Shot` that each of them sets.
 MOVIE_ARGUMENTS: dict[str, Argument] = {
     "speed": argument(
@@ -53,7 +87,27 @@ MOVIE_ARGUMENTS: dict[str, Argument] = {
     "stop": argument("--to", type=float, metavar="T", dest="stop", help="movie: last time in s"),
     "cells": argument("--cells", type=window, metavar="A:B", help="movie: first and last cell"),
     "rate": argument("--rate", type=positive, metavar="N", help="movie: frames per second; default: 15"),
-    "width": argument("--width", type=int, metavar="PIXELS", help="movie: width in pixels; default: 960"),
+    "width": argument(
+        "--width", type=width, metavar="WIDTH", help="width of pictures, as 86mm; of a movie in pixels, by default 960"
+    ),
+}
+# Arguments of pictures alone, by the field of `figures.look.Look` that each of them sets.
+LOOK_ARGUMENTS: dict[str, Argument] = {
+    "style": argument("--style", metavar="FILE", help="matplotlib style (.mplstyle), on top of the house style"),
+    "unit": argument("--unit", choices=("Hz", "rad/s"), default="", help="unit of all frequencies in pictures"),
+    "decibels": argument(
+        "--db", action="store_true", dest="decibels", help="logarithmic axes of amplitudes and energies in dB"
+    ),
+    "labels": argument(
+        "--label",
+        action="append",
+        type=label,
+        default=[],
+        dest="labels",
+        metavar="KEY=TEXT",
+        help="write TEXT in place of a key or of another text; may be repeated",
+    ),
+    "titles": argument("--no-title", action="store_false", dest="titles", help="no headings and titles of panels"),
 }
 
 
@@ -67,11 +121,14 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     on_root(comm, lambda: remove_abandoned(folders[0] / "figures"))
     formats = set(options.format or ())
     movie_options = {name: getattr(options, name) for name in MOVIE_ARGUMENTS if getattr(options, name) is not None}
+    is_page_width = isinstance(movie_options.get("width"), float)
 
     if options.movie:
         unsuitable = sorted(formats - {*MOVIE_FORMATS})
         if options.fig:
             unsuitable.append("--fig")
+        if is_page_width:
+            unsuitable.append("a width in mm, cm, in or pt; give pixels")
         if unsuitable:
             raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {unsuitable[0]}")
         # On rank 0 alone: all frames go into one file, in their order.
@@ -81,13 +138,35 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
             echo(comm, f"vipetsc: {missing}", sys.stderr)
         return DONE
 
+    if is_page_width:
+        del movie_options["width"]
     misplaced = [MOVIE_ARGUMENTS[name].flag for name in movie_options]
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
         raise FolderError(f"{misplaced[0]}: applies only to movies; add --movie")
-    drawn = draw_pictures(pictures, folders, comm, options.fig, formats=tuple(options.format or ("png",)))
+    if options.record and pictures.kind != RUN:
+        raise FolderError("--record: applies only to pictures of runs, as --fig points")
+    names = options.fig or (["points"] if options.record else None)
+    formats_asked = tuple(options.format or ("png",))
+    look = on_root(comm, lambda: look_of(options))
+    drawn = draw_pictures(pictures, folders, comm, names, formats_asked, look=look, records=options.record)
     echo_paths(comm, drawn)
     return DONE
+
+
+def look_of(options: argparse.Namespace) -> "Look":
+    """The look of pictures that the options ask for, on one rank; raises FolderError for a style that is not one."""
+    import matplotlib as mpl
+
+    from vipetsc.figures.look import Look
+
+    if options.style:
+        try:
+            mpl.rc_params_from_file(options.style, use_default_template=False)
+        except (OSError, ValueError) as error:
+            raise FolderError(f"--style {options.style}: {error}") from None
+    width_asked = options.width if isinstance(options.width, float) else None
+    return Look(options.style, width_asked, options.unit, options.decibels, dict(options.labels), options.titles)
 
 
 def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
@@ -113,7 +192,9 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
             return pictures, folders
 
     if len(folders) > 1:
-        raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can be drawn on one page")
+        raise FolderError(
+            f"{' '.join(map(str, paths))}: only runs, or sweeps and folders of branches, can be drawn on one page"
+        )
     return by_source["run"], folders
 
 
@@ -181,14 +262,14 @@ VERB = PlainVerb(
             type=Path,
             nargs="+",
             metavar="PATH",
-            help="folder of results, or the file in it, such as run.h5 or law.h5; several folders may hold sweeps and"
-            " branches, which then share pages",
+            help="folder of results, or the file in it, such as run.h5 or law.h5; several folders may hold runs, or"
+            " sweeps and branches, which then share pages",
         ),
         argument("--fig", action="append", metavar="NAME", help="draw only this figure; may be repeated"),
         argument(
             "--format",
             action="append",
-            choices=("png", "pdf", "gif", "mp4"),
+            choices=("png", "pdf", "svg", "gif", "mp4"),
             help="default: png; for movies gif and, if ffmpeg is installed, mp4; may be repeated",
         ),
         argument(
@@ -198,6 +279,14 @@ VERB = PlainVerb(
             const="energy",
             help="make a movie of a run: energy of the bands by cell, or velocity of the host masses",
         ),
+        argument(
+            "--record",
+            action="append",
+            default=[],
+            metavar="FILE[:COLUMN=POINT]",
+            help="draw a measured record over the points of a run; may be repeated",
+        ),
+        *LOOK_ARGUMENTS.values(),
         *MOVIE_ARGUMENTS.values(),
     ),
     function=plot,

@@ -264,14 +264,19 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
 
 
 def measure_where_missing(folders: Sequence[Path]) -> None:
-    """Check that the only one of ``folders`` holds a finished run, and measure the run if its measures are missing.
+    """Check that each of ``folders`` holds a finished run, and measure the runs whose measures are missing.
 
     Measures that are older than the run count as missing. Raises FolderError if there is no run, or none that can be
     read.
     """
+    for folder in folders:
+        _measure_where_missing(folder)
+
+
+def _measure_where_missing(folder: Path) -> None:
+    """Measure the run in ``folder`` if its measures are missing; raises as ``measure_where_missing``."""
     from vipetsc.studies.analysis_options import is_measured
 
-    (folder,) = folders
     run = folder / "run.h5"
     if not run.exists():
         raise FolderError(f"{folder}: contains no run.h5; give the folder of a finished run")
@@ -289,7 +294,12 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         measure_run(folder)
 
 
-PICTURES = Pictures(RUN, prepare=measure_where_missing)
+def hold_runs(folders: Sequence[Path]) -> bool:
+    """Whether each of ``folders`` holds a finished run."""
+    return all((folder / RUN.file).exists() for folder in folders)
+
+
+PICTURES = Pictures(RUN, prepare=measure_where_missing, recognise=hold_runs)
 VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",

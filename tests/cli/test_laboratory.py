@@ -1,0 +1,64 @@
+"""Tasks of a laboratory as they are typed from the manual: pictures of points with records, pictures for a thesis."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+
+CASE = """
+[lattice]
+cells = 20
+
+[drive]
+cycles = 4
+
+[time]
+engine = "propagator"
+end = 0.04
+
+[output]
+figures = false
+points = [{ name = "near", cell = 5 }, { name = "tip", cell = 15 }]
+"""
+
+
+@pytest.fixture
+def typed(in_process, tmp_path):
+    """Call the program in a temporary folder: ``typed("plot a --fig points")`` returns how it ended."""
+
+    def call(line: str):
+        return in_process(*shlex.split(line), cwd=tmp_path)
+
+    return call
+
+
+def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_path):
+    """Two runs share a page with a record; SVG has the words that were asked for, and no title."""
+    (tmp_path / "x.toml").write_text(CASE, encoding="utf-8")
+    for name, amplitude in (("a", 1.0), ("b", 2.0)):
+        assert typed(f"run x.toml --out {name} --set drive.amplitude={amplitude}").returncode == 0
+    assert typed("export a").returncode == 0
+    (tmp_path / "x.mplstyle").write_text("svg.fonttype: none\naxes.linewidth: 2.5\n", encoding="utf-8")
+    look = '--format svg --width 86mm --unit Hz --no-title --style x.mplstyle --label "Time (s)=t (s)"'
+    ended = typed(f"plot b a --fig points --record a/curves/run-points.csv {look}")
+    assert ended.returncode == 0, ended.stderr
+
+    picture = (tmp_path / "b/figures/points-a.svg").read_text(encoding="utf-8")
+    assert 'width="243' in picture  # 86 mm in pt
+    words = re.findall(r">([^<>\n]+)</text>", picture)
+    assert {"t (s)", "Frequency f (Hz)", "run-points.csv", "(a.i)"} <= set(words)
+    assert not any("rad/s" in word or "History" in word for word in words)
+    assert "stroke-width: 2.5" in picture
+
+    for wrong, telling in (
+        ("--fig points --record x.toml", "x.toml"),
+        ("--fig points --record a/curves/run-points.csv:2=top", "points are near, tip"),
+        ("--fig ledger", "one run"),
+        ("--style none.mplstyle", "--style"),
+        ("--movie --width 86mm", "pixels"),
+    ):
+        ended = typed(f"plot a b {wrong}")
+        assert ended.returncode == 2, wrong
+        assert telling in ended.stderr
