@@ -46,6 +46,8 @@ NOT_TYPED = {
     "paper": "minutes; tests/cli/test_paper.py makes it in small",
     "measurements": "a quarter of an hour; tests/cli/test_bench.py runs the bench in small",
     "trust": "hours; tests/faults meets every phase once",
+    "sweeps": "half a minute of CPU; tests/verify/test_sections.py has such sweeps in small",
+    "read-pictures": "tests/cli/test_laboratory.py draws with these options",
     "extend": "tests/cli/test_plugins.py runs its modules; its verb is called below",
 }
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 from itertools import pairwise
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
