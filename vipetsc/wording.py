@@ -59,8 +59,7 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
 
 def key_name(path: str) -> str:
     """Return the words for the ``path`` of a key of a case: "Drive amplitude" for "drive.amplitude"."""
-    words = path.replace("contacts.", "contact.").replace("_", " ").split(".")
-    text = " ".join(words)
+    text = path.replace("contacts.", "contact.").replace("_", " ").replace(".", " ")
     return text[:1].upper() + text[1:]
 
 

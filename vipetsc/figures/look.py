@@ -154,8 +154,8 @@ def _remove_titles(figure: Figure) -> None:
         part.suptitle("")
     for axes in figure.get_axes():
         for place in ("left", "center", "right"):
-            letter = LETTER_OF_PANEL.match(axes.get_title(place))
-            axes.set_title(letter[0] if letter else "", loc=place)
+            tag = LETTER_OF_PANEL.match(axes.get_title(place))
+            axes.set_title(tag[0] if tag else "", loc=place)
 
 
 def _replace_texts(figure: Figure, change: Callable[[str], str]) -> None:

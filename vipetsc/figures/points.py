@@ -24,7 +24,7 @@ DECADES = 4  # of amplitudes in a spectrum, below its largest
 QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 
 
-class Record(NamedTuple):
+class PointRecord(NamedTuple):
     """A record over a run: ``values`` (sample,) of the ``point`` at ``time`` (sample,) in s, ``name`` in the legend."""
 
     name: str
@@ -33,7 +33,7 @@ class Record(NamedTuple):
     values: np.ndarray
 
 
-class Line(NamedTuple):
+class PointCurve(NamedTuple):
     """A curve of a panel: even ``time`` (sample,) in s, ``values`` (sample,), its look."""
 
     time: np.ndarray
@@ -89,7 +89,9 @@ FIGURES: dict[str, Callable[..., Figure]] = {
 }
 
 
-def _lines(runs: Sequence[tuple[str, xr.Dataset]], records: Sequence[Record], point: str, variable: str) -> list[Line]:
+def _lines(
+    runs: Sequence[tuple[str, xr.Dataset]], records: Sequence[PointRecord], point: str, variable: str
+) -> list[PointCurve]:
     """Return the curves of a ``point`` of the ``runs``, then of the ``records``, which lie over them."""
     lines = []
     for number, (name, run) in enumerate(runs):
@@ -97,11 +99,11 @@ def _lines(runs: Sequence[tuple[str, xr.Dataset]], records: Sequence[Record], po
         width = 0.6 + 1.4 * (len(runs) - 1 - number) / max(len(runs), 2)
         look = {"color": style.BAND_COLOURS[number % 6], "lw": width, "label": name or "run"}
         values = run[variable].sel(point=point).values
-        lines.append(Line(run["time"].values, values, look))
+        lines.append(PointCurve(run["time"].values, values, look))
     for record in records:
         if record.point == point:
             look = {"color": style.BLACK, "lw": 0.6, "ls": style.DASHED, "label": record.name}
-            lines.append(Line(record.time, record.values, look))
+            lines.append(PointCurve(record.time, record.values, look))
     return lines
 
 
@@ -112,14 +114,14 @@ def _frequency_unit(time: np.ndarray) -> tuple[float, str]:
     return 1e3, panels.OMEGA
 
 
-def _draw_history(axes: Axes, lines: Sequence[Line], label: str) -> None:
+def _draw_history(axes: Axes, lines: Sequence[PointCurve], label: str) -> None:
     """Draw ``lines`` over time, as long as the run lasts."""
     for line in lines:
         axes.plot(line.time, line.values, **line.look, rasterized=True)
     axes.set(xlabel="Time (s)", ylabel=label, xlim=lines[0].time[[0, -1]])
 
 
-def _draw_spectrum(axes: Axes, lines: Sequence[Line], label: str, unit: tuple[float, str]) -> None:
+def _draw_spectrum(axes: Axes, lines: Sequence[PointCurve], label: str, unit: tuple[float, str]) -> None:
     """Draw the amplitudes of ``lines`` over the frequency in ``unit``, up to where the first one's leave the scale."""
     top = 0.0
     for line in lines:
@@ -134,7 +136,7 @@ def _draw_spectrum(axes: Axes, lines: Sequence[Line], label: str, unit: tuple[fl
     axes.set_xlim(0, min(1.1 * last, frequency[-1]) / unit[0])
 
 
-def _draw_spectrogram(axes: Axes, line: Line, label: str, unit: tuple[float, str]) -> None:
+def _draw_spectrogram(axes: Axes, line: PointCurve, label: str, unit: tuple[float, str]) -> None:
     """Draw a map of amplitudes over time and frequency in ``unit``."""
     time, frequency, amplitude = spectrogram(line.values, line.time[1] - line.time[0])
     norm = panels.log_norm(amplitude, decades=DECADES)
@@ -145,7 +147,7 @@ def _draw_spectrogram(axes: Axes, line: Line, label: str, unit: tuple[float, str
     panels.colour_bar(image, axes, label)
 
 
-def read_records(text: str, names: Sequence[str], quantity: str) -> list[Record]:
+def read_records(text: str, names: Sequence[str], quantity: str) -> list[PointRecord]:
     """Return the records in a file over points ``names``; ``text`` is FILE or FILE:COLUMN=POINT.
 
     Of FILE the columns are taken whose names begin with that of a point, as in the tables of ``export``: a word about
@@ -178,4 +180,6 @@ def read_records(text: str, names: Sequence[str], quantity: str) -> list[Record]
     except MeasuredError as error:
         raise NoPicture(f"--record {file}: {error.key}: {error.remedy}") from None
     stem = Path(file).name
-    return [Record(stem, point, read.times, values) for (_, point), values in zip(wanted, read.values.T, strict=True)]
+    return [
+        PointRecord(stem, point, read.times, values) for (_, point), values in zip(wanted, read.values.T, strict=True)
+    ]

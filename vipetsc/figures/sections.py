@@ -24,7 +24,7 @@ MOST_POINTS = 4  # panels of a page; a note says that there are more
 WHOLE = 1e-5
 
 
-class Section(NamedTuple):
+class PeriodicStates(NamedTuple):
     """States of a point once a period, after the transient: ``displacement`` in m and ``velocity`` in m/s (period,)."""
 
     point: str
@@ -32,7 +32,7 @@ class Section(NamedTuple):
     velocity: np.ndarray
 
 
-def sections_of(run: xr.Dataset) -> list[Section]:
+def sections_of(run: xr.Dataset) -> list[PeriodicStates]:
     """Return the sections of all named points of a ``run``; raise NoPicture where it has none."""
     if "points/displacement" not in run:
         raise NoPicture("needs named points, which the case has not ([output] points)")
@@ -50,7 +50,7 @@ def sections_of(run: xr.Dataset) -> list[Section]:
     last = (len(time) - 1) // every * every
     rows = last - every * np.arange(count)[::-1]
     return [
-        Section(str(point), run["points/displacement"].values[rows, i], run["points/velocity"].values[rows, i])
+        PeriodicStates(str(point), run["points/displacement"].values[rows, i], run["points/velocity"].values[rows, i])
         for i, point in enumerate(run["point"].values)
     ]
 
@@ -72,7 +72,7 @@ def poincare(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     return figure
 
 
-class Branch(NamedTuple):
+class SweptStates(NamedTuple):
     """Members of one sweep along its axis ``key``: values of it (dot,) and displacements (dot,) in m by point."""
 
     key: SweptKey
@@ -92,7 +92,7 @@ LOOKS = {
 
 def bifurcation(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer the displacement of each named point once a period over the swept key, of all sweeps over that key."""
-    branches: dict[str, list[Branch]] = {}
+    branches: dict[str, list[SweptStates]] = {}
     for ensemble in sweeps:
         branch = _branch_of(ensemble, sweeps)
         if branch is not None:
@@ -101,7 +101,7 @@ def bifurcation(sweeps: Sweeps) -> Iterator[Drawing]:
         yield Drawing("" if len(branches) == 1 else path, lambda along=along: _draw_bifurcation(along))  # type: ignore[misc]
 
 
-def _branch_of(ensemble: xr.Dataset, sweeps: Sweeps) -> Branch | None:
+def _branch_of(ensemble: xr.Dataset, sweeps: Sweeps) -> SweptStates | None:
     """Return the sections of the members of a sweep over one number; None if it is another, or keeps no points."""
     axes = SweptAxis.all_of(ensemble)
     if len(axes) != 1 or axes[0].first_number is None:
@@ -123,10 +123,10 @@ def _branch_of(ensemble: xr.Dataset, sweeps: Sweeps) -> Branch | None:
         return None
     options = tomllib.loads(ensemble.attrs["case"])["sweep"]
     whole = {point: np.concatenate(parts) for point, parts in displacement.items()}
-    return Branch(axes[0].first_number, options.get("follow", "none"), np.concatenate(values), whole)
+    return SweptStates(axes[0].first_number, options.get("follow", "none"), np.concatenate(values), whole)
 
 
-def _draw_bifurcation(branches: list[Branch]) -> Figure:
+def _draw_bifurcation(branches: list[SweptStates]) -> Figure:
     """Draw ``branches`` over one key, a row for each point."""
     points = list(branches[0].displacement)[:MOST_POINTS]
     figure = style.new_figure(style.PAGE, 2.2 * len(points) + 0.3)

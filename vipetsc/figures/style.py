@@ -134,9 +134,9 @@ def rc_style(style: str | None = None) -> Iterator[None]:
     What a user's ``matplotlibrc`` says has precedence over the house, and the file ``style`` over both.
     """
     with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")):
-        own = mpl.rc_params_from_file(mpl.matplotlib_fname(), use_default_template=False)
+        settings = mpl.rc_params_from_file(mpl.matplotlib_fname(), use_default_template=False)
         # Where a user has no such file it is that of matplotlib, whose settings are the defaults.
-        mpl.rcParams.update({key: value for key, value in own.items() if value != mpl.rcParamsDefault[key]})
+        mpl.rcParams.update({key: value for key, value in settings.items() if value != mpl.rcParamsDefault[key]})
         if style:
             mpl.rcParams.update(mpl.rc_params_from_file(style, use_default_template=False))
         yield
