@@ -34,6 +34,7 @@ class Unit(NamedTuple):
 UNITS: Mapping[str, tuple[Unit, ...]] = {
     "Hz": (
         Unit(re.compile(r"ω \(krad/s\)"), "f (Hz)", 1e3 / (2 * np.pi)),
+        Unit(re.compile(r"ω \(rad/s\)"), "f (Hz)", 1 / (2 * np.pi)),
         Unit(re.compile(r"\(krad/s\)"), "(Hz)", 1e3 / (2 * np.pi)),
         Unit(re.compile(r"\(rad/s\)"), "(Hz)", 1 / (2 * np.pi)),
     ),
@@ -120,7 +121,10 @@ def _scale(axis: Axis, factor: float) -> None:
     if axis.get_scale() == "log":
         ticks = np.array(log_ticks(low * factor, high * factor))
     else:
-        ticks = MaxNLocator(MOST_TICKS).tick_values(low * factor, high * factor)
+        # Labels of a horizontal axis need half an inch each.
+        length = axis.axes.bbox.width / axis.axes.figure.dpi
+        most = MOST_TICKS if axis.axis_name == "y" else int(np.clip(2 * length, 2, MOST_TICKS))
+        ticks = MaxNLocator(most).tick_values(low * factor, high * factor)
     _set_ticks(axis, ticks / factor, [f"{tick:.6g}" for tick in ticks])
 
 
