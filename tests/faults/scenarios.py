@@ -126,8 +126,63 @@ points = 5
 # The parameter of the curves is a key of the case, and masses are named, whose harmonics are stored.
 OVER_KEY = NFRC.replace("range = [0.97, 1.01]", 'over = "contacts.clearance"\nrange = [1.2e-3, 1.8e-3]\nfixed = [2.0]')
 OVER_KEY += "[[output.points]]\nname = 'before'\ncell = 98\n[[output.points]]\nname = 'behind'\ncell = 102\nmass = 3\n"
+FAMILY = NFRC.replace("restitutions = [1.0, 0.7]\n", "") + "[nfrc.family.contacts]\nsites = [[100], [101]]\n"
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
+# The energy that is transmitted is to be large at one amplitude, and small at another one.
+FRONT = (
+    OPTIMISE
+    + """
+population = 4
+[[optimise.objective]]
+measure = "transmitted"
+amplitudes = [5.0]
+[[optimise.objective]]
+measure = "transmitted"
+goal = "minimise"
+"""
+)
+# An absorber with stops: its mass meets them at 2 N, and does not reach them at 1 N.
+ABSORBER = """
+[lattice]
+cells = 1
+[lattice.cell]
+masses = [1.0, 0.05]
+springs = [
+    { start = 1, end = 1, stiffness = 0.5, next_cell = true },
+    { start = 1, end = 2, stiffness = 0.06, damping = 0.01 },
+]
+[contacts]
+law = "bilinear"
+stiffness = 20.0
+sites = [1]
+pair = [0, 1]
+clearance = 14.0
+[drive]
+waveform = "harmonic"
+amplitude = 1.0
+frequency = 1.0
+[time]
+end = 10.0
+[[output.points]]
+name = "mass"
+cell = 1
+[nfrc]
+source = "force"
+over = "frequency"
+range = [0.84, 0.9]
+fixed = [1.0, 2.0]
+harmonics = 1
+largest_step = 1.0
+[optimise]
+budget = 4
+population = 4
+[optimise.variables.lattice.cell]
+"springs[2]" = { stiffness = { log = [0.02, 0.1] } }
+[[optimise.objective]]
+measure = "response/peak_displacement/mass"
+goal = "minimise"
+"""
 # One clearance is identified from a record with contacts, in two starts: one for each of two ranks.
 IDENTIFY = f"""
 [lattice]
@@ -221,11 +276,15 @@ SCENARIOS = {
         Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
         Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
         Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
+        Scenario("nfrc-family", FAMILY, f"nfrc {OUT} {PLAIN}"),
         Scenario("nfrc-over-key", OVER_KEY, f"nfrc {OUT} {PLAIN}"),
         Scenario("design", DESIGN, f"design {OUT}", ranks=2),
         Scenario("law", LAW, f"law {OUT} {PLAIN}", ranks=2),
         Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}", ranks=2),
         Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}", ranks=3),
+        Scenario("optimise-front", FRONT, f"optimise {OUT} {PLAIN}"),
+        Scenario("optimise-team", OPTIMISE.replace("[optimise]", "[optimise]\nranks = 2"), f"optimise {OUT} {PLAIN}"),
+        Scenario("optimise-responses", ABSORBER, f"optimise {OUT} {PLAIN}"),
         Scenario("identify", IDENTIFY, f"identify {OUT} {PLAIN}", ranks=2),
         Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", before=f"sweep {OUT}"),
         Scenario("plot", RUN, "plot {out}", before=f"run {OUT} {PLAIN}"),

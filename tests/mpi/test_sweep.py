@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, on_two
+from tests.conftest import assert_same_bits, datasets
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
 from vipetsc.io.records import RecordFile
@@ -65,22 +65,6 @@ def whole(tmp_path_factory):
         return datasets(folder / "ensemble.h5")
 
     return on_root(MPI.COMM_WORLD, swept)
-
-
-@pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("team", [1, 2])
-def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
-    """A sweep on all ranks, each alone or in teams of two, leaves the ensemble of one rank and no other files."""
-    comm = MPI.COMM_WORLD
-
-    result = run_sweep(sweep(f"sweep.ranks={team}"), folder, comm)
-
-    assert result.complete
-    assert result.status.size == 6
-    assert len(result.busy) == comm.size
-    assert_same_bits(datasets(folder / "ensemble.h5"), whole)
-    assert {path.name for path in folder.glob("[!.]*")} == {"case.toml", "members.jsonl", "ensemble.h5"}
-    comm.Barrier()
 
 
 @pytest.mark.parallel([1, 2])
@@ -190,26 +174,6 @@ def test_records_that_one_rank_cannot_close_end_all_ranks(folder, monkeypatch, s
             run_sweep(sweep(), folder / "out", comm)
         else:
             RecordedRuns("some-runs", folder, comm, StopRequest()).make([1.0, 2.0], lambda key: {"value": key})
-
-
-@pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize(("team", "looks"), [*on_two((1, 1)), (2, 1)])
-def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
-    """A request to stop on one rank ends the sweep on all; the same command then completes it with the same bits."""
-    comm = MPI.COMM_WORLD
-    plan = sweep(f"sweep.ranks={team}")
-    stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
-
-    stopped = run_sweep(plan, folder / "out", comm, stop=stop)
-
-    assert stopped.resumable
-    assert not (folder / "out" / "ensemble.h5").exists()
-    assert stopped.computed == stopped.count(0) + stopped.count(1)
-
-    comm.Barrier()
-    assert run_sweep(plan, folder / "out", comm).complete
-    assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
-    comm.Barrier()
 
 
 @pytest.mark.parallel([1, 2, 3])

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.conftest import assert_same_bits, datasets, run_of
+from tests.conftest import run_of
 from tests.models import THREE_MASS_CELL
 from tests.one_site import COARSE, LATTICES, law_case
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.records import read_records
 from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
 from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
@@ -236,27 +235,6 @@ def test_a_law_is_refined_to_its_onset(refined):
         assert LawCase.of(data).to_toml() == case.to_toml()
         assert np.nanmax(data["interpolation_error"]) < 1
     assert [path.name for path in draw("law", [folder])] == ["law.png"]
-
-
-def number_of_records(path: Path) -> int:
-    """The number of complete lines in a file of records."""
-    return sum(1 for _ in read_records(path, lambda text: None))
-
-
-@pytest.mark.slow
-def test_a_law_that_was_cut_off_goes_on_to_the_same_bits(refined, tmp_path):
-    """A law whose last runs are missing, with one line cut off in the middle, is completed to the same bits."""
-    case, _, folder = refined
-    lines = (folder / "law-runs.jsonl").read_bytes().splitlines(keepends=True)
-    records = tmp_path / "law-runs.jsonl"
-    records.write_bytes(b"".join(lines[:-3]) + lines[-3][:40])
-    (tmp_path / "case.toml").write_text((folder / "case.toml").read_text())
-    assert number_of_records(records) == len(lines) - 3
-
-    make_law(case, tmp_path, MPI.COMM_SELF)
-
-    assert_same_bits(datasets(folder / "law.h5"), datasets(tmp_path / "law.h5"))
-    assert number_of_records(records) == len(lines)
 
 
 def law_by_hand() -> ScatteringLaw:

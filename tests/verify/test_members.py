@@ -1,7 +1,6 @@
 """Members of a sweep are scaled from a linear run where no contact can close, and simulated otherwise."""
 
 import os
-import shutil
 
 from mpi4py import MPI
 
@@ -87,44 +86,6 @@ def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
     thin = open_ensemble(tmp_path / "thin")
     for name in ("status", "contact_episodes", "ibtet", "entropy/energy_weighted", "entropy/masked", "bands/share"):
         np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)
-
-
-@pytest.mark.slow
-def test_damaged_records_are_named_and_simulated_again(sweep, tmp_path):
-    _, _, folder = sweep
-    out = shutil.copytree(folder, tmp_path / "out")
-    before = datasets(out / "ensemble.h5")
-    plan = Sweep.load(out / "case.toml")
-    lines = (out / "members.jsonl").read_bytes().splitlines(keepends=True)
-
-    # The first line is the linear run, the others are the members.
-    assert len(lines) == 7
-    assert b'"linear"' in lines[0][:20]
-
-    # Without the record of the linear run, the two members that are scaled from it are computed again.
-    for number, missing in ((0, 2), (2, 1), (6, 1)):
-        damaged = lines.copy()
-        damaged[number] = lines[number].replace(b"2", b"3", 1)
-        (out / "members.jsonl").write_bytes(b"".join(damaged))
-
-        again = run_sweep(plan, out)
-
-        assert again.complete
-        assert again.computed == missing
-        (warning,) = (text for text in again.warnings if "reaches the right end" not in text)
-        assert (
-            warning == f"{out}/members.jsonl, line {number + 1}: truncated or damaged; its results are computed again"
-        )
-        assert_same_bits(before, datasets(out / "ensemble.h5"))
-        assert (out / "members.jsonl").read_bytes().count(b"\n") == 7
-
-    os.truncate(out / "ensemble.h5", 20)
-
-    again = run_sweep(plan, out)
-
-    assert again.complete
-    assert again.computed == 0
-    assert_same_bits(before, datasets(out / "ensemble.h5"))
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from vipetsc.parallel import StudyError
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import composed, predict, prediction_warnings
 from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, onset_of, site_points
-from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, DISSIPATED, SiteResponse, SiteResponses, in_contact
 
 # The two ramps of this chirp meet, so that its spectrum is smooth and lies within the band.
@@ -238,18 +237,6 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
     z = np.array([record["z"] for record in site_records])
     release = prediction.site().over_bursts(z).release
     np.testing.assert_allclose(release, [record["release"] for record in site_records])
-
-
-def test_finished_runs_are_not_repeated(prediction, tmp_path, monkeypatch):
-    (tmp_path / "prediction-runs.jsonl").write_bytes((prediction.folder / "prediction-runs.jsonl").read_bytes())
-    (tmp_path / "case.toml").write_text(prediction.case.to_toml())
-    # The test fails if any run is started.
-    monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was started"))
-
-    again = predict(prediction.case, tmp_path)
-
-    for name in ("predicted/bands", "simulated/bands"):
-        np.testing.assert_array_equal(again[name], prediction.data[name])
 
 
 def test_amplitudes_and_points_by_default():
