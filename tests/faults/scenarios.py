@@ -82,7 +82,7 @@ system = "condensed"
 start_frequency = [1420.0, 3700.0]
 direction = "down"
 energy = [1e-4, 0.3]
-points = 4
+points = 3
 first_step = 1e-2
 """
 DESIGN = """
