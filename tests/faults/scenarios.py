@@ -70,7 +70,20 @@ springs = [
 ]
 smooth = [{ start = 0, end = 1, cubic = 0.5 }]
 """
-# Branches of a lattice by harmonic balance of its sites.
+# A branch of a lattice by shooting, and branches of a longer one by harmonic balance of its sites.
+SHOT = """
+[lattice]
+preset = "four-band"
+cells = 4
+[contacts]
+restitution = 1.0
+sites = [2]
+[nnm]
+system = "chain"
+modes = [3]
+energy = [0.0, 10.0]
+points = 3
+"""
 CONDENSED = """
 [lattice]
 preset = "four-band"
@@ -274,6 +287,7 @@ SCENARIOS = {
         Scenario("sweep", SWEEP, f"sweep {OUT}"),
         Scenario("sweep-team", TEAM, f"sweep {OUT}", ranks=3),
         Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
+        Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
         Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
         Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
         Scenario("nfrc-family", FAMILY, f"nfrc {OUT} {PLAIN}"),
