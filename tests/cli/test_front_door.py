@@ -189,7 +189,7 @@ def test_a_folder_that_is_not_a_run_is_never_replaced(in_process, case, tmp_path
     for force in ((), ("--force",)):
         ended = in_process("run", case, "--out", out, *force)
         assert ended.returncode == 2
-        assert "do not belong" in ended.stderr
+        assert "choose another --out" in ended.stderr
 
     assert [p.name for p in out.iterdir()] == ["thesis.tex"]
 

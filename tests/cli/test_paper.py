@@ -156,7 +156,7 @@ def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
     (tmp_path / "foreign" / "letter.txt").write_text("mine")
     foreign = in_process("paper", "--only", "fig10", "--out", tmp_path / "foreign")
     assert foreign.returncode == 2
-    assert "do not belong" in foreign.stderr
+    assert "choose another --out" in foreign.stderr
 
 
 def test_quick_and_full_do_not_mix(in_process, tmp_path):

@@ -172,9 +172,9 @@ def test_an_own_lattice_with_pictures(typed, put, tmp_path):
 def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put, in_process, tmp_path):
     """A sweep has a curve over the amplitude for each restitution, and a page for each with the slope of a branch."""
     put("rest.toml", my_lattice(), PLAIN, RESTITUTIONS, BRANCH)
-    typed("sweep rest.toml\nplot runs/rest --fig ibtet")
-    data = ensemble(tmp_path / "runs/rest")
-    assert pages(tmp_path / "runs/rest") == {"ibtet-over-contacts.restitution-drive.amplitude"}
+    typed("sweep rest.toml\nplot runs/rest-sweep --fig ibtet")
+    data = ensemble(tmp_path / "runs/rest-sweep")
+    assert pages(tmp_path / "runs/rest-sweep") == {"ibtet-over-contacts.restitution-drive.amplitude"}
 
     impacts = data.contact_episodes.transpose("restitution", "amplitude").values
     lost = data.dissipated_fraction.transpose("restitution", "amplitude").values
@@ -187,16 +187,16 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
     # Another question: the sweep and the branch of the cell in one picture, for each restitution.
     printed = typed(
         "nnm rest.toml --out runs/branch --set output.figures=false\n"
-        "plot runs/rest runs/branch --fig ibtet_backbone\nplot runs/rest runs/branch --fig ibtet"
+        "plot runs/rest-sweep runs/branch --fig ibtet_backbone\nplot runs/rest-sweep runs/branch --fig ibtet"
     )
-    drawn = {name for name in pages(tmp_path / "runs/rest") if name.startswith("ibtet_backbone")}
+    drawn = {name for name in pages(tmp_path / "runs/rest-sweep") if name.startswith("ibtet_backbone")}
     assert len(drawn) == 2
     assert {restitution for restitution in ("0.3", "0.9") for name in drawn if restitution in name} == {"0.3", "0.9"}
     assert "ibtet: without the branches of runs/branch; --fig ibtet_backbone draws both" in printed
 
     # A branch that is too short for a comparison is refused with the key that lengthens it.
     typed("nnm rest.toml --out runs/short --set output.figures=false --set nnm.energy=[0.0,0.05]")
-    refused = in_process("plot", "runs/rest", "runs/short", "--fig", "ibtet_backbone", cwd=tmp_path)
+    refused = in_process("plot", "runs/rest-sweep", "runs/short", "--fig", "ibtet_backbone", cwd=tmp_path)
     assert refused.returncode == 2
     assert "of 3 needed; follow the branch to more energy (nnm.energy)" in refused.stderr
 
@@ -205,10 +205,10 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
 def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
     """A sweep over two keys of three or more values is drawn as a map; a page without its data is refused."""
     put("map.toml", my_lattice(), PLAIN, CLEARANCES)
-    typed("sweep map.toml\nplot runs/map --fig contact_episodes\nexport runs/map")
-    assert pages(tmp_path / "runs/map") == {"contact_episodes-over-contacts.clearance-contacts.restitution"}
+    typed("sweep map.toml\nplot runs/map-sweep --fig contact_episodes\nexport runs/map-sweep")
+    assert pages(tmp_path / "runs/map-sweep") == {"contact_episodes-over-contacts.clearance-contacts.restitution"}
 
-    rows = table(tmp_path / "runs/map/curves/ensemble-members.csv")
+    rows = table(tmp_path / "runs/map-sweep/curves/ensemble-members.csv")
     impacts = {(row["clearance (m)"], row["restitution"]): float(row["contact_episodes"]) for row in rows}
     assert len(impacts) == 12
     # The table has numbers as the case writes them. The wider the clearance, the fewer impacts.
@@ -216,7 +216,7 @@ def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
         counts = [impacts[clearance, restitution] for clearance in ("0.0005", "0.001", "0.0015", "0.002")]
         assert counts == sorted(counts, reverse=True)
 
-    refused = in_process("plot", "runs/map", "--fig", "ibtet_backbone", cwd=tmp_path)
+    refused = in_process("plot", "runs/map-sweep", "--fig", "ibtet_backbone", cwd=tmp_path)
     assert refused.returncode == 2
     assert "needs branches of the same law, in a further folder, and a sweep over drive.amplitude" in refused.stderr
 
@@ -229,28 +229,28 @@ def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_p
     put("harmonic.toml", driven, PLAIN, 'transmission = [["base", "tip"]]\n', HARMONIC)
     typed(
         "sweep harmonic.toml --set time.end=0.4 --set contacts.clearance=1.0\n"
-        "plot runs/harmonic --fig transmission_base-tip"
+        "plot runs/harmonic-sweep --fig transmission_base-tip"
     )
 
-    data = ensemble(tmp_path / "runs/harmonic")
+    data = ensemble(tmp_path / "runs/harmonic-sweep")
     passed = dict(zip(data.frequency.values, data["transmission/base-tip"].values, strict=True))
     # The bands are 0-632, 717-1312 and 1529-2955 rad/s. In a gap only transients of the drive's beginning pass.
     assert passed[1420.0] < 0.3 * min(passed[500.0], passed[900.0], passed[1100.0])
-    assert pages(tmp_path / "runs/harmonic") == {"transmission_base-tip-over-drive.frequency"}
+    assert pages(tmp_path / "runs/harmonic-sweep") == {"transmission_base-tip-over-drive.frequency"}
 
 
 @pytest.mark.slow
 def test_clearances_that_scatter_as_a_band(typed, put, tmp_path):
     """Samples of scattered clearances deviate from their mean with contacts, and not at all without contact."""
     put("scatter.toml", my_lattice(), PLAIN, SCATTER)
-    typed("sweep scatter.toml\nplot runs/scatter --fig ibtet\nexport runs/scatter")
-    assert pages(tmp_path / "runs/scatter") == {"ibtet-over-drive.amplitude"}
+    typed("sweep scatter.toml\nplot runs/scatter-sweep --fig ibtet\nexport runs/scatter-sweep")
+    assert pages(tmp_path / "runs/scatter-sweep") == {"ibtet-over-drive.amplitude"}
 
-    data = ensemble(tmp_path / "runs/scatter")
+    data = ensemble(tmp_path / "runs/scatter-sweep")
     deviation = data["statistics/ibtet/deviation"].values
     assert deviation[0] == 0
     assert np.all(deviation[1:] > 0.01 * data["statistics/ibtet/mean"].values[1:])
-    rows = table(tmp_path / "runs/scatter/curves/ensemble-amplitude.csv")
+    rows = table(tmp_path / "runs/scatter-sweep/curves/ensemble-amplitude.csv")
     assert [float(row["statistics/ibtet/deviation"]) for row in rows] == deviation.tolist()
 
 
@@ -307,7 +307,7 @@ def test_a_breather(typed, put, tmp_path):
     """A run that begins with a breather of a branch keeps its energy, and the motion stays at its site."""
     small = "--set nnm.points=3 --set nnm.start_frequency=[1420.0] --set nnm.orbits_at=[] --set output.figures=false"
     begun = "--set initial.orbit=1 --set time.end=0.05 --set output.figures=false"
-    typed(f"examples breather gallery/breather-run\nnnm breather.toml {small}\nrun gallery/breather-run.toml {begun}")
+    typed(f"examples breather gallery/breather-run\nnnm breather.toml --out runs/breather {small}\nrun gallery/breather-run.toml {begun}")
 
     with vipetsc.open(tmp_path / "runs/breather-run") as run:
         energy = (run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"]).values
@@ -347,14 +347,14 @@ def test_a_frequency_response(typed, put, tmp_path):
 def test_the_best_clearances(typed, put, tmp_path):
     """A search leaves a case file of its best design, and a run of that case has the objective of the search."""
     put("search.toml", my_lattice(), PLAIN, SEARCH)
-    typed("optimise search.toml\nrun runs/search/best.toml --out runs/best --set output.figures=false")
-    with vipetsc.open(tmp_path / "runs/search") as found:
+    typed("optimise search.toml\nrun runs/search-optimise/best.toml --out runs/best --set output.figures=false")
+    with vipetsc.open(tmp_path / "runs/search-optimise") as found:
         values = found["value"].values.ravel()
     with vipetsc.open(tmp_path / "runs/best/analysis.h5") as measured:
         assert float(measured["ibtet"]) == pytest.approx(values.max(), rel=1e-6)
     assert values.max() > 1.3 * values[0]
 
-    case = tomllib.loads((tmp_path / "runs/search/best.toml").read_text(encoding="utf-8"))
+    case = tomllib.loads((tmp_path / "runs/search-optimise/best.toml").read_text(encoding="utf-8"))
     assert len(case["contacts"]["clearance"]) == 2
 
 

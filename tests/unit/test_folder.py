@@ -68,7 +68,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
     """``--force`` replaces neither a file nor a folder of another kind or without a marker."""
     (tmp_path / "file").touch()
     assert_refused("is a file", tmp_path / "file", RUN, OLD, force=True)
-    assert_refused("do not belong", tmp_path, RUN, OLD, force=True)
+    assert_refused("choose another --out", tmp_path, RUN, OLD, force=True)
 
     for kind, file in SHOWN.items():
         folder = tmp_path / kind.noun
@@ -76,7 +76,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
             (folder / file).touch()
         for other in KINDS:
             if other is not kind:
-                assert_refused("do not belong", folder, other, OLD, force=True)
+                assert_refused("choose another --out", folder, other, OLD, force=True)
         assert names_in(folder) == {kind.marker, file}
 
 

@@ -60,7 +60,8 @@ class Case(CaseFile):
     petsc: PetscTable | None = None
 
     verb = "run"
-    builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
+    # PETSc's integrator, on which the program is built, is what a first command shows.
+    builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}, "time": {"engine": "ts"}}
 
     @classmethod
     @cache

@@ -16,7 +16,6 @@ from vipetsc.case.resolve import check_cell, with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.section import described
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.study import with_fastest_engine
 from vipetsc.case.warnings import wave_warnings
 from vipetsc.lattice import max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.packet import packet_speeds
@@ -126,7 +125,7 @@ class LawCase(Case):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
-        sections, problems = super().read(with_fastest_engine(table))
+        sections, problems = super().read(table)
         if problems:
             return sections, problems
 

@@ -17,7 +17,7 @@ from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTabl
 from vipetsc.case.schema import Positive
 from vipetsc.case.search_space import SearchSpace, case_of, search_space
 from vipetsc.case.section import described, is_within
-from vipetsc.case.study import StudyCase, with_fastest_engine
+from vipetsc.case.study import StudyCase
 from vipetsc.case.variable_problems import variable_problems, variable_warnings
 from vipetsc.case.variables import Variable, VariablesTable
 
@@ -91,7 +91,6 @@ class OptimiseCase(StudyCase):
         table, section, missing = cls.divide(table, remedy)
         if missing:
             return {}, missing
-        table = with_fastest_engine(table)
 
         options, problems = read_section(OptimiseTable, section, "optimise")
         try:

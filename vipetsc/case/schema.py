@@ -296,7 +296,7 @@ class TimeTable(Section):
     engine: Literal["ts", "propagator", "auto"] = described(
         "Runge-Kutta steps (ts), exact linear steps (propagator), or the propagator where it applies,"
         " otherwise ts (auto)",
-        "ts",
+        "auto",
     )
     method: Method = described("PETSc's Runge-Kutta method for ts", "8vr")
     rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = described("relative tolerance", 1e-10)

@@ -30,12 +30,3 @@ class StudyCase(CaseFile):
         if not isinstance(section, dict):
             return of_run, {}, [Problem(cls.section, section, f"missing; {remedy}")]
         return of_run, section, []
-
-
-def with_fastest_engine(table: Table) -> Table:
-    """The ``table`` of a run with the fastest engine that the case allows, unless it names one; for many runs."""
-    time = table.get("time", {})
-    # Types are not checked yet.
-    if not isinstance(time, dict):
-        return table
-    return table | {"time": {"engine": "auto"} | time}

@@ -19,7 +19,7 @@ from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table,
 from vipetsc.case.html import html_table
 from vipetsc.case.schema import number
 from vipetsc.case.section import described
-from vipetsc.case.study import StudyCase, with_fastest_engine
+from vipetsc.case.study import StudyCase
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 from vipetsc.wording import counted, shortened
 
@@ -77,7 +77,6 @@ class Sweep(StudyCase):
         table, section, missing = cls.divide(table, remedy)
         if missing:
             return {}, missing
-        table = with_fastest_engine(table)
 
         # The section [analysis] does not vary: all members are measured alike, and ``analyse`` measures them again.
         sections = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}

@@ -30,7 +30,7 @@ CASE = argument("case", nargs="?", metavar="CASE", help="case file (TOML); defau
 SET = argument(
     "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
 )
-OUT = output_folder("runs/NAME, with the name of the case")
+OUT = output_folder("runs/NAME of a run, runs/NAME-VERB of another verb, with the name of the case")
 FORCE = argument(
     "--force", action="store_true", help="start again from the beginning and replace the results in the output folder"
 )

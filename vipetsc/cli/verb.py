@@ -137,14 +137,23 @@ def summary(data: "xr.Dataset") -> str:
     return str(data.attrs["summary"])
 
 
+def default_folder(name: str, verb: str) -> Path:
+    """Return the output folder of a ``verb`` for a case of that ``name``: one file may have sections of several verbs.
+
+    It is ``runs/NAME`` of a run, ``runs/NAME-VERB`` of every other verb unless the name has the verb in it already.
+    """
+    if verb == "run" or verb in name:
+        return Path("runs") / name
+    return Path("runs") / f"{name}-{verb}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class StudyVerb(Verb):
     """A verb that computes results of a ``case`` into a folder.
 
     ``study`` computes, prints the results, and returns how it ended; all ranks call it. ``table`` gives the rows that
-    ``validate`` prints of a case on a number of ranks. ``pictures`` are drawn of the results, if there are any. The
-    folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, for a verb
-    whose case depends on more than ``CASE`` and ``--set``.
+    ``validate`` prints of a case on a number of ranks. ``pictures`` are drawn of the results, if there are any.
+    ``load`` reads the case from the parsed options, for a verb whose case depends on more than ``CASE`` and ``--set``.
     """
 
     case: type[CaseFile]
@@ -152,7 +161,6 @@ class StudyVerb(Verb):
     table: Callable[[Any, int], Rows]
     results: ResultKind
     pictures: Pictures | None = None
-    suffix: str = ""
     load: Callable[[argparse.Namespace], CaseFile] | None = None
     is_stoppable: bool = True
 
@@ -163,7 +171,7 @@ class StudyVerb(Verb):
         # One rank has read the case, and has imported the modules that it names; the others do now.
         on_every_rank(comm, case.import_plugins)
 
-        folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
+        folder = options.out or default_folder(case.name, self.name)
         work = Work(options, folder, comm, stop)
         # Computed on rank 0 alone: warnings need the bands of the cell, which take a moment.
         work.warn(on_root(comm, case.warnings))

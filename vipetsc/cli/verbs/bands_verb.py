@@ -10,9 +10,9 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, CaseError, Problem
-from vipetsc.cli.arguments import CASE, SET, argument, output_folder
+from vipetsc.cli.arguments import CASE, OUT, SET, argument
 from vipetsc.cli.messages import echo
-from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.cli.verb import DONE, PlainVerb, default_folder
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
@@ -33,7 +33,7 @@ JSON = argument("--json", action="store_true", help="print JSON instead of a tab
 def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Print pass bands, gaps and group velocities of a case's cell, and write them as a table and a picture."""
     case = on_root(comm, lambda: Case.load(options.case, options.set))
-    folder = options.out or Path("runs") / f"{case.name}-bands"
+    folder = options.out or default_folder(case.name, "bands")
 
     # All ranks find modes together; everything else is a second's work for one.
     modes = modes_report(case, options, folder, comm)
@@ -196,7 +196,7 @@ VERB = PlainVerb(
     name="bands",
     text="pass bands, gaps and group velocities of a cell",
     example="bands runs/examples/three-mass.toml --json",
-    arguments=(CASE, MODES, NEAR, SET, output_folder("runs/NAME-bands, with the name of the case"), JSON),
+    arguments=(CASE, MODES, NEAR, SET, OUT, JSON),
     function=bands,
     is_answer=True,
 )

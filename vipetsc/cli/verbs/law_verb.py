@@ -1,7 +1,7 @@
 """The verb ``law``: the scattering law of one site."""
 
 from vipetsc.case import LawCase
-from vipetsc.cli.arguments import CASE, FORCE, RESUME, SET, output_folder
+from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
 from vipetsc.cli.verb import Rows, StudyVerb, study_of
@@ -19,11 +19,10 @@ VERB = StudyVerb(
     name="law",
     text="compute the scattering law of one site with adaptive refinement",
     example="law runs/examples/law.toml --set law.tolerance=0.02",
-    arguments=(CASE, SET, output_folder("runs/NAME-law, with the name of the case"), FORCE, RESUME),
+    arguments=(CASE, *STUDY_ARGUMENTS),
     case=LawCase,
     study=study_of("vipetsc.studies.one_site:make_law", lambda law: table(law.summary())),
     table=law_rows,
     results=LAW,
     pictures=Pictures(LAW),
-    suffix="-law",
 )
