@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.conftest import small_case
+from tests.conftest import simulated, small_case
 from vipetsc.case import Case, LawCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
+from vipetsc.case.wave_at_sites import wave_over_clearance
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.lattice import Contact
 
@@ -28,8 +29,9 @@ def test_cases_that_are_as_they_should_be(name):
 @pytest.mark.parametrize("preset", ["four-band", "diatomic"])
 @pytest.mark.parametrize("reading", ["printed", "calibrated"])
 def test_the_built_in_cases(preset, reading):
-    """Presets without further keys give no warning."""
-    assert Case.from_table({"lattice": {"preset": preset, "reading": reading}}).warnings() == []
+    """Presets without further keys give no warning, but for the one whose default wave closes no clearance."""
+    sentences = Case.from_table({"lattice": {"preset": preset, "reading": reading}}).warnings()
+    assert ["closes" in sentence for sentence in sentences] == [True] * ((preset, reading) == ("diatomic", "printed"))
 
 
 def warnings_of(**sections) -> list[str]:
@@ -88,7 +90,38 @@ def test_a_wave_longer_than_the_lattice():
 
     assert "lattice.cells = 24 contain only 0.741 wavelengths of 32.37 cells" in sentence
     assert "0.262 rad/cell" in sentence
-    assert warnings_of(**slow, lattice={"cells": 130}) == []
+    assert not [sentence for sentence in warnings_of(**slow, lattice={"cells": 130}) if "wavelengths" in sentence]
+
+
+def test_a_steady_drive_has_no_wave_that_is_too_long_or_comes_back():
+    """Reflections are part of a steady motion, whatever its wavelength."""
+    steady = {"waveform": "harmonic", "amplitude": 1.0, "frequency": 100.0, "ramp": 0.01}
+    table = {"lattice": {"preset": "four-band", "cells": 24}, "drive": steady, "time": {"end": 0.3}}
+    sentences = Case.from_table(table).warnings()
+    assert not [sentence for sentence in sentences if "returns" in sentence or "wavelengths" in sentence]
+
+
+def test_waves_that_close_no_clearance_or_all_of_them():
+    """A warning has the linear wave over the clearance where it is below 1 everywhere, or above 100."""
+    case = small_case(time={"end": 0.04})
+    ratios = wave_over_clearance(case.model()).max(axis=1)
+    amplitude = case.drive.amplitude
+
+    for factor, word in (0.99, "no contact closes"), (1.01, ""), (99.0, ""), (101.0, "times the clearance"):
+        sentences = " ".join(warnings_of(drive={"amplitude": amplitude * factor / ratios.max()}))
+        assert (word in sentences) if word else "clearance" not in sentences, factor
+
+
+def test_the_wave_at_a_site_is_that_of_a_linear_run():
+    """|w| of the wave at a site in the middle of a long lattice, without contact, is the clearance times the ratio."""
+    case = small_case(
+        lattice={"cells": 80}, contacts={"sites": [30], "clearance": 1.0}, time={"end": 0.12, "engine": "propagator"}
+    )
+    ratio = wave_over_clearance(case.model())[0]
+    field = simulated(case)[0].displacement.values[:, 29]
+    cell = case.lattice.unit_cell()
+    w = field[:, cell.resonator] - field[:, cell.host]
+    assert ratio[0] == ratio[1] == pytest.approx(np.abs(w).max(), rel=0.03)
 
 
 def test_a_drive_that_samples_do_not_show():

@@ -11,6 +11,7 @@ import numpy as np
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
 from vipetsc.case.schema import LatticeTable, OutputTable
+from vipetsc.case.wave_at_sites import wave_over_clearance
 from vipetsc.io.tables import is_number
 from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
@@ -25,6 +26,7 @@ TINY = 1e-6  # a loss ratio, or ratio of frequencies, that stands for 0
 BRIEF = 0.1  # duration of a contact over the sample interval
 MOST_ENERGY = 0.95  # fraction of the energy of samples
 FAR = 3.0  # ratio to the lattice's highest frequency, or of its lowest one
+MOST_CLOSING = 100.0  # times a clearance that a wave moves a site
 STEPS = 10.0  # of fixed length in a contact: a half sine of ten points has its peak to 1 %
 DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt does not give one
 
@@ -36,6 +38,7 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
         *length_warnings(model),
         *end_warnings(model, output),
         *field_warnings(model, output),
+        *closing_warnings(model),
         *contact_warnings(model, petsc),
     ]
 
@@ -144,8 +147,8 @@ def length_warnings(model: Model) -> Iterator[str]:
     drive = model.drive
     cells = model.chain.cells
     waves = waves_at(model.chain.cell, drive.frequency)
-    # A rig of one cell is not about waves.
-    if model.first_drive_acts and waves and cells > 1:
+    # A rig of one cell is not about waves, and a steady motion not about the wave that comes first.
+    if model.first_drive_acts and waves and cells > 1 and not drive.repeats:
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
         wavelength = 2 * pi / max(kappa, 1e-300)
         if wavelength * WAVELENGTHS > cells:
@@ -170,6 +173,9 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     drive = model.drive
     at = model.drive_cell
     if chain.ends == "periodic" or not (model.first_drive_acts and waves_at(chain.cell, drive.frequency)):
+        return
+    # Of a drive that goes on, reflections are a part of the motion.
+    if drive.repeats or chain.cells == 1:
         return
     # The wave should not return to the sites; without sites, to the recorded window, or to the driven cell.
     name = "cell"
@@ -222,6 +228,27 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
             f"the drive contains up to {highest:.5g} rad/s, beyond the {np.pi / model.sample_interval:.5g} rad/s of"
             f" samples every {model.sample_interval:.3g} s: fields and energies are aliased; use a time.sample_interval"
             f" below {interval:.3g} s"
+        )
+
+
+def closing_warnings(model: Model) -> Iterator[str]:
+    """Warnings of waves that close no clearance, and of ones far larger than the clearances."""
+    if not (model.chain.sites and model.first_drive_acts):
+        return
+    ratios = wave_over_clearance(model).max(axis=1)
+    # A wave that is evanescent has a warning of its own; stops that touch close by any wave.
+    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
+    if not ratios.size:
+        return
+    if ratios.max() < 1:
+        yield (
+            f"the drive's linear wave reaches {ratios.max():.3g} of the nearest clearance: no contact closes unless waves"
+            " add up; a larger drive.amplitude or a smaller contacts.clearance closes one"
+        )
+    if ratios.max() > MOST_CLOSING:
+        yield (
+            f"the drive's linear wave is {ratios.max():.3g} times the clearance, so that the stops are shut nearly all"
+            " the time; are drive.amplitude and contacts.clearance in N and m?"
         )
 
 

@@ -13,12 +13,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.case import Case, Model
+from vipetsc.case.wave_at_sites import wave_over_clearance
 from vipetsc.dynamics.engine_choice import PROPAGATOR, choose_engine
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import refusal, spring_cost, step_series
 from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
-from vipetsc.lattice import UnitCell, bloch, pass_bands, waves_at
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice import pass_bands
 
 # Further steps of ts that an episode costs.
 EPISODE_STEPS = 60.0
@@ -175,23 +175,13 @@ def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, epi
 
 
 def expected_episodes(model: Model) -> float:
-    """Contact episodes if each site meets the drive's linear wave: one a cycle at each stop that |w| goes beyond.
-
-    The wave's largest displacement is ``model.scale``; the ratio of |w| to it is that of the Bloch wave.
+    """Return the contact episodes if each site meets the drive's linear wave alone: one a cycle at each stop that |w|
+    goes beyond. Impacts make the resonators move on, so that there are up to several times as many.
     """
-    chain = model.chain
     drive = model.drive
-    waves = waves_at(chain.cell, drive.frequency)
-    if not (waves and drive.amplitude and chain.sites):
+    if not model.chain.sites:
         return 0.0
-
-    # The wave at this frequency that moves a pair most counts.
-    pairs = chain.contact_pairs
-    largest = {pair: max(_relative_amplitude(chain.cell, pair, wave) for wave in waves) for pair in set(pairs)}
-    amplitudes = model.scale * np.array([largest[pair] for pair in pairs])
-    gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances])
-    # Beads that touch have no clearance: any wave closes them.
-    z = amplitudes[:, None] / np.maximum(gaps, 1e-300)
+    z = wave_over_clearance(model)
 
     # A sine that does not end is above a clearance for the whole run, or never.
     if drive.repeats:
@@ -201,14 +191,3 @@ def expected_episodes(model: Model) -> float:
     # The envelope of a burst is sin^2, above 1/z in this fraction of its time.
     above = np.where(z > 1, 1 - 2 / np.pi * np.arcsin(np.sqrt(1 / np.maximum(z, 1))), 0.0)
     return float(drive.cycles * above.sum())
-
-
-def _relative_amplitude(cell: UnitCell, pair: Pair, wave: tuple[int, float, float]) -> float:
-    """The amplitude of w of a ``pair`` in a ``wave`` of ``waves_at``, over that of the mass that moves most."""
-    band, kappa, _ = wave
-    shape = bloch(cell, kappa).vectors[:, band - 1]
-    w = shape[pair.resonator] * np.exp(1j * kappa * pair.next_cell)
-    # Ground, number -1, does not move.
-    if pair.host >= 0:
-        w -= shape[pair.host]
-    return float(abs(w) / np.abs(shape).max())

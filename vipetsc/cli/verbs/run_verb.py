@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vipetsc.case import Case, Sweep
+from vipetsc.case import Case, Model, Sweep
+from vipetsc.case.wave_at_sites import wave_over_clearance
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
 from vipetsc.cli.case_rows import lattice_rows
@@ -25,6 +26,16 @@ from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
+
+# What a run counts where a contact reaches a limit of the law or of the method, as a sentence that begins "n contacts".
+LIMITS = {
+    "grazes": "touched without an impact",
+    "floored": "slower than contacts.approach_floor",
+    "clipped": "cut off where damping would have pulled",
+    "pulled": "pulled by damping for a moment",
+    "missed": "with a change inside a step",
+    "forced": "in a step whose error exceeds rtol",
+}
 
 MEMBER = argument(
     "--member",
@@ -135,12 +146,13 @@ def run_rows(case: Case, ranks: int) -> Rows:
         engine += f": {cost.note}"
     time = f"about {duration(cost.seconds)} on {counted(ranks, 'rank')}"
     if cost.episodes:
-        time += f", {duration(cost.contacts)} of this for about {float(f'{cost.episodes:.1g}'):g} contacts"
+        time += f", {duration(cost.contacts)} of this for {float(f'{cost.episodes:.1g}'):g} contacts or more"
 
     return [
         *lattice_rows(case),
         ("begins with", begins_with),
         *_drive_rows(case),
+        ("wave/clearance", _closing(model)),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("points", ", ".join(f"{p.name} (cell {p.cell}, mass {p.mass})" for p in case.output.points or [])),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
@@ -150,6 +162,14 @@ def run_rows(case: Case, ranks: int) -> Rows:
         ("time", time),
         ("faster", cost.faster),
     ]
+
+
+def _closing(model: Model) -> str:
+    """Return the linear wave over the clearance of each site, the nearer stop of two; "" without a wave or a site."""
+    if not (model.chain.sites and model.first_drive_acts):
+        return ""
+    ratios = wave_over_clearance(model).max(axis=1)
+    return first_few([f"{ratio:.3g}" if ratio < np.inf else "touching" for ratio in ratios])
 
 
 def _drive_rows(case: Case) -> Rows:
@@ -210,8 +230,7 @@ def run_table(result: "Result", faster: str = "") -> str:
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
     if rebounds:
         restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)"
-    rare = "grazes", "floored", "clipped", "pulled", "missed", "forced"
-    limits = [f"{name} {numbers[name]}" for name in rare if numbers.get(name)]
+    limits = [f"{counted(numbers[name], 'contact')} {text}" for name, text in LIMITS.items() if numbers.get(name)]
     engine = ""
     if note := numbers.get("engine_note"):
         engine = f"{numbers['engine']}: {note}"

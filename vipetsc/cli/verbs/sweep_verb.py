@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 from vipetsc.case import Sweep
 from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.tables import table
+from vipetsc.cli.tables import duration, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import SWEEP
+from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
+
+MOST_ESTIMATED = 50  # members whose time ``validate`` estimates, 10 ms each
 
 
 def simulate_members(plan: Sweep, work: Work) -> Outcome:
@@ -35,14 +38,25 @@ def failure_of(result: "SweepResult") -> list[str]:
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
-    """A row of ``validate`` with the number of members, and how many are no valid cases, out of those tried."""
+    """Return rows of ``validate`` with the number of members, how many of those tried are not valid, and their time."""
+    from vipetsc.dynamics.cost import estimate
+
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))
     of = str(len(tried))
     if len(tried) == plan.count:
         of = "them"
-    return [("sweep", f"{plan.count} members ({counts}), {impossible} of {of} impossible")]
+    rows = [("sweep", f"{plan.count} members ({counts}), {impossible} of {of} impossible")]
+
+    # Members at equal distances stand for all of them.
+    possible = [member.case for member in tried if member.case]
+    some = possible[:: max(1, len(possible) // MOST_ESTIMATED)]
+    if some:
+        mean = sum(estimate(case).seconds for case in some) / len(some)
+        seconds = mean * plan.count * len(possible) / len(tried) / ranks
+        rows.append(("sweep takes", f"about {duration(seconds)} on {counted(ranks, 'rank')}, and its measures"))
+    return rows
 
 
 def sweep_table(result: "SweepResult") -> str:
