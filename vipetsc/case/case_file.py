@@ -26,7 +26,7 @@ from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_l
 from vipetsc.case.plain import plain_table, wrong_keys
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
-from vipetsc.case.section import described, is_within
+from vipetsc.case.section import described, is_within, unit_at
 from vipetsc.case.shapes import MARK
 from vipetsc.plugins import only
 from vipetsc.register import PartError
@@ -387,6 +387,8 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         near = nearest(value, re.findall(r"'([^']+)'", choices), cutoff=0.4)
         if near:
             message += f"; did you mean {near!r}?"
+    if isinstance(value, str) and (unit := unit_at({name: kind}, path, {})):
+        message += f', in {unit}, or a text with such a unit, as "1 {unit}"'
     return Problem(path, value, message)
 
 

@@ -3,19 +3,18 @@
 All of it comes from the fields of the sections (``section.described``).
 """
 
-import re
 from collections.abc import Iterator, Sequence
-from typing import Any, get_args
+from typing import Any
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Table
 from vipetsc.case.schema import MULTIPLE_OF_PI
+from vipetsc.case.section import unit_at
+from vipetsc.case.units import NUMBER_WITH_UNIT
 from vipetsc.case.verb_cases import SECTIONS
-from vipetsc.case.waveforms import DEFAULT, WAVEFORMS, waveform_record
+from vipetsc.case.waveforms import DEFAULT, waveform_record
 from vipetsc.lattice.contact import registered_law
 from vipetsc.plugins import only
 from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
@@ -23,9 +22,8 @@ from vipetsc.wording import with_unit
 
 TITLE = "Every key of a case file"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-INDEX = re.compile(r"\[\d+\]")  # of an entry of a list in a path
-FURTHER_AMPLITUDE = re.compile(r"drive\.more\[(\d+)\]\.amplitude")
 Schema = dict[str, Any]
+TEXT_WITH_UNIT: Schema = {"type": "string", "pattern": NUMBER_WITH_UNIT.pattern}
 
 
 def unit_of(path: str, case: Table) -> str:
@@ -34,44 +32,10 @@ def unit_of(path: str, case: Table) -> str:
     An amplitude of a drive has the unit of its waveform, or m for a wall. The unit is empty for keys without one, and
     where it depends on other keys.
     """
-    drive = _drive_of(path, case)
-    if drive is not None:
-        if "end" in drive:
-            return "m"
-        return _unit_of_waveform(drive.get("waveform") or DEFAULT)
     parameter = _parameter_of(path, case)
     if parameter:
         return parameter.unit
-    section, *keys = INDEX.sub("", path).split(".")
-    table: type[BaseModel] | None = SECTIONS.get(section)
-    for key in keys[:-1]:
-        table = _table_of(table, key)
-    if table is None or not keys:
-        return ""
-    unit = _unit_in(table, keys[-1])
-    # Such a text says on what the unit depends.
-    if " of " in unit or " or " in unit:
-        return ""
-    return unit
-
-
-def _drive_of(path: str, case: Table) -> Table | None:
-    """Return the table of the drive, or of one of the further drives, whose amplitude has that ``path``; else None."""
-    drive = case.get("drive", {})
-    if path == "drive.amplitude":
-        return drive
-    further = FURTHER_AMPLITUDE.fullmatch(path)
-    if not further:
-        return None
-    drives: list[Table] = drive["more"]
-    return drives[int(further[1]) - 1]
-
-
-def _unit_of_waveform(name: str) -> str:
-    """Unit of the amplitude of a waveform; that of a force where the module that registers it is not imported."""
-    if name in WAVEFORMS or name in PARTS[WAVEFORM]:
-        return waveform_record(name).unit
-    return "N"
+    return unit_at(SECTIONS, path, case)
 
 
 def _parameter_of(path: str, case: Table) -> Parameter | None:
@@ -90,38 +54,6 @@ def _parameter_of(path: str, case: Table) -> Parameter | None:
     return None
 
 
-def _unit_in(table: type[BaseModel], key: str) -> str:
-    """Return the unit of a ``key`` of a ``table``; empty for one without, or for a key that it does not have."""
-    about = _field_of(table, key)
-    if about and isinstance(about.json_schema_extra, dict):
-        return str(about.json_schema_extra.get("unit", ""))
-    return ""
-
-
-def _field_of(table: type[BaseModel], key: str) -> FieldInfo | None:
-    """Return the field of a ``table`` that a case file writes as ``key``; None for a key that it does not have."""
-    for name, about in table.model_fields.items():
-        if key == (about.alias or name):
-            return about
-    return None
-
-
-def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
-    """Return the class of the table that ``key`` of a ``table`` is; None where it is not a table."""
-    if not table:
-        return None
-    about = _field_of(table, key)
-    if not about:
-        return None
-    # The types within a type, as in ``list[X] | None``, are appended while the loop runs.
-    choices = [about.annotation]
-    for choice in choices:
-        choices += get_args(choice)
-        if isinstance(choice, type) and issubclass(choice, BaseModel):
-            return choice
-    return None
-
-
 def json_schema(modules: Sequence[str] = ()) -> Schema:
     """Return the JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key.
 
@@ -130,9 +62,26 @@ def json_schema(modules: Sequence[str] = ()) -> Schema:
     schema = _schema_with_units(modules)
     for table in schema["$defs"].values():
         for item in table.get("properties", {}).values():
-            if "unit" in item:
-                item["description"] = with_unit(item["description"], item.pop("unit"))
+            unit = item.pop("unit", "")
+            if unit:
+                texts = _or_text(item)
+                item.clear()
+                item |= texts | {"description": with_unit(texts["description"], unit)}
     return schema
+
+
+def _or_text(schema: Any) -> Any:
+    """Return the ``schema`` of a key with a unit in which each number may also be a text with a unit."""
+    if isinstance(schema, list):
+        return [_or_text(choice) for choice in schema]
+    if not isinstance(schema, dict):
+        return schema
+    inside = {key: _or_text(value) for key, value in schema.items() if key in ("anyOf", "items")}
+    if schema.get("type") != "number":
+        return schema | inside
+    bounds = {key: schema[key] for key in schema if key not in ("title", "description", "default", "unit")}
+    about = {key: schema[key] for key in schema.keys() - bounds.keys()}
+    return about | {"anyOf": [bounds, TEXT_WITH_UNIT]}
 
 
 def _schema_with_units(modules: Sequence[str] = ()) -> Schema:

@@ -1,5 +1,6 @@
 """The section of a case about its contact sites: their cells, laws and stops."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, create_model
@@ -100,6 +101,10 @@ class PerSiteTable(ElasticLaws):
     )
 
 
+# Units of the stiffness of a law whose exponent has no key.
+STIFFNESS_UNITS = {"hertz": "N/m^1.5", "bilinear": "N/m"}
+
+
 class ContactsTable(ElasticLaw):
     """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
 
@@ -148,3 +153,11 @@ class ContactsTable(ElasticLaw):
     approach_floor: NotNegative = described(
         "smallest approach velocity in the factor of the dissipation", 0.0, unit="m/s"
     )
+
+    @classmethod
+    def unit_of(cls, key: str, table: Mapping[str, Any]) -> str:
+        """Return the unit of a ``key``; that of the stiffness depends on the law."""
+        unit = super().unit_of(key, table)
+        if key == "stiffness":
+            return STIFFNESS_UNITS.get(table.get("law", "hertz"), unit)
+        return unit

@@ -18,8 +18,9 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.html import html_table
 from vipetsc.case.schema import number
-from vipetsc.case.section import described
+from vipetsc.case.section import described, unit_at
 from vipetsc.case.study import StudyCase
+from vipetsc.case.units import in_unit
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 from vipetsc.wording import counted, shortened
 
@@ -87,7 +88,7 @@ class Sweep(StudyCase):
         given = dict(leaves(varying))
         for key, value in given.items():
             try:
-                values[key] = values_in(value)
+                values[key] = values_in(in_unit(value, unit_at(Case.sections(), key, table)))
             except ValueError as error:
                 problems.append(Problem(f"sweep.{key}", value, str(error)))
         if not given:

@@ -242,8 +242,8 @@ def closing_warnings(model: Model) -> Iterator[str]:
         return
     if ratios.max() < 1:
         yield (
-            f"the drive's linear wave reaches {ratios.max():.3g} of the nearest clearance: no contact closes unless waves"
-            " add up; a larger drive.amplitude or a smaller contacts.clearance closes one"
+            f"the drive's linear wave reaches {ratios.max():.3g} of the nearest clearance: no contact closes unless"
+            " waves add up; a larger drive.amplitude or a smaller contacts.clearance closes one"
         )
     if ratios.max() > MOST_CLOSING:
         yield (

@@ -294,6 +294,19 @@ class OneDrive(Section):
         "the end whose wall moves with the waveform, instead of a force on a mass", None
     )
 
+    @classmethod
+    def unit_of(cls, key: str, table: Mapping[str, Any]) -> str:
+        """Return the unit of a ``key``; that of the amplitude depends on the waveform, and is m for a wall."""
+        if key != "amplitude":
+            return super().unit_of(key, table)
+        if "end" in table:
+            return "m"
+        name = table.get("waveform") or DEFAULT
+        # A module that registers the waveform may not be imported.
+        if name in WAVEFORMS or name in PARTS[WAVEFORM]:
+            return waveform_record(name).unit
+        return "N"
+
     @property
     def kind(self) -> str:
         """The waveform's name."""

@@ -175,8 +175,10 @@ def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, epi
 
 
 def expected_episodes(model: Model) -> float:
-    """Return the contact episodes if each site meets the drive's linear wave alone: one a cycle at each stop that |w|
-    goes beyond. Impacts make the resonators move on, so that there are up to several times as many.
+    """Return the contact episodes if each site meets the drive's linear wave alone.
+
+    These are one a cycle at each stop that |w| goes beyond. Impacts make the resonators move on, so that there are up
+    to several times as many.
     """
     drive = model.drive
     if not model.chain.sites:
