@@ -140,7 +140,7 @@ def small_case(**sections) -> Case:
         "lattice": {"preset": "four-band", "cells": 24},
         "contacts": {"sites": [6, 12, 13], "clearance": 2e-4},
         "drive": {"amplitude": 24.33, "cycles": 6},
-        "time": {"end": 0.05},
+        "time": {"engine": "ts", "end": 0.05},
     }
     return Case.from_table(with_sections(table, sections))
 
