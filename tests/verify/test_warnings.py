@@ -32,7 +32,9 @@ def test_a_sound_run_warns_of_nothing(folder):
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_sites_that_nothing_reaches(folder, engine):
     case = small_case(drive={"amplitude": 0.1}, time={"end": 0.04, "engine": engine})
-    assert warnings_of(simulate(case, folder / "run")) == ["no contact: nothing reached any of the 3 sites"]
+    expected, found = warnings_of(simulate(case, folder / "run"))
+    assert "no contact closes" in expected
+    assert found == "no contact: nothing reached any of the 3 sites"
 
 
 @pytest.mark.slow
