@@ -184,7 +184,7 @@ def test_results_of_other_verbs_are_never_replaced(name, tmp_path):
         if other is kind:
             (out / kind.marker).unlink()
         for force in (False, True):
-            with pytest.raises(FolderError, match="do not belong"):
+            with pytest.raises(FolderError, match="choose another --out"):
                 compute(name, out, force=force)
         assert file.read_text() == "results"
 
