@@ -9,7 +9,7 @@ FACTOR = re.compile(r"([A-Za-zµ]+)(?:\^(\d+(?:\.\d+)?))?")
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6, "G": 1e9}
 
 
-class Unit(NamedTuple):
+class SiUnit(NamedTuple):
     """A unit: its ``factor`` to SI, and the powers of metre, kilogram and second."""
 
     factor: float
@@ -20,15 +20,15 @@ class Unit(NamedTuple):
 
 # A frequency in Hz is one of 2 pi rad/s; rad has no dimension.
 SYMBOLS = {
-    "m": Unit(1.0, metre=1),
-    "g": Unit(1e-3, kilogram=1),
-    "s": Unit(1.0, second=1),
-    "N": Unit(1.0, metre=1, kilogram=1, second=-2),
-    "Pa": Unit(1.0, metre=-1, kilogram=1, second=-2),
-    "J": Unit(1.0, metre=2, kilogram=1, second=-2),
-    "Hz": Unit(2 * math.pi, second=-1),
-    "rad": Unit(1.0),
-    "1": Unit(1.0),
+    "m": SiUnit(1.0, metre=1),
+    "g": SiUnit(1e-3, kilogram=1),
+    "s": SiUnit(1.0, second=1),
+    "N": SiUnit(1.0, metre=1, kilogram=1, second=-2),
+    "Pa": SiUnit(1.0, metre=-1, kilogram=1, second=-2),
+    "J": SiUnit(1.0, metre=2, kilogram=1, second=-2),
+    "Hz": SiUnit(2 * math.pi, second=-1),
+    "rad": SiUnit(1.0),
+    "1": SiUnit(1.0),
 }
 
 
@@ -55,21 +55,21 @@ def in_unit(value: Any, unit: str) -> Any:
     return float(f"{float(match[1]) * given.factor / wanted.factor:.15g}")
 
 
-def _unit_of(text: str) -> Unit | None:
+def _unit_of(text: str) -> SiUnit | None:
     """Return the unit that a ``text`` such as "kN/mm^1.5" or "N s/m" stands for; None if it is not one."""
     above, *below = text.split("/")
-    product = Unit(1.0)
+    product = SiUnit(1.0)
     for part, sign in ((above, 1), *((part, -1) for part in below)):
         for symbol in part.split():
             factor = _power_of(symbol, sign)
             if factor is None:
                 return None
             powers = [mine + further for mine, further in zip(product[1:], factor[1:], strict=True)]
-            product = Unit(product.factor * factor.factor, *powers)
+            product = SiUnit(product.factor * factor.factor, *powers)
     return product
 
 
-def _power_of(symbol: str, sign: int) -> Unit | None:
+def _power_of(symbol: str, sign: int) -> SiUnit | None:
     """Return a ``symbol`` as "mm^2", with or without a prefix, to the power of its ``sign``; None if unknown."""
     if symbol == "1":
         return SYMBOLS["1"]
@@ -84,4 +84,4 @@ def _power_of(symbol: str, sign: int) -> Unit | None:
     if not prefix or name not in SYMBOLS:
         return None
     unit = SYMBOLS[name]
-    return Unit((prefix * unit.factor) ** exponent, *(exponent * power for power in unit[1:]))
+    return SiUnit((prefix * unit.factor) ** exponent, *(exponent * power for power in unit[1:]))

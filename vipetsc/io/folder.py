@@ -122,8 +122,8 @@ def _claim(path: Path, kind: ResultKind, text: str, force: bool, resume: bool, d
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
     if _holds_another_kind(path, kind) or (filled and not (path / kind.marker).exists()):
         others = [other.noun for other in KINDS if other != kind and other.is_in(path)]
-        found = f"results of the kind {others[0]}" if others else "other files"
-        raise FolderError(f"{path}: contains {found}; choose another --out for results of the kind {kind.noun}")
+        content = f"results of the kind {others[0]}" if others else "other files"
+        raise FolderError(f"{path}: contains {content}; choose another --out for results of the kind {kind.noun}")
     if resume and not filled:
         raise FolderError(f"{path}: contains no {kind.noun} to resume; omit --resume")
 
