@@ -327,9 +327,9 @@ def test_a_frequency_response(typed, put, tmp_path):
     put("response.toml", NFRC)
     # The case allows so few points that its curves would end before they turn back.
     command = "nfrc response.toml --set nfrc.points=200 --set output.figures=false"
-    typed(f"{command}\nexport runs/response")
+    typed(f"{command}\nexport runs/response-nfrc")
     curves = {
-        restitution: table(tmp_path / f"runs/response/curves/branch-r{restitution}-1023.27-point.csv")
+        restitution: table(tmp_path / f"runs/response-nfrc/curves/branch-r{restitution}-1023.27-point.csv")
         for restitution in ("1", "0.7")
     }
     for rows in curves.values():

@@ -43,7 +43,8 @@ def test_indentations_beyond_the_radius(folder):
 
     def warnings(name, **contacts):
         case = small_case(**HALF, drive={"amplitude": 400.0}, contacts={"modulus": 1e5} | contacts)
-        return warnings_of(simulate(case, folder / name))
+        # That a wave is large beside its clearance is told too.
+        return [text for text in warnings_of(simulate(case, folder / name)) if "times the clearance" not in text]
 
     (warning,) = warnings("soft")
     assert "exceeds the contacts' radius of 0.005 m: Hertz" in warning

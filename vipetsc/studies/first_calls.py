@@ -33,7 +33,7 @@ CELL: dict[str, Any] = {
 BREATHER: dict[str, Any] = {
     "lattice": {"preset": "four-band", "cells": 20},
     "contacts": {"sites": [7]},
-    "nnm": {"system": "chain", "start_frequency": [1600.0], "tolerance": 1e-12, "first_step": 1e-2, "points": 2},
+    "nnm": {"system": "condensed", "start_frequency": [1600.0], "tolerance": 1e-12, "first_step": 1e-2, "points": 2},
 }
 # One clearance in the first contacts of the record that comes with the examples.
 RECORD = Path(__file__).parents[1] / "examples" / "identify.csv"
@@ -60,9 +60,7 @@ IDENTIFIED: dict[str, Any] = {
 def compile_kernels(comm: MPI.Comm) -> None:
     """Compile the kernels of runs, branches and fits that are not kept yet.
 
-    The calls are divided over the ranks. Two ranks that need a kernel at the same time compile it twice: those of the
-    propagator's steps, which take longer than all others, are needed by runs and by breathers, and one rank has both.
-    All ranks must call it.
+    The calls are divided over the ranks: the propagator's steps take as long as all others. All ranks must call it.
     """
     parts: list[list[Callable[[], object]]] = [
         [partial(run, "propagator"), partial(follow, BREATHER)],
