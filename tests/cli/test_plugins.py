@@ -133,7 +133,7 @@ def test_validate_lists_the_parts_that_a_case_uses(folder, in_process):
         ("figure", "kinetic"): (str(folder / "pictures.py"), ""),
     }
     example = in_process("validate", EXAMPLE).stdout
-    assert f"  law          rubber-stop, registered by {EXAMPLE.with_name('own_law.py')}, version 1.0\n" in example
+    assert f" rubber-stop, registered by {EXAMPLE.with_name('own_law.py')}, version 1.0\n" in example
 
 
 def test_the_waveform_is_the_formula(folder):

@@ -11,7 +11,7 @@ import pytest
 
 from vipetsc.case import Case
 from vipetsc.case.verb_cases import VERB_CASES
-from vipetsc.cli.verb import DONE, FAILED, STOPPED, Outcome
+from vipetsc.cli.verb import DONE, FAILED, STOPPED, Outcome, default_folder
 from vipetsc.cli.verbs.plot_verb import pictures_of
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs, verb_of
 from vipetsc.io.folder import FolderError
@@ -134,10 +134,12 @@ def test_exit_codes_say_how_a_study_ended(call, drawn, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_help_names_the_folder_that_is_used(name):
-    """The help of --out has the folder of the results, which ends with the suffix of the verb."""
-    verb = VERBS[name]
-    (out,) = (argument for argument in verb.arguments if argument.flag == "--out")
-    assert f"runs/NAME{verb.suffix}," in out.keywords["help"]
+    """The help of --out has the folder of the results: the case's name, and the verb where the name lacks it."""
+    (out,) = (argument for argument in VERBS[name].arguments if argument.flag == "--out")
+    assert {"runs/NAME", "runs/NAME-VERB"} <= set(out.keywords["help"].split())
+    folder = "runs/chain" if name == "run" else f"runs/chain-{name}"
+    assert default_folder("chain", name) == Path(folder)
+    assert default_folder(f"{name}-hertz", name) == Path(f"runs/{name}-hertz")
 
 
 def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):

@@ -74,7 +74,7 @@ def test_same_bits_with_springs_that_are_not_linear(folder, ends):
         "lattice": {"cell": cell, "cells": 23, "ends": ends},
         "contacts": {"law": "hertz", "stiffness": 1e8, "restitution": 0.7, "sites": [7, 8, 12], "clearance": 1e-4},
         "drive": {"amplitude": 20.0, "cycles": 4, "frequency": 500.0},
-        "time": {"end": 0.03},
+        "time": {"engine": "ts", "end": 0.03},
     }
     runs_alike(folder, Case.from_table(table))
 
@@ -86,7 +86,7 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
         "lattice": {"preset": "diatomic", "cells": 31},
         "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
         "drive": {"amplitude": 40.0, "cycles": 10, "cell": 16, "mass": 2},
-        "time": {"end": 0.05},
+        "time": {"engine": "ts", "end": 0.05},
     }
     runs_alike(folder, Case.from_table(table))
 
