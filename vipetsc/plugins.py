@@ -30,8 +30,14 @@ NEVER_RESULTS = (register.FIGURE,)  # kinds of parts on which no number depends
 # them, since functions of modules ask by name for what runs contain. IndexError is not, since lists may be empty in one
 # run and not in the next. The last two are RuntimeErrors, which otherwise say that a run has failed.
 PROGRAMMING: tuple[type[Exception], ...] = (
-    *(TypeError, AttributeError, NameError, ImportError, SyntaxError, KeyError),
-    *(NotImplementedError, RecursionError),
+    TypeError,
+    AttributeError,
+    NameError,
+    ImportError,
+    SyntaxError,
+    KeyError,
+    NotImplementedError,
+    RecursionError,
 )
 
 

@@ -140,6 +140,8 @@ def test_the_help_names_the_folder_that_is_used(name):
     folder = "runs/chain" if name == "run" else f"runs/chain-{name}"
     assert default_folder("chain", name) == Path(folder)
     assert default_folder(f"{name}-hertz", name) == Path(f"runs/{name}-hertz")
+    # A word of the name counts, not some letters of it.
+    assert default_folder(f"out{name}", name).name == (f"out{name}" if name == "run" else f"out{name}-{name}")
 
 
 def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):

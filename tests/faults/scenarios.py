@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import dataclass, replace
 from functools import cache
@@ -52,6 +53,7 @@ sites = [1]
 amplitude = [0.1, 5.0, 10.0]
 """
 TEAM = SWEEP.replace("[sweep]", "[sweep]\nranks = 2\nfields = true")
+FOLLOW = SWEEP.replace("[sweep]", '[sweep]\nfields = true\nfollow = "up"')
 BRANCHES = """
 [nnm]
 system = "own"
@@ -285,6 +287,7 @@ SCENARIOS = {
             ranks=2,
         ),
         Scenario("sweep", SWEEP, f"sweep {OUT}"),
+        Scenario("sweep-follow", FOLLOW, f"sweep {OUT}", ranks=2),
         Scenario("sweep-team", TEAM, f"sweep {OUT}", ranks=3),
         Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
         Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
@@ -433,6 +436,11 @@ def _attributes(name: str, item: h5py.Dataset | h5py.Group) -> dict:
             continue
         if key == "statistics":
             found[f"{name}@{key}"] = _timeless(json.loads(value))
+        elif key == "case":
+            # A member that follows another one names the file of that one: its folder is that of this outcome, and its
+            # hash differs by the durations in it.
+            case = re.sub(r'path = ".*/(\w+/run\.h5)"', r"\1", str(value))
+            found[f"{name}@{key}"] = re.sub(r'(/run\.h5\ntime = \S+)\nsha256 = "\w+"', r"\1", case)
         else:
             found[f"{name}@{key}"] = _content_of(np.asarray(value))
     if isinstance(item, h5py.Dataset):

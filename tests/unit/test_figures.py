@@ -83,6 +83,7 @@ def impacts(episodes: int) -> dict[str, np.ndarray]:
         "approach_velocity": values,
         "separation": values.copy(),
         "indentation": values,
+        "impulse": values,
         "force": values,
         "loss": values,
     }

@@ -112,6 +112,14 @@ def test_waves_that_close_no_clearance_or_all_of_them():
         assert (word in sentences) if word else "clearance" not in sentences, factor
 
 
+def test_a_drive_of_many_frequencies_has_no_wave_to_compare():
+    """An impulse and a chirp send waves of many frequencies, none of which tells what closes."""
+    table = {"lattice": {"preset": "four-band", "cells": 24}, "contacts": {"sites": [6]}, "time": {"end": 0.01}}
+    for drive in {"waveform": "impulse", "duration": 1e-3}, {"waveform": "step", "ramp": 1e-3}:
+        sentences = Case.from_table(table | {"drive": {"amplitude": 1e-3} | drive}).warnings()
+        assert not any("clearance" in text for text in sentences)
+
+
 def test_the_wave_at_a_site_is_that_of_a_linear_run():
     """|w| of the wave at a site in the middle of a long lattice, without contact, is the clearance times the ratio."""
     case = small_case(

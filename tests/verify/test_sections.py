@@ -78,8 +78,21 @@ def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, follo
             ends[float(member["frequency"])] = state[:, 0], state[:, -1]
     order = sorted(ends, reverse=follow == "down")
     assert not ends[order[0]][0].any()
+    # A member is repeated from the same state.
+    again = Sweep.from_table(table).case_in(tmp_path, [2.4, 2.2, 2.3].index(order[1]))
+    assert simulate(again).dataset["displacement"].values[-1, 0, 0] == ends[order[1]][1][0]
     for before, after in pairwise(order):
         assert ends[after][0].tolist() == ends[before][1].tolist()
+
+
+def test_members_follow_one_another_along_numbers():
+    """A last axis without an order, and a sweep without fields, are refused by the key."""
+    for sweep, word in (
+        ({"fields": True, "drive": {"frequency": [2.2, 2.3]}, "contacts": {"law": ["bilinear", "hertz"]}}, "last axis"),
+        ({"drive": {"frequency": [2.2, 2.3]}}, "sweep.fields"),
+    ):
+        with pytest.raises(CaseError, match=f"sweep.follow.*{word}"):
+            Sweep.from_table(IMPACT | {"sweep": {"follow": "up"} | sweep})
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,8 +29,8 @@ from vipetsc.wording import counted, shortened
 # takes about a second: 0.6 ms a member, 5 us a site.
 MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
-# Ramp of a drive that goes on from the run before, in periods: its force is 0 there and grows to 6e-3 of its amplitude
-# meanwhile. A ramp must be positive.
+# Ramp, in periods, of a harmonic drive that goes on from the run before: the full force is there at once, as far as a
+# ramp, which must be positive, allows. A sine has grown to 6e-3 of its amplitude by then.
 SHORT_RAMP = 1e-3
 
 
@@ -98,6 +99,9 @@ class Sweep(StudyCase):
         axes, wrong = axes_of(values, options.zip)
         if options.follow != "none" and not options.fields:
             remedy = "needs the fields of each run, with which the next one begins: set sweep.fields = true"
+            problems.append(Problem("sweep.follow", options.follow, remedy))
+        if options.follow != "none" and axes and not _are_numbers(next(iter(axes[-1].values()))):
+            remedy = "needs numbers on the last axis, in whose order runs follow one another; move that key to the end"
             problems.append(Problem("sweep.follow", options.follow, remedy))
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
@@ -197,13 +201,18 @@ class Sweep(StudyCase):
         order = sorted(range(len(values)), key=lambda i: values[i], reverse=self.options.follow == "down")
         return numbers[..., order].reshape(-1, len(order)).tolist()
 
-    def following(self, number: int, path: str) -> Case:
-        """The case of the member ``number`` that begins with the last state of the run in ``path``.
+    def case_in(self, folder: Path, number: int) -> Case:
+        """Return the case of the member ``number`` of the sweep in a ``folder``, where members may follow one another.
 
-        Its harmonic drive is on from the beginning, since that of the run before was. Raises CaseError.
+        Such a member begins with the last state of the run before it, which ``folder`` has. Its harmonic drive is on
+        from the beginning, since that of the run before was. Raises CaseError.
         """
         case = self.case(number)
-        changes: dict[str, Any] = {"initial": {"kind": "file", "path": path}}
+        chain = next(chain for chain in self.chains() if number in chain)
+        if number == chain[0]:
+            return case
+        before = folder / self.ids()[chain[chain.index(number) - 1]] / "run.h5"
+        changes: dict[str, Any] = {"initial": {"kind": "file", "path": str(before.resolve())}}
         if case.drive.ramp is not None and case.drive.frequency:
             changes["drive"] = {"ramp": SHORT_RAMP * 2 * np.pi / case.drive.frequency}
         return case.varied(without=["initial"], **changes)
@@ -303,3 +312,8 @@ def coordinate(values: Iterable[Any]) -> np.ndarray:
             value = json.dumps(value)
         texts.append(value)
     return np.array(texts, dtype=object)
+
+
+def _are_numbers(values: Iterable[Any]) -> bool:
+    """Return whether all ``values`` are numbers, which have an order."""
+    return all(isinstance(value, int | float) for value in values)

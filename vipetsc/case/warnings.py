@@ -11,7 +11,7 @@ import numpy as np
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
 from vipetsc.case.schema import LatticeTable, OutputTable
-from vipetsc.case.wave_at_sites import wave_over_clearance
+from vipetsc.case.wave_at_sites import sends_one_wave, wave_over_clearance
 from vipetsc.io.tables import is_number
 from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
@@ -233,7 +233,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 def closing_warnings(model: Model) -> Iterator[str]:
     """Warnings of waves that close no clearance, and of ones far larger than the clearances."""
-    if not (model.chain.sites and model.first_drive_acts):
+    if not (model.chain.sites and sends_one_wave(model)):
         return
     ratios = wave_over_clearance(model).max(axis=1)
     # A wave that is evanescent has a warning of its own; stops that touch close by any wave.

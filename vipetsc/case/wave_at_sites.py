@@ -3,8 +3,13 @@
 import numpy as np
 
 from vipetsc.case.model import Model
-from vipetsc.lattice import UnitCell, bloch, waves_at
+from vipetsc.lattice import ToneBurst, UnitCell, bloch, waves_at
 from vipetsc.lattice.chain import Pair
+
+
+def sends_one_wave(model: Model) -> bool:
+    """Return whether the first drive of a ``model`` sends a wave of one frequency, for ``wave_over_clearance``."""
+    return model.first_drive_acts and (isinstance(model.drive, ToneBurst) or model.drive.repeats)
 
 
 def wave_over_clearance(model: Model) -> np.ndarray:

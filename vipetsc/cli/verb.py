@@ -7,6 +7,7 @@ study computes, the pictures are drawn, and the exit code says how the study end
 
 import argparse
 import os
+import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -140,9 +141,10 @@ def summary(data: "xr.Dataset") -> str:
 def default_folder(name: str, verb: str) -> Path:
     """Return the output folder of a ``verb`` for a case of that ``name``: one file may have sections of several verbs.
 
-    It is ``runs/NAME`` of a run, ``runs/NAME-VERB`` of every other verb unless the name has the verb in it already.
+    It is ``runs/NAME`` of a run, ``runs/NAME-VERB`` of every other verb unless a word of the name is the verb, as in
+    "nnm-hertz".
     """
-    if verb == "run" or verb in name:
+    if verb == "run" or verb in re.split(r"[\W_]+", name):
         return Path("runs") / name
     return Path("runs") / f"{name}-{verb}"
 

@@ -134,12 +134,18 @@ def rc_style(style: str | None = None) -> Iterator[None]:
     What a user's ``matplotlibrc`` says has precedence over the house, and the file ``style`` over both.
     """
     with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")):
-        settings = mpl.rc_params_from_file(mpl.matplotlib_fname(), use_default_template=False)
         # Where a user has no such file it is that of matplotlib, whose settings are the defaults.
+        settings = _settings(mpl.matplotlib_fname())
         mpl.rcParams.update({key: value for key, value in settings.items() if value != mpl.rcParamsDefault[key]})
         if style:
-            mpl.rcParams.update(mpl.rc_params_from_file(style, use_default_template=False))
+            mpl.rcParams.update(_settings(style))
         yield
+
+
+def _settings(file: str) -> dict[str, Any]:
+    """Return matplotlib's settings in a ``file``, without the backend: pictures in files need no windows."""
+    settings = mpl.rc_params_from_file(file, use_default_template=False)
+    return {key: value for key, value in settings.items() if key != "backend"}
 
 
 def with_prefix(value: float, unit: str) -> str:

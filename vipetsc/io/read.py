@@ -29,7 +29,7 @@ RUN_NEEDS = (
     *(f"energy/{name}" for name in ("kinetic", "spring", "contact", "work", "dissipated", "dissipated_by_site")),
     *(f"sites/{name}" for name in ("cell", "clearance")),
     *(f"impacts/{name}" for name in ("site", "side", "onset", "approach_velocity", "separation")),
-    *(f"impacts/{name}" for name in ("indentation", "force", "loss")),
+    *(f"impacts/{name}" for name in ("indentation", "force", "impulse", "loss")),
 )
 PARTS = "bands/part", "part"  # dimensions of pass bands and the gaps between them, of one run and of a sweep
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")

@@ -117,27 +117,24 @@ class SweepRuns:
         """Simulate the members with these ``numbers`` of a sweep whose members follow one another; returns how many.
 
         A chain of such members depends on the state of the one before, so that one team computes it, one run after the
-        other; ranks share chains, not their members. A chain goes on from its first missing member. Collective.
+        other; ranks share chains, not their members. Collective.
         """
-        missing = set(numbers)
-        # By the last member, whose record is that of the task. ``left`` are the members that have to be computed.
-        chains: dict[Key, list[int]] = {}
+        wanted = set(numbers)
+        # The missing members of each chain, by the last one, whose record is that of the task.
         left: dict[Key, list[int]] = {}
         for chain in self.plan.chains():
-            begin = next((i for i, number in enumerate(chain) if number in missing), None)
-            if begin is not None:
-                key = self.ids[chain[-1]]
-                chains[key] = chain
-                left[key] = chain[begin:]
+            missing = [number for number in chain if number in wanted]
+            if missing:
+                left[self.ids[missing[-1]]] = missing
 
         def make(key: Key) -> Record:
-            chain = chains[key]
-            while len(left[key]) > 1:
+            members = left[key]
+            while len(members) > 1:
                 began = time.process_time()
-                record = self._following_record(chain, left[key][0])
+                record = self._following_record(members[0])
                 record["cpu_seconds"] = round(time.process_time() - began, 4)
-                self.recorded.keep_part(self.ids[left[key].pop(0)], record, kind=MEMBER)
-            return self._following_record(chain, left[key][0])
+                self.recorded.keep_part(self.ids[members.pop(0)], record, kind=MEMBER)
+            return self._following_record(members[0])
 
         def fail(key: Key, reason: str) -> None:
             # Those behind a member that failed have no state to begin with.
@@ -145,21 +142,13 @@ class SweepRuns:
                 self.recorded.append(self.ids[number], {"reason": reason}, MEMBER)
 
         what = "chains of runs"
-        self.recorded.compute(chains, make, kind=MEMBER, what=what, progress=progress, keep=False, fail=fail)
-        return len(missing)
+        self.recorded.compute(left, make, kind=MEMBER, what=what, progress=progress, keep=False, fail=fail)
+        return len(wanted)
 
-    def _following_record(self, chain: Sequence[int], number: int) -> Record:
-        """Simulate the member ``number`` of a ``chain``, from the end of the one before it; returns its record."""
-        place = chain.index(number)
-
-        def case_of_member() -> Case:
-            if place == 0:
-                return self.plan.case(number)
-            before = self.folder / self.ids[chain[place - 1]] / "run.h5"
-            return self.plan.following(number, str(before.resolve()))
-
+    def _following_record(self, number: int) -> Record:
+        """Simulate the member ``number`` of a chain, from the end of the one before it; returns its record."""
         # One rank reads the state of the run before: on a network file system another one may not see it yet.
-        case = on_root(self.recorded.team, case_of_member)
+        case = on_root(self.recorded.team, lambda: self.plan.case_in(self.folder, number))
         record = self._simulate(case, self.folder / self.ids[number], None)
         return record | {"rtol": case.time.rtol}
 

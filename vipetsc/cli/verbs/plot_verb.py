@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -46,13 +46,17 @@ def window(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def width(text: str) -> int | float:
-    """The width in ``text``: an integer, of pixels of a movie, or with a unit inches of a picture, a float.
+class Width(NamedTuple):
+    """A width, of a movie in ``pixels`` or of a picture in ``inches``; the other one is None."""
 
-    Raises ArgumentTypeError for another text.
-    """
+    pixels: int | None
+    inches: float | None
+
+
+def width(text: str) -> Width:
+    """Return the width in ``text``: pixels without a unit; raises ArgumentTypeError for another text."""
     if text.isdigit():
-        return int(text)
+        return Width(pixels=int(text), inches=None)
     unit = text[-2:]
     narrowest, widest = PAGE_WIDTHS
     try:
@@ -64,7 +68,7 @@ def width(text: str) -> int | float:
             f"{text} is neither a width with a unit, such as 86mm (1in to 40in; {', '.join(LENGTHS)}), nor pixels of a"
             " movie"
         )
-    return inches
+    return Width(pixels=None, inches=inches)
 
 
 def label(text: str) -> tuple[str, str]:
@@ -121,13 +125,15 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     on_root(comm, lambda: remove_abandoned(folders[0] / "figures"))
     formats = set(options.format or ())
     movie_options = {name: getattr(options, name) for name in MOVIE_ARGUMENTS if getattr(options, name) is not None}
-    is_page_width = isinstance(movie_options.get("width"), float)
+    size = movie_options.pop("width", Width(None, None))
+    if size.pixels is not None:
+        movie_options["width"] = size.pixels
 
     if options.movie:
         unsuitable = sorted(formats - {*MOVIE_FORMATS})
         if options.fig:
             unsuitable.append("--fig")
-        if is_page_width:
+        if size.inches is not None:
             unsuitable.append("a width in mm, cm, in or pt; give pixels")
         if unsuitable:
             raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {unsuitable[0]}")
@@ -138,8 +144,6 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
             echo(comm, f"vipetsc: {missing}", sys.stderr)
         return DONE
 
-    if is_page_width:
-        del movie_options["width"]
     misplaced = [MOVIE_ARGUMENTS[name].flag for name in movie_options]
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
@@ -148,14 +152,17 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         raise FolderError("--record: applies only to pictures of runs, as --fig points")
     names = options.fig or (["points"] if options.record else None)
     formats_asked = tuple(options.format or ("png",))
-    look = on_root(comm, lambda: look_of(options))
+    look = on_root(comm, lambda: look_of(options, size.inches))
     drawn = draw_pictures(pictures, folders, comm, names, formats_asked, look=look, records=options.record)
     echo_paths(comm, drawn)
     return DONE
 
 
-def look_of(options: argparse.Namespace) -> "Look":
-    """The look of pictures that the options ask for, on one rank; raises FolderError for a style that is not one."""
+def look_of(options: argparse.Namespace, inches: float | None) -> "Look":
+    """Return the look of pictures that the options ask for, with a width in ``inches`` or that of each figure.
+
+    Called on one rank. Raises FolderError for a style that is not one.
+    """
     import matplotlib as mpl
 
     from vipetsc.figures.look import Look
@@ -165,8 +172,14 @@ def look_of(options: argparse.Namespace) -> "Look":
             mpl.rc_params_from_file(options.style, use_default_template=False)
         except (OSError, ValueError) as error:
             raise FolderError(f"--style {options.style}: {error}") from None
-    width_asked = options.width if isinstance(options.width, float) else None
-    return Look(options.style, width_asked, options.unit, options.decibels, dict(options.labels), options.titles)
+    return Look(
+        style=options.style,
+        width=inches,
+        unit=options.unit,
+        decibels=options.decibels,
+        labels=dict(options.labels),
+        titles=options.titles,
+    )
 
 
 def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:

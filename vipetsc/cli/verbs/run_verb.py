@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vipetsc.case import Case, Model, Sweep
-from vipetsc.case.wave_at_sites import wave_over_clearance
+from vipetsc.case import Case, CaseError, Model, Problem, Sweep
+from vipetsc.case.wave_at_sites import sends_one_wave, wave_over_clearance
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
 from vipetsc.cli.case_rows import lattice_rows
@@ -51,7 +51,14 @@ def load(options: argparse.Namespace) -> Case:
 
     plan = _sweep_of(options)
     number = plan.number(options.member)
-    return plan.case(number).varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
+    case = plan.case(number)
+    if plan.options.follow != "none":
+        folder = Path(options.case)
+        if not folder.is_dir():
+            remedy = "begins with the end of another member; give the folder of the finished sweep, not its file"
+            raise CaseError([Problem("--member", options.member, remedy)])
+        case = plan.case_in(folder, number)
+    return case.varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
 
 
 def _sweep_of(options: argparse.Namespace) -> Sweep:
@@ -166,7 +173,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
 
 def _closing(model: Model) -> str:
     """Return the linear wave over the clearance of each site, the nearer stop of two; "" without a wave or a site."""
-    if not (model.chain.sites and model.first_drive_acts):
+    if not (model.chain.sites and sends_one_wave(model)):
         return ""
     ratios = wave_over_clearance(model).max(axis=1)
     return first_few([f"{ratio:.3g}" if ratio < np.inf else "touching" for ratio in ratios])
