@@ -212,8 +212,7 @@ class NfrcCase(Case):
             if contacts.sites in (0, []) and valid("lattice"):
                 cell, _ = check_cell(sections["lattice"])
                 if cell is not None and not sections["lattice"].nonlinear_keys:
-                    remedy = "give a cell with a contact, or a spring that is not linear"
-                    yield Problem("contacts.sites", contacts.sites, remedy)
+                    yield from _check_linear(sections, valid)
 
     def warnings(self) -> list[str]:
         """No warnings: those about runs in time do not concern steady states."""
@@ -264,6 +263,12 @@ class NfrcCase(Case):
         if self.contacts.each and self.contacts.each.restitution:
             return laws
         return [replace(law, restitution=restitution) for law in laws]
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the lattice has neither contacts nor nonlinear springs, so that its response is proportional."""
+        chain = self.model().chain
+        return not chain.sites and chain.is_linear
 
     @property
     def are_contacts_springs(self) -> bool:
@@ -379,6 +384,26 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
+
+
+def _check_linear(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+    """Problems with the curve of a linear lattice: a force or a wall moves named masses, over amplitude or frequency.
+
+    Other keys of ``[nfrc]`` are of stability and continuation, which it does not have.
+    """
+    nfrc = sections["nfrc"]
+    if nfrc.source == "wave":
+        yield Problem("nfrc.source", "wave", 'the lattice is linear, and a wave travels unchanged; use "force"')
+    if nfrc.varies_key:
+        remedy = "the response of a linear lattice is computed over the frequency; list values in [nfrc.family]"
+        yield Problem("nfrc.over", nfrc.over, remedy)
+    for key in ("subharmonic", "isolas", "switch", "curves_of", "points_at"):
+        value = getattr(nfrc, key)
+        if value != NfrcTable.model_fields[key].get_default(call_default_factory=True):
+            yield Problem(f"nfrc.{key}", value, "a linear lattice has no such motions; remove it")
+    if valid("output") and not (sections["output"].points or sections["output"].forces):
+        remedy = "name the masses whose response you want, or give cells with contacts"
+        yield Problem("output.points", sections["output"].points, remedy)
 
 
 def _check_points_at(nfrc: NfrcTable, measures: Mapping[str, Any]) -> Iterator[Problem]:

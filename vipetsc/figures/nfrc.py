@@ -43,6 +43,8 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
     Raises OSError or ValueError for a file that holds no response.
     """
     branches = responses_in(paths, "share")
+    if not all(map(has_places, branches)):
+        raise style.NoPicture("needs contacts or nonlinear springs; the outputs show linear responses")
     if all("special" in branch.attrs for branch in branches):
         return response_page(branches, [_draw_plane], height=2.6)
     rows = [_draw_displacement]
@@ -53,6 +55,26 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
         rows.append(_draw_energies)
 
     return response_page(branches, rows, height=2.3 * len(rows))
+
+
+def has_places(branch: xr.Dataset) -> bool:
+    """Return whether a curve is that of a lattice with contacts or nonlinear springs; others have a linear response."""
+    return bool(branch.sizes["site"]) or "largest_elongation" in branch
+
+
+def draw_linear(axes: Axes, branch: xr.Dataset, name: str, number: int, scale: float = 1.0) -> None:
+    """Draw ``scale`` times the quantity of that ``name`` in linear motion, which is grey and lies behind all else.
+
+    ``number`` is that of its site, spring, location or pair. Files of curves by a wave do not have it.
+    """
+    values = branch.get(f"linear_{name}")
+    if values is None:
+        return
+    curve = np.where(np.isfinite(values[:, number]), values[:, number], np.nan)
+    low, high = axes.get_ylim()
+    axes.plot(branch["linear"], scale * curve, color=style.GREY, lw=1.6, alpha=0.5, zorder=0.5, label="linear")
+    # A resonance without contacts may be far higher than all states: these are what the panel shows.
+    axes.set_ylim(low, high)
 
 
 def has_fractions(branch: xr.Dataset) -> bool:
@@ -161,12 +183,13 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     # clearances may change.
     if clearance.size and np.all(clearance > 0) and "parameter" not in branch:
         motion_label = "largest |w| / clearance"
-        relative = largest / clearance
+        scale = 1 / clearance
     else:
         motion_label = "largest elongation (mm)"
         if branch.sizes["site"]:
             motion_label = "largest |w| (mm)"
-        relative = 1e3 * largest
+        scale = np.full(largest.shape[1], 1e3)
+    relative = scale * largest
     size = relative[:, 0]
 
     # One entry of the legend stands for all of them.
@@ -200,6 +223,8 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     draw_undecided(axes, parameter, size, unstable, style.BLACK)
 
     draw_special(axes, branch, size, labelled=True)
+    name = "largest" if branch.sizes["site"] else "largest_elongation"
+    draw_linear(axes, branch, name, 0, scale=scale[0])
     axes.set_ylabel(motion_label)
     axes.legend(fontsize=6, loc="best")
 

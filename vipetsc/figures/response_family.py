@@ -16,7 +16,15 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, parameter_label, parameter_of, responses_in
+from vipetsc.figures.nfrc import (
+    draw_special,
+    has_places,
+    lag_of,
+    largest_motions,
+    parameter_label,
+    parameter_of,
+    responses_in,
+)
 from vipetsc.figures.stability import UNDECIDED, StabilityLook, draw_states
 from vipetsc.figures.style import NoPicture
 from vipetsc.figures.swept_axes import SweptKey
@@ -43,17 +51,24 @@ def response_family(paths: Sequence[Path]) -> Figure:
     if len({str(curve.attrs["over"]) for curve in curves}) > 1:
         raise NoPicture("needs curves over the same parameter")
 
-    rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
-    labels = ["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"]
+    rows: list[Callable[[xr.Dataset], np.ndarray]] = []
+    labels: list[str] = []
+    with_places = all(map(has_places, curves))
+    if with_places:
+        rows.append(_relative)
+        labels.append("largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)")
     locations = _common_locations(curves)
     for name in locations[:MOST_LOCATIONS]:
         rows.append(partial(_displacement, name=name))
         labels.append(f"displacement\nof {name} (m)")
     nfrc = NfrcCase.of(curves[0]).nfrc
-    has_phase = nfrc.source == "force" and nfrc.over == "frequency"
+    has_phase = with_places and nfrc.source == "force" and nfrc.over == "frequency"
     if has_phase:
         rows.append(lag_of)
         labels.append("phase lag (degrees)")
+
+    if not rows:
+        raise NoPicture("needs named masses that all curves have, or contacts or nonlinear springs in all")
 
     names = legend_of(curves)
     height = 1.7 * len(rows) + 0.3

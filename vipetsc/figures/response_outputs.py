@@ -3,20 +3,22 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, responses_in
+from vipetsc.figures.nfrc import draw_linear, draw_special, has_places, parameter_of, response_page, responses_in
 from vipetsc.figures.stability import StabilityLook, draw_states
 from vipetsc.figures.style import NoPicture
 from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
 
-# Labels of the rows of the page by the quantities that they show.
-AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
+# Units of the motions of named masses, each of which has a row of the page.
+AMPLITUDES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 # Lines of locations, which differ in greyscale print.
 DASHES = ("-", style.DASHED, "-.", style.DOTTED)
 
@@ -43,6 +45,8 @@ def response_outputs(paths: Sequence[Path]) -> Figure:
     if _all_have(curves, "lag"):
         rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]
         rows.append(_draw_lag)
+    if _all_have(curves, "transmission"):
+        rows.append(_draw_transmission)
     if _all_have(curves, "largest_force"):
         rows.append(_draw_forces)
 
@@ -50,15 +54,60 @@ def response_outputs(paths: Sequence[Path]) -> Figure:
 
 
 def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
-    """Draw the largest value of a ``quantity`` at each location, and thin the amplitude of its first harmonic."""
+    """Draw the largest value of a ``quantity`` at each location, and thin the amplitude of its first harmonic.
+
+    A linear response is proportional to the drive: it is drawn in decibels, over the drive's amplitude.
+    """
+    unit = AMPLITUDES[quantity]
+    if not has_places(curve):
+        _draw_frequency_response(axes, curve, quantity)
+        return
     for number, name in enumerate(curve["location"].values.astype(str)):
         _draw_states(axes, curve, curve[f"peak_{quantity}"].values[:, number], number, label=name)
         first = curve[f"first_{quantity}"].values[:, number]
         axes.plot(parameter_of(curve), first, color=style.band_colour(number + 1), lw=0.4, alpha=0.7)
-    axes.set_ylabel(AMPLITUDES[quantity])
+    for number in range(curve.sizes["location"]):
+        draw_linear(axes, curve, f"peak_{quantity}", number)
+    axes.set_ylabel(f"{quantity} ({unit})")
     if quantity == "displacement":
         axes.plot([], [], color=style.GREY, lw=0.4, label="first harmonic")
-        axes.legend(fontsize=6, loc="best")
+        _legend(axes)
+
+
+def _draw_frequency_response(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
+    """Draw the level of a ``quantity`` of linear motion over the drive at each location."""
+    for number, name in enumerate(curve["location"].values.astype(str)):
+        level = decibels(curve[f"first_{quantity}"].values[:, number] / curve["amplitude"].values)
+        _draw_states(axes, curve, level, number, label=name)
+    drive_unit = "m" if NfrcCase.of(curve).drive.end else "N"
+    axes.set_ylabel(f"{quantity}\n(dB re 1 {AMPLITUDES[quantity]} per {drive_unit})")
+    if quantity == "displacement":
+        _legend(axes)
+
+
+def _draw_transmission(axes: Axes, curve: xr.Dataset) -> None:
+    """Draw the level of the transmission of each pair of locations, of rms velocities."""
+    for number, name in enumerate(curve["pair"].values.astype(str)):
+        _draw_states(axes, curve, decibels(curve["transmission"].values[:, number]), number, label=name)
+    if "linear_transmission" in curve:
+        of_linear = curve.assign(linear_transmission=decibels(curve["linear_transmission"]))
+        for number in range(curve.sizes["pair"]):
+            draw_linear(axes, of_linear, "transmission", number)
+    axes.set_ylabel("transmission (dB)")
+    _legend(axes)
+
+
+def decibels(ratio: Any) -> Any:
+    """Return the level of a ``ratio`` of amplitudes in dB."""
+    with np.errstate(divide="ignore"):
+        return 20 * np.log10(ratio)
+
+
+def _legend(axes: Axes) -> None:
+    """Draw a legend with one entry for each label."""
+    handles, labels = axes.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    axes.legend(list(entries.values()), list(entries), fontsize=6, loc="best")
 
 
 def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
@@ -67,6 +116,12 @@ def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
         # Files have lags from 0 to 360 degrees, between which a curve would jump across the panel.
         lag = panels.continuous_phase(curve["lag"].values[:, number], begin=-panels.ROUNDING)
         _draw_states(axes, curve, lag, number)
+        # Grey lines have the same revolution as the curve at its beginning.
+        if "linear_lag" in curve:
+            linear = panels.continuous_phase(curve["linear_lag"].values[:, number], begin=-panels.ROUNDING)
+            of_linear = curve.copy()
+            of_linear["linear_lag"][:, number] = linear
+            draw_linear(axes, of_linear, "lag", number)
     axes.set_ylabel("phase lag (degrees)")
     panels.mark_degrees(axes)
 

@@ -56,6 +56,18 @@ OUTPUTS = {
 }
 """The measures that a file has if its case asks for them in ``[output]``, and the ``parameter``, if a key varies."""
 
+LINEAR = "linear"
+"""The dimension of linear motions, which the files of nonlinear curves have for comparison."""
+
+LINEAR_OUTPUTS = (
+    *(f"peak_{quantity}" for quantity in ("displacement", "velocity", "acceleration")),
+    "lag",
+    "largest_elongation",
+    "transmission",
+    "largest_wall_force",
+)
+"""The outputs that they have of these motions, named ``linear_<output>``."""
+
 
 class CurvePart(NamedTuple):
     """A part of a curve (point,): the ``parameter`` that varies, the ``values`` of a response, the ``length`` along it.

@@ -135,6 +135,11 @@ class Follower:
     def _follow_one(self, branch: Branch[Any], job: int, direction: int) -> None:
         """Compute the points of a branch, then what its file holds of the whole branch (``Method.finish``)."""
         method = self.method
+        points = method.computed(job)
+        if points is not None:
+            branch.points = points
+            branch.ended = Ending.END_OF_RANGE.with_numbers(end=method.case.nfrc.range[1])
+            return
         problem = method.problem(job)
         interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
         try:

@@ -83,6 +83,10 @@ class Method(ABC, Generic[S]):
     def start(self, problem: PeriodicProblem[S], job: int, stop: StopRequest | None = None) -> S:
         """The first point of a branch; StoppedError is raised where that takes long and a ``stop`` is requested."""
 
+    def computed(self, job: int) -> list[S] | None:
+        """All points of a branch that needs no continuation; None of others, which are followed."""
+        return None
+
     def stopped_by(self, problem: PeriodicProblem[S], stop: StopRequest) -> AbstractContextManager[None]:
         """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
 

@@ -32,6 +32,7 @@ from vipetsc.modes.response.isolated import (
     unknown_states,
 )
 from vipetsc.modes.response.keyed_case import KeyedCase
+from vipetsc.modes.response.linear import linear_states, linear_variables
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
@@ -112,15 +113,35 @@ class ResponseMethod(Method[Response]):
         """The equations of a curve."""
         return self._equations(self.curves[job], self.curves[job].case)
 
+    def computed(self, job: int) -> list[Response] | None:
+        """The linear motions of a lattice without contacts and nonlinear springs."""
+        curve = self.curves[job]
+        if not curve.case.is_linear:
+            return None
+        return list(linear_states(curve.case, curve.fixed, self._compliance_of(curve)))
+
+    def finish(self, problem: PeriodicProblem[Response], branch: Branch[Response]) -> None:
+        """Add the linear motions under a force or a wall, with which a curve is compared."""
+        if not isinstance(problem, SteadyStates) or problem.wave:
+            return
+        options = problem.options
+        fixed = problem.parameter.fixed
+        states = list(linear_states(problem.case, fixed, problem.compliance))
+        branch.extra |= linear_variables(states, options.over)
+
     def _equations(self, curve: ResponseCurve, case: NfrcCase) -> SteadyStates | StatesOverKey:
         """The equations of a ``curve``, with the harmonics of a ``case``."""
         options = case.nfrc
         if options.varies_key:
             keyed = KeyedCase(case, curve.restitution, curve.fixed)
             return StatesOverKey(keyed.at, options.over, curve.fixed, options)
+        return SteadyStates(case, curve.restitution, curve.fixed, compliance=self._compliance_of(curve))
+
+    def _compliance_of(self, curve: ResponseCurve) -> WaveCompliance | ModalCompliance:
+        """The compliance of the lattice of a ``curve``."""
         if self._compliance is None or self._compliance[0] != curve.member:
-            self._compliance = curve.member, compliance_of(case)
-        return SteadyStates(case, curve.restitution, curve.fixed, compliance=self._compliance[1])
+            self._compliance = curve.member, compliance_of(curve.case)
+        return self._compliance[1]
 
     def start(self, problem: PeriodicProblem[Response], job: int, stop: StopRequest | None = None) -> Response:
         """The state at the beginning of the range."""
@@ -282,7 +303,8 @@ def _without_curve(name: str) -> tuple[str, str]:
 def _axes(case: NfrcCase) -> Variables:
     """Coordinates of the variables of states: sites, harmonics, channels, points and pairs that [output] names."""
     chain = case.model().chain
-    orders = np.arange(case.nfrc.harmonics + 1)
+    last_harmonic = 1 if case.is_linear else case.nfrc.harmonics
+    orders = np.arange(last_harmonic + 1)
     axes = {
         "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
         "order": variable("order", orders, "1", "harmonic of the motion"),

@@ -122,8 +122,11 @@ def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
     parameter = sign * parameter_values(branch)
-    # The first contact stands for the state; without contacts the first spring that is not linear.
-    name = "largest_elongation"
+    # The first contact stands for the state; without contacts the first spring that is not linear. A linear lattice has
+    # one state at each value of the parameter.
+    size = np.zeros(len(parameter))
     if branch.dofs:
-        name = "largest"
-    return ParameterSweep(parameter, size=measure(branch, name)[:, 0], stable=with_stable_folds(stable, fold))
+        size = measure(branch, "largest")[:, 0]
+    elif "largest_elongation" in outputs_of(branch):
+        size = measure(branch, "largest_elongation")[:, 0]
+    return ParameterSweep(parameter, size=size, stable=with_stable_folds(stable, fold))

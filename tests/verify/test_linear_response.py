@@ -1,0 +1,98 @@
+"""Linear frequency responses of nfrc against the dense solution of the equations of motion, and their pictures."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from tests.rigs import TWO_MASSES
+from vipetsc.case.case_file import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.cli.main import main
+from vipetsc.figures.response_outputs import response_outputs
+from vipetsc.io.read import open_results
+
+POINTS = {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 3}], "transmission": [["near", "far"]]}
+OVER = {"source": "force", "over": "frequency", "range": [0.4, 2.6], "fixed": [0.2], "points": 45}
+WALL = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"}
+FORCE = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "cell": 2, "mass": 1}
+
+
+def table(**changes):
+    """The rig of two masses, made three, without contacts, and with ``changes`` of its sections."""
+    case = copy.deepcopy(TWO_MASSES)
+    case["lattice"]["cells"] = 3
+    del case["lattice"]["cell"]["contact"]
+    return case | {"contacts": {"sites": []}, "output": POINTS, "nfrc": OVER} | changes
+
+
+def curve_of(case: dict, folder):
+    """The file of the only curve of a case, computed by the verb."""
+    path = folder / "case.toml"
+    path.write_text(NfrcCase.from_table(case).to_toml())
+    assert main(["nfrc", str(path), "--out", str(folder / "out"), "--quiet"]) == 0
+    (file,) = (folder / "out").glob("branch-*.h5")
+    return open_results(file)
+
+
+@pytest.mark.parametrize("damping", [0.06, 0.0])
+@pytest.mark.parametrize("drive, ends", [(WALL, "fixed"), (FORCE, "fixed"), (FORCE, "free"), (FORCE, "periodic")])
+def test_the_linear_response_is_the_dense_solution(drive, ends, damping, tmp_path):
+    """Compares displacement, velocity, acceleration, phase and transmission of two masses on the whole grid."""
+    case = table(drive=drive, nfrc=OVER | {"infinite": False})
+    case["lattice"] |= {"ends": ends, "damping": {"mass": damping}}
+    if not damping:
+        del case["lattice"]["damping"]
+    with curve_of(case, tmp_path) as curve:
+        chain = NfrcCase.from_table(case).model().chain
+        load = np.zeros(3)
+        # The spring of the wall pulls with 1.5 N/m.
+        load[0 if drive is WALL else 1] = 0.2 * (1.5 if drive is WALL else 1.0)
+        omega = np.linspace(0.4, 2.6, 45)
+        stiffness = chain.stiffness_matrix().toarray()
+        loss = chain.damping_rows(0, 3).toarray()
+        u = np.array([np.linalg.solve(stiffness + 1j * w * loss - w**2 * np.eye(3), load) for w in omega])[:, [0, 2]]
+
+        np.testing.assert_allclose(curve["frequency"], omega)
+        for power, quantity in enumerate(("displacement", "velocity", "acceleration")):
+            size = np.abs(u) * omega[:, None] ** power
+            np.testing.assert_allclose(curve[f"first_{quantity}"], size, rtol=1e-9)
+            # The peak is that of a parabola through samples.
+            np.testing.assert_allclose(curve[f"peak_{quantity}"], size, rtol=2e-3)
+        turned = np.exp(-1j * np.radians(curve["lag"].values))
+        np.testing.assert_allclose(turned, u / np.abs(u), atol=1e-8)
+        np.testing.assert_allclose(curve["transmission"][:, 0], np.abs(u[:, 1] / u[:, 0]), rtol=1e-9)
+    assert (tmp_path / "out" / "figures" / f"outputs-{curve.attrs['name']}.png").exists()
+
+
+def test_the_linear_response_lies_behind_a_nonlinear_one(tmp_path):
+    """States that touch no stop are linear motions, which the file has beside them; others are not."""
+    case = copy.deepcopy(TWO_MASSES)
+    case |= {"output": POINTS | {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}]}}
+    case["nfrc"] |= {"range": [0.6, 1.4], "fixed": [0.1], "points": 200}
+    with curve_of(case, tmp_path) as curve:
+        free = curve["episodes"].values == 0
+        assert free.any() and not free.all()
+        for name, at in (("peak_displacement", 1), ("lag", 0), ("transmission", 0), ("largest", 0)):
+            here = np.interp(curve["frequency"], curve["linear"], curve[f"linear_{name}"][:, at])
+            states = curve[name].values[:, at]
+            np.testing.assert_allclose(states[free], here[free], rtol=5e-3)
+            assert np.abs(states / here - 1)[~free].max() > 0.02
+        figure = response_outputs([tmp_path / "out" / f"branch-{curve.attrs['name']}.h5"])
+        assert all("linear" in axes.get_legend_handles_labels()[1] for axes in figure.axes)
+
+
+@pytest.mark.parametrize(
+    "changes, key",
+    [
+        ({"output": {}}, "output.points"),
+        ({"nfrc": OVER | {"subharmonic": 3, "isolas": 1}}, "nfrc.subharmonic"),
+        ({"nfrc": {"source": "wave", "range": [0.4, 2.6]}}, "nfrc.source"),
+    ],
+)
+def test_a_linear_lattice_has_nothing_else_to_follow(changes, key):
+    """Names the key that asks for a motion which a linear lattice does not have."""
+    with pytest.raises(CaseError, match=key):
+        NfrcCase.from_table(table(**changes))
