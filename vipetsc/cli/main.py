@@ -117,6 +117,8 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
             options.set = [*options.set, *(f"petsc.{name}={value}" for name, value in petsc.items())]
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: one starts again, the other continues")
+        if getattr(options, "force", False) and getattr(options, "extend", False):
+            raise FolderError("--force and --extend exclude each other: one starts again, the other goes on")
 
         # A verb that never looks at the request has nothing to save, and is ended by the signal at once.
         with StopRequest().listening() as stop, nullcontext() if verb.is_stoppable else stop.at_once():

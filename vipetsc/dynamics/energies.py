@@ -268,10 +268,11 @@ class EnergyMeter:
 
         speed = model.scale * model.drive.frequency
         # The motion's scale in as many cells as the drive's wave train covers; an initial state may be in all cells.
+        # The end of the run does not count: a run that is extended has the bits of one long run.
         cells = float(model.chain.cells)
-        if not model.initial:
-            duration = min(max(drive.waveform.duration for drive in model.drives), model.end)
-            cells = duration * model.speed
+        duration = max(drive.waveform.duration for drive in model.drives)
+        if not model.initial and duration < np.inf:
+            cells = min(duration * model.speed, cells)
         scale = sum(model.chain.cell.masses) * speed**2 * max(cells, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - _UNIT_BITS))
         self.largest = self.unit * LARGEST

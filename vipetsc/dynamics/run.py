@@ -61,6 +61,7 @@ def simulate(
     *,
     force: bool = False,
     resume: bool = False,
+    extend: bool = False,
     stop: StopRequest | None = None,
     progress: bool = False,
     observers: Sequence[type[Observer]] = (),
@@ -75,7 +76,8 @@ def simulate(
         Output folder; without one the run is held in memory, and is lost where it is stopped. An unfinished run of the
         same case in the folder is resumed, to the same bits; one that has ended is not simulated again. ``force``
         begins anew and replaces the run in the folder when the new one has ended; ``resume`` requires an unfinished
-        run. ``result.dataset`` is the run as an xarray dataset.
+        run. ``extend`` goes on from the end of a run whose case ends earlier and is otherwise the same, to the bits of
+        one long run. ``result.dataset`` is the run as an xarray dataset.
     comm
         The ranks over which the lattice is distributed; a ``RunMemory`` has its own.
     stop
@@ -129,8 +131,11 @@ def simulate(
             return replace(result, held=memory.dataset)
         return result
 
-    with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume) as claim:
-        output = RunFolder(claim.folder, comm)
+    output = RunFolder(Path(target), comm)
+    obstacle = output.extension_obstacle if extend else None
+    with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume, extend=obstacle) as claim:
+        # Also without ``extend``: a command that was to extend the run may have been killed.
+        output.reopen(model.end)
         # A run that a kill has ended after its file was written is complete.
         ended = output.ending()
         if ended:
@@ -313,15 +318,16 @@ class Run:
         self.setup.output.save_state(state)
 
     def finish(self, ended: Ended, begin: Begin, note: dict[str, str]) -> Result:
-        """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
+        """Write the last checkpoint of a run that was stopped or can be extended, and the files of one that ended."""
         engine = self.setup.engine
         output = self.setup.output
         comm = self.setup.output.comm
         sentence = ended.sentence
         is_stopped = ended.ending is Ending.STOPPED
         is_complete = ended.ending is Ending.COMPLETE
-        if is_stopped:
+        if is_stopped or (is_complete and isinstance(output, RunFolder)):
             self.checkpoint(stopped=True)
+        if is_stopped:
             sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         statistics["effective_restitution"] = self.setup.model.effective_restitution

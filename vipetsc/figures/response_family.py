@@ -51,24 +51,12 @@ def response_family(paths: Sequence[Path]) -> Figure:
     if len({str(curve.attrs["over"]) for curve in curves}) > 1:
         raise NoPicture("needs curves over the same parameter")
 
-    rows: list[Callable[[xr.Dataset], np.ndarray]] = []
-    labels: list[str] = []
-    with_places = all(map(has_places, curves))
-    if with_places:
-        rows.append(_relative)
-        labels.append("largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)")
-    locations = _common_locations(curves)
-    for name in locations[:MOST_LOCATIONS]:
-        rows.append(partial(_displacement, name=name))
-        labels.append(f"displacement\nof {name} (m)")
-    nfrc = NfrcCase.of(curves[0]).nfrc
-    has_phase = with_places and nfrc.source == "force" and nfrc.over == "frequency"
-    if has_phase:
-        rows.append(lag_of)
-        labels.append("phase lag (degrees)")
-
-    if not rows:
+    quantities = _quantities(curves)
+    if not quantities:
         raise NoPicture("needs named masses that all curves have, or contacts or nonlinear springs in all")
+    labels, rows = zip(*quantities.items(), strict=True)
+    has_phase = lag_of in rows
+    locations = _common_locations(curves)
 
     names = legend_of(curves)
     height = 1.7 * len(rows) + 0.3
@@ -96,6 +84,20 @@ def response_family(paths: Sequence[Path]) -> Figure:
     if len(locations) > MOST_LOCATIONS:
         style.add_note(figure, f"the first {MOST_LOCATIONS} of {len(locations)} named masses")
     return figure
+
+
+def _quantities(curves: Sequence[xr.Dataset]) -> dict[str, Callable[[xr.Dataset], np.ndarray]]:
+    """Return what the rows of the page show of each of ``curves``, by the labels of their axes."""
+    quantities: dict[str, Callable[[xr.Dataset], np.ndarray]] = {}
+    with_places = all(map(has_places, curves))
+    if with_places:
+        quantities["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"] = _relative
+    for name in _common_locations(curves)[:MOST_LOCATIONS]:
+        quantities[f"displacement\nof {name} (m)"] = partial(_displacement, name=name)
+    nfrc = NfrcCase.of(curves[0]).nfrc
+    if with_places and nfrc.source == "force" and nfrc.over == "frequency":
+        quantities["phase lag (degrees)"] = lag_of
+    return quantities
 
 
 def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:

@@ -181,6 +181,31 @@ def log_columns(log: np.ndarray) -> Arrays:
     return columns
 
 
+def part_of(file: h5py.File, number: int, count: int) -> Arrays:
+    """Return chunk ``number`` of the ``count`` chunks into which the samples of a run's ``file`` are divided again.
+
+    Episodes that were open at the end of the run are left out: they go on.
+    """
+
+    def part(name: str) -> np.ndarray:
+        values = file[name]
+        n = len(values)
+        return np.asarray(values[n * number // count : n * (number + 1) // count])
+
+    present = [name for name in (*SAMPLED, DAMPED, *MOTION, LOSSES, FORCES) if name in file]
+    arrays = {name: part(name) for name in present}
+    arrays.setdefault("field_time", arrays["time"])
+    fields = [name for name in ("displacement", "velocity") if name in file]
+    arrays |= {name: np.moveaxis(part(name), 1, -1) for name in fields}
+
+    columns = {name.removeprefix("impacts/"): part(name) for name in LARGE if name.startswith("impacts/")}
+    log = np.zeros(len(columns["onset"]), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        log[name] = values
+    arrays["impacts"] = log[np.isfinite(log["separation"])]
+    return arrays
+
+
 def put_chunks(datasets: Mapping[str, h5py.Dataset], output: Chunks) -> None:
     """Copy the variables to which ``datasets`` belong, fields or over sites, from all chunks.
 

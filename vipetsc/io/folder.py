@@ -38,12 +38,14 @@ MOST_NAMED = 6  # keys of another case that a message names: more do not help to
 REPLACED = ".replaced"
 # What verbs leave beside the results themselves in a folder of any kind, as patterns of ``Path.glob``.
 ACCOMPANYING = (
-    "figures", "curves", "law", "summary.json", "analysis.h5", "run.xdmf", "branch-*.csv", "backbone.h5",
+    "figures", "curves", "law", "summary.json", "end-state", "analysis.h5", "run.xdmf", "branch-*.csv", "backbone.h5",
     "best*.toml", "identified.toml",
 )  # fmt: skip
 
 Difference = Callable[[str], str | None]
 """Takes the text of an earlier case; returns why its results are not the wanted ones, or None if they are."""
+Obstacle = Callable[[], str | None]
+"""Returns why results cannot go on from their end, or None if they can."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ def claimed(
     force: bool = False,
     resume: bool = False,
     difference: Difference | None = None,
+    extend: Obstacle | None = None,
 ) -> Iterator[Claim]:
     """Claim the folder ``path`` for results of ``kind``: start new results, or continue those of the same case.
 
@@ -101,20 +104,30 @@ def claimed(
         Only continue existing results.
     difference
         What makes results those of another case; by default any key that changed, but for the section that is free.
+    extend
+        Go on with existing results, unless there is an obstacle, though the key of ``kind`` that grows is larger.
 
     Raises
     ------
     FolderError
         If the path is a file, another process works in it, it holds files that are no results of ``kind``, or results
-        of another case without ``force``, or there is nothing to ``resume``.
+        of another case without ``force``, or there is nothing to ``resume`` or to ``extend``.
     """
     path = Path(path)
     with locked(comm, path):
-        going_on = on_root(comm, lambda: _claim(path, kind, text, force, resume, difference))
+        going_on = on_root(comm, lambda: _claim(path, kind, text, force, resume, difference, extend))
         yield Claim(comm, path, going_on)
 
 
-def _claim(path: Path, kind: ResultKind, text: str, force: bool, resume: bool, difference: Difference | None) -> bool:
+def _claim(
+    path: Path,
+    kind: ResultKind,
+    text: str,
+    force: bool,
+    resume: bool,
+    difference: Difference | None,
+    extend: Obstacle | None,
+) -> bool:
     """Prepare the folder ``path``; returns whether it holds results of the same case. See ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
 
@@ -126,10 +139,12 @@ def _claim(path: Path, kind: ResultKind, text: str, force: bool, resume: bool, d
         raise FolderError(f"{path}: contains {content}; choose another --out for results of the kind {kind.noun}")
     if resume and not filled:
         raise FolderError(f"{path}: contains no {kind.noun} to resume; omit --resume")
+    if extend and not filled:
+        raise FolderError(f"{path}: contains no {kind.noun} to extend; omit --extend")
 
     going_on = filled and not force
     if going_on:
-        problem = _problem(path, kind, text, difference)
+        problem = _problem(path, kind, text, difference, extend)
         old = set_aside_in(path)
         if problem and (old / REPLACED).exists():
             problem += f"; the results that it was to replace are in {old}"
@@ -185,7 +200,9 @@ def _results(folder: Path) -> list[Path]:
     return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
 
 
-def _problem(folder: Path, kind: ResultKind, text: str, difference: Difference | None) -> str | None:
+def _problem(
+    folder: Path, kind: ResultKind, text: str, difference: Difference | None, extend: Obstacle | None
+) -> str | None:
     """Message why the results in ``folder`` are not results of ``text``; None if they are."""
     earlier = _text_of(folder / kind.marker)
     if difference:
@@ -201,14 +218,18 @@ def _problem(folder: Path, kind: ResultKind, text: str, difference: Difference |
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         return f"its {kind.marker} cannot be read ({error}); {remedy}"
 
-    differing = []
-    for key in then | now:
-        if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free:
-            values = [_shown(case.get(key, "nothing")) for case in (then, now)]
-            differing.append(f"{key} = {values[0]} there, {values[1]} here")
-    if not differing:
+    keys = [key for key in then | now if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free]
+    if not keys:
         return None
+    if keys == [kind.grows] and now[kind.grows] > then[kind.grows]:
+        if extend:
+            return extend()
+        remedy = f"go on from its end with --extend, {remedy}"
 
+    differing = []
+    for key in keys:
+        values = [_shown(case.get(key, "nothing")) for case in (then, now)]
+        differing.append(f"{key} = {values[0]} there, {values[1]} here")
     shown = "; ".join(differing[:MOST_NAMED])
     if len(differing) > MOST_NAMED:
         shown += f"; and {len(differing) - MOST_NAMED} more"

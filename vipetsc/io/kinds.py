@@ -29,6 +29,8 @@ class ResultKind:
         Name of the file with the case of the results.
     free
         Section of the case that may change while the results stay valid; empty for none.
+    grows
+        Key of the case that ``--extend`` lets grow: the results go on from their end; empty for none.
     """
 
     noun: str
@@ -39,6 +41,7 @@ class ResultKind:
     has_folders: bool = False
     marker: str = "case.toml"
     free: str = ""
+    grows: str = ""
 
     @property
     def source(self) -> str:
@@ -55,7 +58,7 @@ class ResultKind:
         return any(any(folder.glob(pattern)) for pattern in self.results)
 
 
-RUN = ResultKind("run", "run.h5", ("parts",), free="analysis")
+RUN = ResultKind("run", "run.h5", ("parts",), free="analysis", grows="time.end")
 SWEEP = ResultKind("sweep", "ensemble.h5", ("members*.jsonl",), has_folders=True)
 BRANCHES = ResultKind("branch", "branch-*.h5", name="branches")
 SEARCH = ResultKind("search", "design.h5", needs=("cost", "frequency"), name="design")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 import tomllib
 from collections import Counter
@@ -48,8 +49,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+CHUNK_BYTES = 64 * 2**20  # of a run's file, in a chunk into which it is divided again
+
+
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
+
+    The run's last checkpoint stays in ``end-state/``: with a later end the run goes on from there (``reopen``).
 
     It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end. The caller
     sets ``recording``, which describes their contents, before the first one. A chunk has ``chunk_length`` samples; if
@@ -65,6 +71,7 @@ class RunFolder:
         self.comm = comm
         self.count = 0
         self._parts = self.folder / "parts"
+        self._end = self.folder / "end-state"
 
     def begin(self, case: str) -> None:
         """Prepare the output of a new or continued run of ``case`` (TOML); all ranks must call it."""
@@ -108,6 +115,50 @@ class RunFolder:
         if not (self.folder / "summary.json").exists():
             self._summarise(attributes | {"case": tomllib.loads(attributes["case"])})
         return attributes
+
+    def extension_obstacle(self) -> str | None:
+        """Why the run in the folder cannot go on from its end; None if it can, or has not ended. For one rank."""
+        if not (self.folder / "run.h5").exists() or any(self._parts.glob("*")):
+            return None
+        stamp = self._end / "source"
+        if not stamp.exists():
+            return "the run broke off, or its end-state is gone: nothing can go on; repeat it with --force"
+        if stamp.read_text(encoding="utf-8") != source_key():
+            return "other sources of vipetsc made the run, whose bits would not go on; repeat it with --force"
+        return None
+
+    def reopen(self, end: float) -> None:
+        """Let a run that has ended before ``end`` in s go on: divide its file into chunks again. Collective."""
+        on_root(self.comm, lambda: self._reopen(end))
+
+    def _reopen(self, end: float) -> None:
+        """Divide the file on one rank; see ``reopen``. A kill leaves the run as it was, or reopened."""
+        path = self.folder / "run.h5"
+        if not path.exists() or any(self._parts.glob("*")):
+            return
+        aside = self.folder / ".parts.part"
+        discard(aside)
+        with h5py.File(path) as file:
+            if not tomllib.loads(file.attrs["case"])["time"]["end"] < end:
+                return
+            aside.mkdir()
+            count = 1 + path.stat().st_size // CHUNK_BYTES
+            for number in range(count):
+                save_arrays(aside / self._chunk(number).name, chunks.part_of(file, number, count))
+        for state in self._end.glob("state-*.h5"):
+            _, _, rank, size = state.stem.split("-")
+            shutil.copy(state, aside / self._state(count - 1, int(rank), int(size)).name)
+        shutil.copy(self._end / "source", aside)
+        aside.replace(self._parts)
+
+    def _keep_end(self) -> None:
+        """Keep the last checkpoint, that of the run's end, from which a longer run goes on."""
+        number, _ = self._last_complete_state()
+        self._end.mkdir()
+        for state in self._parts.glob(f"state-{number:06d}-*.h5"):
+            state.replace(self._end / state.name)
+        # Last, as it says that all is there.
+        write_text(self._end / "source", source_key())
 
     def _summarise(self, summary: Mapping[str, Any]) -> None:
         """Write ``summary.json``."""
@@ -201,6 +252,9 @@ class RunFolder:
                 self._fill(file, small, log)
             sys.audit("vipetsc.conclude", str(self.folder))
             self._summarise({**attributes, **summary})
+            discard(self._end)
+            if attributes["complete"]:
+                self._keep_end()
             sys.audit("vipetsc.clean", str(self._parts))
             discard(self._parts)
 

@@ -43,6 +43,10 @@ MEMBER = argument(
     help="repeat a member of a sweep with all its fields: its name or number; CASE is the sweep's file or folder",
 )
 
+EXTEND = argument(
+    "--extend", action="store_true", help="go on from the end of the run in the output folder to a later time.end"
+)
+
 
 def load(options: argparse.Namespace) -> Case:
     """The case of the file, or of one member if ``--member`` names it and CASE is a sweep; raises CaseError."""
@@ -76,7 +80,7 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
 
-    result = simulate(case, work.folder, work.comm, **work.keywords)
+    result = simulate(case, work.folder, work.comm, extend=work.options.extend, **work.keywords)
     work.warn(result.warnings)
     faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
     work.report(run_table(result, faster))
@@ -330,7 +334,7 @@ VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",
     example="run runs/examples/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
-    arguments=(CASE, MEMBER, *STUDY_ARGUMENTS),
+    arguments=(CASE, MEMBER, *STUDY_ARGUMENTS, EXTEND),
     case=Case,
     load=load,
     study=simulate_and_measure,

@@ -31,9 +31,10 @@ def linear_states(case: NfrcCase, fixed: float, compliance: WaveCompliance | Mod
     weights = driven_points(case).weights
     sites = len(contacts)
     pairs = sites + len(nonlinear_places(compliance.chain))
-    scale = np.ptp(options.range) / 2
+    low, high = options.range
+    scale = (high - low) / 2
 
-    for index, value in enumerate(np.linspace(*options.range, max(options.points, 2)).tolist()):
+    for index, value in enumerate(np.linspace(low, high, max(options.points, 2)).tolist()):
         omega, amplitude = (value, fixed) if options.over == "frequency" else (fixed, value)
         # The mean, which is zero, and the fundamental.
         relative = np.zeros((pairs, 2), complex)
