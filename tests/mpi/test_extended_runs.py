@@ -46,7 +46,7 @@ def _middles_of_contacts(folder) -> list[float]:
 
 @pytest.mark.parallel(1)
 def test_what_cannot_go_on_is_refused(folder):
-    """A later end names ``--extend``; another key, an earlier end, no run, and an end-state that is gone are refused."""
+    """A later end names ``--extend``; another key, an earlier end, no run and a lost end-state are refused."""
     path = folder / "run"
     with pytest.raises(FolderError, match="no run to extend"):
         simulate(case_until(0.02, "ts"), path, extend=True)
