@@ -131,7 +131,7 @@ def simulate(
             return replace(result, held=memory.dataset)
         return result
 
-    output = RunFolder(Path(target), comm)
+    output = RunFolder(Path(target), comm, keeps_end=True)
     obstacle = output.extension_obstacle if extend else None
     with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume, extend=obstacle) as claim:
         # Also without ``extend``: a command that was to extend the run may have been killed.
@@ -325,7 +325,7 @@ class Run:
         sentence = ended.sentence
         is_stopped = ended.ending is Ending.STOPPED
         is_complete = ended.ending is Ending.COMPLETE
-        if is_stopped or (is_complete and isinstance(output, RunFolder)):
+        if is_stopped or (is_complete and output.keeps_end):
             self.checkpoint(stopped=True)
         if is_stopped:
             sentence += "; the same command continues from there"

@@ -55,7 +55,8 @@ CHUNK_BYTES = 64 * 2**20  # of a run's file, in a chunk into which it is divided
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
-    The run's last checkpoint stays in ``end-state/``: with a later end the run goes on from there (``reopen``).
+    If it ``keeps_end``, the run's last checkpoint stays in ``end-state/``: with a later end the run goes on from there
+    (``reopen``).
 
     It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end. The caller
     sets ``recording``, which describes their contents, before the first one. A chunk has ``chunk_length`` samples; if
@@ -66,9 +67,10 @@ class RunFolder:
     saves_states = True
     chunk_length: int | None = None
 
-    def __init__(self, folder: Path, comm: MPI.Comm) -> None:
+    def __init__(self, folder: Path, comm: MPI.Comm, *, keeps_end: bool = False) -> None:
         self.folder = Path(folder)
         self.comm = comm
+        self.keeps_end = keeps_end
         self.count = 0
         self._parts = self.folder / "parts"
         self._end = self.folder / "end-state"
@@ -253,7 +255,7 @@ class RunFolder:
             sys.audit("vipetsc.conclude", str(self.folder))
             self._summarise({**attributes, **summary})
             discard(self._end)
-            if attributes["complete"]:
+            if attributes["complete"] and self.keeps_end:
                 self._keep_end()
             sys.audit("vipetsc.clean", str(self._parts))
             discard(self._parts)
@@ -322,6 +324,7 @@ class RunMemory:
     """
 
     folder = None
+    keeps_end = False
     recording: Recording
 
     def __init__(
