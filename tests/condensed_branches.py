@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tests.models import CLEARANCE, four_band_contact
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions

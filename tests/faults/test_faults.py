@@ -22,7 +22,7 @@ from tests.faults.phases import phases
 from tests.faults.scenarios import OF_ONE_CALL, SCENARIOS, difference, prepare
 from tests.faults.trials import ROOT, Crew, judge, last_words, matrix, processes_of, references
 from vipetsc.case import Case
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.dynamics import simulate
 

@@ -15,8 +15,7 @@ from scipy.special import ellipk
 from tests.condensed_branches import condensed_branch, condensed_breather
 from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
-from vipetsc.case.nnm import NnmCase
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State

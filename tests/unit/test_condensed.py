@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, Contact, DenseCompliance, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.conservative import ConservativeMotions, HarmonicFrame, fraction_closed

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.case import CaseError
-from vipetsc.case.measured import MeasuredError, RecordTable, read_measured
+from vipetsc.case.identify import MeasuredError, RecordTable, read_measured
 from vipetsc.case.samples import MOST_SAMPLES, with_samples
 
 

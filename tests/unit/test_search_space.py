@@ -9,9 +9,7 @@ from tests.conftest import search_table, with_sections
 from vipetsc.case import CaseError, case_id
 from vipetsc.case.changes import put, value_at
 from vipetsc.case.keys import unit_of
-from vipetsc.case.optimise import OptimiseCase
-from vipetsc.case.search_space import SearchSpace
-from vipetsc.case.variables import Variable
+from vipetsc.case.optimise import OptimiseCase, SearchSpace, Variable
 from vipetsc.studies.sampler import CmaEs
 
 OWN_CELL = {

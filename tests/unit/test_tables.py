@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vipetsc.case.measured import RecordTable, read_measured
+from vipetsc.case.identify import RecordTable, read_measured
 from vipetsc.case.samples import with_samples
 from vipetsc.io.tables import TableError, read_table
 

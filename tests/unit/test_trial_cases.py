@@ -10,8 +10,7 @@ import pytest
 from tests.conftest import with_sections
 from tests.identified import lattice_table
 from vipetsc.case import Case, CaseError
-from vipetsc.case.sought import SoughtParameter, UnknownTable, parameters_of, values_of
-from vipetsc.case.trial import TrialCases
+from vipetsc.case.identify import SoughtParameter, TrialCases, UnknownTable, parameters_of, values_of
 
 QUANTITIES = get_args(UnknownTable.model_fields["quantity"].annotation)
 CELL = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.models import IN_PHASE, OUT_OF_PHASE, reduced_model
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point

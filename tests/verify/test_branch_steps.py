@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
-from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch_checks import BranchMonitor
 from vipetsc.modes.continuation.arclength import Continuation, half_trace_change

@@ -10,7 +10,7 @@ import pytest
 
 from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
 from tests.verify.conftest import follow
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.continuation.arclength import Continuation, Segment, locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.flow import MAPS, Dop853Flow

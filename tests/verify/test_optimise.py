@@ -11,8 +11,7 @@ import pytest
 from tests.conftest import datasets, search_table, simulated, small_case, with_sections
 from vipetsc.case import Case
 from vipetsc.case.amplitude import amplitude_changes, amplitude_of
-from vipetsc.case.objective import ObjectiveTable
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.lattice import gaps, pass_bands
 from vipetsc.studies import optimum_search
 from vipetsc.studies.linear_run import LinearRun, linear_case

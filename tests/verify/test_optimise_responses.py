@@ -14,8 +14,7 @@ import pytest
 from tests.conftest import assert_same_bits, datasets, with_sections
 from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.objective import ObjectiveTable
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.endings import Ending
 from vipetsc.figures.optimum import compared_curves, convergence
 from vipetsc.figures.style import rc_style

@@ -9,8 +9,7 @@ import pytest
 
 from tests.conftest import run_of, search_table, with_sections
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.objective import measures_of_runs
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.optimise import OptimiseCase, measures_of_runs
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from tests.condensed_branches import condensed_branch
 from tests.models import TWO_MASS_CELL
 from vipetsc.case import Case, CaseError, NnmCase
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact
 from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_of
 from vipetsc.modes.branches.follow import follow_all

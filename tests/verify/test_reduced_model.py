@@ -10,7 +10,7 @@ import pytest
 
 from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_contact, reduced_model
 from tests.verify.conftest import follow
-from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.endings import Ending
 from vipetsc.lattice import Chain, four_band
 from vipetsc.modes.balance.stops import Stops

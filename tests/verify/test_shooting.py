@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.models import CLEARANCE, OUT_OF_PHASE, four_band_contact, reduced_model
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import four_band
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.continuation.arclength import Continuation

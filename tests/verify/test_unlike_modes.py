@@ -13,7 +13,7 @@ from tests.breathers import breather_chain
 from tests.condensed_branches import condensed_branch
 from tests.models import CLEARANCE, four_band_contact
 from tests.unlike_lattices import independent_lattice, unlike_case
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, Contact, WaveCompliance
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions

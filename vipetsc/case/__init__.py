@@ -1,8 +1,8 @@
 """Cases, which define simulations: strict TOML is read into a typed, immutable and fully resolved case.
 
 ``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case).
-``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers. Each verb has a module
-with its case and the conditions between its keys: ``case`` that of ``run``, all others one of the verb's name;
+``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers. Each verb has a module or
+a folder with its case and the conditions between its keys: ``case`` that of ``run``, all others one of the verb's name;
 ``verb_cases`` lists them. The manual lists keys and units.
 
 A case file passes these stages, each of which reports all of its problems at once:

@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from vipetsc.case.objective import ObjectiveTable
-from vipetsc.case.optimise import OptimiseCase
-from vipetsc.case.response_measures import RESPONSE
+from vipetsc.case.nfrc import RESPONSE
+from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.figures import panels, style
 from vipetsc.figures.stability import StabilityLook, draw_states
 from vipetsc.spectra.measures import row_of

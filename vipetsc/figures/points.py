@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.case.measured import MeasuredError, RecordTable, read_measured
+from vipetsc.case.identify import MeasuredError, RecordTable, read_measured
 from vipetsc.figures import panels, style
 from vipetsc.figures.style import NoPicture, Shown
 from vipetsc.io.tables import TableError, read_table

@@ -26,8 +26,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from vipetsc.case import CaseError
-from vipetsc.case.identify import IdentifyCase
-from vipetsc.case.sought import SoughtParameter, differs_by_side
+from vipetsc.case.identify import IdentifyCase, SoughtParameter, differs_by_side
 from vipetsc.identification.misfit import NARROW, WIDTH, Misfit
 from vipetsc.identification.motion import MotionError
 

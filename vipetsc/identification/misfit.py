@@ -24,8 +24,7 @@ import scipy
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.drive import first_built
-from vipetsc.case.identify import IdentifyCase
-from vipetsc.case.measured import Measured, SensorTable
+from vipetsc.case.identify import IdentifyCase, Measured, SensorTable
 from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.identification.motion import MotionError, RecordedMotion, SampledModel, State
 

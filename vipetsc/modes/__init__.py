@@ -28,7 +28,7 @@ J. R. Dormand and P. J. Prince, A family of embedded Runge-Kutta formulae, J. Co
 E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., Springer 1993.
 """
 
-from vipetsc.case.nnm_table import Guards, NnmTable
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.measured import SensorTable
+from vipetsc.case.identify import SensorTable
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.uncertainty import Uncertainty, errors_with_sensor

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from vipetsc.case.identify import IdentifyCase
-from vipetsc.case.measured import UNITS
+from vipetsc.case.identify import SENSOR_UNITS, IdentifyCase
 from vipetsc.identification.growing_windows import GrowingWindows, largest_towards, motion_without, reached_by
 from vipetsc.identification.misfit_profile import ProfileCosts
 from vipetsc.identification.uncertainty import (
@@ -308,7 +307,7 @@ def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
             channel = {
                 "channel": f"{number + 1}: {sensor.name}",
                 "channels/record": number + 1,
-                "channels/unit": UNITS[sensor.quantity],
+                "channels/unit": SENSOR_UNITS[sensor.quantity],
                 "channels/noise": misfit.noise[number][k],
                 "channels/is_given": int(sensor.noise is not None),
                 "channels/misfit": float(np.sqrt(np.mean(residuals**2))),

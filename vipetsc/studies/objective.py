@@ -19,8 +19,7 @@ import xarray as xr
 from vipetsc.case import Case, Model, case_id
 from vipetsc.case.amplitude import amplitude_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.objective import MeasuredTable
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.optimise import MeasuredTable, OptimiseCase
 from vipetsc.io.records import Record
 from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest, on_root

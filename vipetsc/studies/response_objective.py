@@ -7,9 +7,8 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.objective import MeasuredTable
-from vipetsc.case.response_measures import ResponseMeasure
+from vipetsc.case.nfrc import NfrcCase, ResponseMeasure
+from vipetsc.case.optimise import MeasuredTable
 from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import follow_all

@@ -72,7 +72,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.balance.harmonic_balance import BalanceFrame, Compliance, HarmonicBalance
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
 from vipetsc.modes.departures import Departure, union_length

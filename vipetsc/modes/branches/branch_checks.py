@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vipetsc.case.nnm_table import Guards
+from vipetsc.case.nnm import Guards
 from vipetsc.endings import Ended, Ending
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.point import Point

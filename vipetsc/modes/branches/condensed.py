@@ -11,7 +11,7 @@ import numpy as np
 from vipetsc.case import NnmCase
 from vipetsc.case.names import distinct
 from vipetsc.case.nfrc import needs_modes
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands

@@ -3,7 +3,7 @@
 import numpy as np
 
 from vipetsc.case import NnmCase
-from vipetsc.case.nnm_table import MOST_OF_DAMPED
+from vipetsc.case.nnm import MOST_OF_DAMPED
 from vipetsc.io.branch_kinds import DAMPED
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch

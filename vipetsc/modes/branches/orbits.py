@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from vipetsc.case import NnmCase
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, sampled

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.keys import unit_of
-from vipetsc.case.nfrc import NfrcCase, ResponseCurve
-from vipetsc.case.response_measures import FRACTIONS, WALLS, value_of
+from vipetsc.case.nfrc import FRACTIONS, WALLS, NfrcCase, ResponseCurve, value_of
 from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable

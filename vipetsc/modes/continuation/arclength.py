@@ -40,7 +40,7 @@ from typing import Any, Generic, NamedTuple, Protocol
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm import NnmTable
 from vipetsc.endings import NOT_FINISHED, Ended, Ending
 from vipetsc.modes.departures import Departure, changed_families
 from vipetsc.modes.point import Point

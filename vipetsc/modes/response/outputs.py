@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.response_measures import WALLS
+from vipetsc.case.nfrc import WALLS, NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonics import Episode
 from vipetsc.modes.balance.stops import Stops

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.case.nfrc_table import NfrcTable
+from vipetsc.case.nfrc import NfrcTable
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import SpecialKind
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations

@@ -13,13 +13,19 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.law import LawCase
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTable, ObjectiveTable, measured_problems
+from vipetsc.case.optimise.objective import (
+    FILE_AMPLITUDE,
+    ConstraintTable,
+    MeasuredTable,
+    ObjectiveTable,
+    measured_problems,
+)
+from vipetsc.case.optimise.problems import variable_problems, variable_warnings
+from vipetsc.case.optimise.search_space import SearchSpace, case_of, search_space
+from vipetsc.case.optimise.variables import Variable, VariablesTable
 from vipetsc.case.schema import Positive
-from vipetsc.case.search_space import SearchSpace, case_of, search_space
 from vipetsc.case.section import described, is_within
 from vipetsc.case.study import StudyCase
-from vipetsc.case.variable_problems import variable_problems, variable_warnings
-from vipetsc.case.variables import Variable, VariablesTable
 
 # Designs of a search: with a run of 0.3 s for each, as of the built-in case, so many take eight hours.
 MOST_DESIGNS = 100_000

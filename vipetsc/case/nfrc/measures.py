@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from vipetsc.case.nfrc_table import NfrcTable
+from vipetsc.case.nfrc.table import NfrcTable
 from vipetsc.case.schema import LatticeTable, OutputTable
 from vipetsc.lattice import Chain, nonlinear_places
 from vipetsc.spectra.measures import JOINT

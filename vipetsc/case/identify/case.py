@@ -14,9 +14,8 @@ from pydantic import Field
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.features import refusals, refuse_disorder
-from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
-from vipetsc.case.section import described
-from vipetsc.case.sought import (
+from vipetsc.case.identify.measured import MeasuredError, RecordTable, read_measured, sensor_problems
+from vipetsc.case.identify.sought import (
     OF_CELL,
     OF_EITHER_SIGN,
     OF_SITES,
@@ -28,8 +27,9 @@ from vipetsc.case.sought import (
     parameters_of,
     values_of,
 )
+from vipetsc.case.identify.trial import TrialCases
+from vipetsc.case.section import described
 from vipetsc.case.study import StudyCase
-from vipetsc.case.trial import TrialCases
 from vipetsc.case.warnings import loss_warnings, unit_warnings
 from vipetsc.case.waveforms import OneDrive
 from vipetsc.lattice.contact import LAWS

@@ -13,10 +13,10 @@ from vipetsc.case.case_file import LARGEST, Table, put
 from vipetsc.case.changes import value_at
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
+from vipetsc.case.optimise.variables import Kind, Variable, VariablesTable
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import number
 from vipetsc.case.value_ranges import RANGES
-from vipetsc.case.variables import Kind, Variable, VariablesTable
 
 IN_ROWS = ("contacts.", "lattice.profiles.")  # keys with lists over the sites or the cells
 FORMS = "give { log = [low, high] }, { linear = [low, high] }, { whole = [low, high] } or a list of values"

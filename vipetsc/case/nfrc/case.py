@@ -13,14 +13,14 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, lists_of
 from vipetsc.case.drive import DriveTable
-from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
-from vipetsc.case.nfrc_ends import are_contacts_springs, check_ground, check_open_ends, no_waves
-from vipetsc.case.nfrc_table import NfrcTable
+from vipetsc.case.nfrc.ends import are_contacts_springs, check_ground, check_open_ends, no_waves
+from vipetsc.case.nfrc.family import FamilyMember, family_of
+from vipetsc.case.nfrc.measures import RESPONSE, ResponseMeasure, measures_of
+from vipetsc.case.nfrc.table import NfrcTable
+from vipetsc.case.nfrc.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
-from vipetsc.case.response_measures import RESPONSE, ResponseMeasure, measures_of
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS

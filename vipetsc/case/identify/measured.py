@@ -27,7 +27,7 @@ LEAST_SAMPLES = 8  # of a record: two windows of the least length in ``identific
 # samples a period, .05 of a sample is a phase of .03, which moves a value by 3 % of its amplitude.
 UNEVEN = 0.05
 HDF5 = (".h5", ".hdf5", ".nc")
-UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
+SENSOR_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
 
 Place = Annotated[int | str, BY_SHAPE]  # of a column: its number from 1, or its name
 

@@ -5,9 +5,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import Section
+from vipetsc.case.nfrc.varied_key import is_key
 from vipetsc.case.schema import Finite, Positive, Range, once
 from vipetsc.case.section import described
-from vipetsc.case.varied_key import is_key
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
 

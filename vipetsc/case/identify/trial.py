@@ -14,9 +14,9 @@ from typing import Any
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table
 from vipetsc.case.drive import check_drives
+from vipetsc.case.identify.sought import OF_CELL, OF_SPRINGS, SoughtParameter, changed_case, numbers_of
 from vipetsc.case.resolve import check_cell, check_contacts
 from vipetsc.case.schema import LatticeTable
-from vipetsc.case.sought import OF_CELL, OF_SPRINGS, SoughtParameter, changed_case, numbers_of
 
 FOLLOWING = ("kind", "energy", "near")
 """Keys of ``[initial]`` from which, together with the lattice, other numbers of the motion follow."""

@@ -24,7 +24,7 @@ from vipetsc.case.contacts import (
 )
 from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.features import refusals
-from vipetsc.case.nnm_checks import (
+from vipetsc.case.nnm.checks import (
     ONE_CONTACT,
     check_condensed,
     check_damped,
@@ -38,7 +38,7 @@ from vipetsc.case.nnm_checks import (
     rigid_motions,
     rigid_motions_of_pair,
 )
-from vipetsc.case.nnm_table import NnmTable
+from vipetsc.case.nnm.table import NnmTable
 from vipetsc.case.resolve import (
     build_chain,
     check_cell,

@@ -7,7 +7,7 @@ from vipetsc.case.case_file import Problem, Valid
 from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites, path_of, values_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
-from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
+from vipetsc.case.nnm.table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
 from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
