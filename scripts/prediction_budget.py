@@ -29,7 +29,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case
-from vipetsc.case.kinds import NO_SITES
+from vipetsc.case.law import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import Record, read_records
 from vipetsc.lattice import WaveCompliance

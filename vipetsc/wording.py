@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Sequence
 
 MOST_SHOWN = 8  # entries of a list, which with the number of all of them fit on a line
+SHORT = 6  # digits of a number that differs from all others in them
+EXACT = 17  # digits in which any two doubles differ
 
 
 def shortened(items: Sequence[object]) -> str:
@@ -68,3 +70,19 @@ def with_unit(name: str, unit: str) -> str:
     if unit in ("", "1"):
         return name
     return f"{name} ({unit})"
+
+
+def distinct(numbers: Sequence[float]) -> list[str]:
+    """Return a text for each of different ``numbers``: six digits, or as many as it takes that all texts differ.
+
+    A number that differs from all others in six digits is written with six, also if others need more.
+    """
+    texts = [f"{number:.{SHORT}g}" for number in numbers]
+    for digits in range(SHORT + 1, EXACT + 1):
+        shared = {text for text in texts if texts.count(text) > 1}
+        if not shared:
+            break
+        for i, number in enumerate(numbers):
+            if texts[i] in shared:
+                texts[i] = f"{number:.{digits}g}"
+    return texts

@@ -4,8 +4,8 @@ import pytest
 
 from tests.breathers import breather_case
 from tests.steady_states import nfrc_case
-from vipetsc.case.names import distinct
 from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.wording import distinct
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from tests.conftest import simulated, with_sections
 from tests.one_site import PREDICTION, prediction_case
 from vipetsc.case import Case, CaseError
-from vipetsc.case.kinds import NO_SITES
+from vipetsc.case.law import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import read_records
 from vipetsc.parallel import StudyError

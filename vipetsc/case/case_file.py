@@ -18,16 +18,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 import tomli_w
 from pydantic import ValidationError
 
-from vipetsc.case.case_error import CaseError as CaseError
 from vipetsc.case.changes import put as put
 from vipetsc.case.changes import with_overrides as with_overrides
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
 from vipetsc.case.plain import plain_table, wrong_keys
+from vipetsc.case.section import MARK, described, is_within, unit_at
+from vipetsc.case.section import CaseError as CaseError
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
-from vipetsc.case.section import described, is_within, unit_at
-from vipetsc.case.shapes import MARK
 from vipetsc.plugins import only
 from vipetsc.register import PartError
 from vipetsc.wording import nearest

@@ -11,8 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.case.points import MOST_POINTS, PointTable
-from vipetsc.case.section import described
-from vipetsc.case.shapes import BY_SHAPE
+from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 

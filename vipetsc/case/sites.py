@@ -8,8 +8,7 @@ from pydantic import Field, create_model
 from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
 from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
-from vipetsc.case.section import described
-from vipetsc.case.shapes import BY_SHAPE
+from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
 from vipetsc.register import DISSIPATION, LAW
 

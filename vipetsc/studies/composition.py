@@ -28,7 +28,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
-from vipetsc.case.kinds import lesser_clearances
+from vipetsc.case.law import lesser_clearances
 from vipetsc.lattice import ToneBurst, WaveCompliance, Waveform, bloch
 from vipetsc.lattice.direct_compliance import DirectCompliance
 from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, self_response, unit_phase

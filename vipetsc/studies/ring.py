@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vipetsc.case.kinds import NO_SITES, contacts_of_one
-from vipetsc.case.law import LawCase
+from vipetsc.case.law import NO_SITES, LawCase, contacts_of_one
 from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 

@@ -13,8 +13,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.schema import Finite, Positive, Range
-from vipetsc.case.section import described
-from vipetsc.case.shapes import BY_SHAPE
+from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.io.names import resolved_path
 from vipetsc.io.tables import TableError, read_table
 from vipetsc.wording import counted

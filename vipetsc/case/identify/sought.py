@@ -12,8 +12,7 @@ from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.schema import Range
-from vipetsc.case.section import described
-from vipetsc.case.shapes import BY_SHAPE
+from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.lattice import UnitCell, pass_bands
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")

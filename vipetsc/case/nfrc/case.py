@@ -13,7 +13,6 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, lists_of
 from vipetsc.case.drive import DriveTable
-from vipetsc.case.names import distinct
 from vipetsc.case.nfrc.ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc.family import FamilyMember, family_of
 from vipetsc.case.nfrc.measures import RESPONSE, ResponseMeasure, measures_of
@@ -24,6 +23,7 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
+from vipetsc.wording import distinct
 
 MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from vipetsc.case.case_file import Problem, Table, put
-from vipetsc.case.names import distinct
 from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
+from vipetsc.wording import distinct
 
 # To read a member takes half a millisecond, but to follow its curve takes seconds to minutes: a thousand are a day.
 MOST_MEMBERS = 1000

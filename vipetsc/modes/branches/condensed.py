@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import NnmCase
-from vipetsc.case.names import distinct
 from vipetsc.case.nfrc import needs_modes
 from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
@@ -31,6 +30,7 @@ from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.stability import Hill
 from vipetsc.modes.system import System, elastic_stops
 from vipetsc.parallel import StopRequest
+from vipetsc.wording import distinct
 
 # Displacements below this fraction of the largest one are rounding, and left out.
 NEGLIGIBLE = 1e-16
