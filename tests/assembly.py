@@ -20,11 +20,11 @@ def assembled(chain: Chain, per_cell: np.ndarray, of_reference: Sequence[float])
     matrix = np.zeros((n * d, n * d))
     for left in range(-1, n):
         for number, spring in enumerate(chain.cell.springs):
-            right = left + spring.next_cell
+            right = left + spring.offset
             if chain.ends == "periodic":
                 right = right % n
             # The wall on the left, cell -1, holds springs of fixed ends to the first cell only.
-            if left < 0 and (chain.ends == "periodic" or not spring.next_cell):
+            if left < 0 and (chain.ends == "periodic" or not spring.offset):
                 continue
             is_inside = left >= 0 and right < n
             if chain.ends == "free" and not is_inside:

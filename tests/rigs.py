@@ -67,14 +67,14 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         host = site * d + pair.host if pair.host >= 0 else None
         sides = [(side, gap) for side, gap in ((1, plus), (-1, minus)) if gap < np.inf]
         load = sum(side * stops.law.elastic_force(-gap) for side, gap in sides)
-        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops.law, sides, load))
+        joins.append((host, (site + pair.offset) % chain.cells * d + pair.resonator, stops.law, sides, load))
 
     beyond = []
     for cell, number in itertools.product(range(-1, chain.cells), range(len(chain.cell.springs))):
         spring = chain.spring(cell, number)
-        other = cell + spring.next_cell
+        other = cell + spring.offset
         is_inside = cell >= 0 and other < chain.cells
-        if spring.is_linear or not (is_inside or (spring.next_cell and chain.ends == "fixed")):
+        if spring.is_linear or not (is_inside or (spring.offset and chain.ends == "fixed")):
             continue
         start = cell * d + spring.start if cell >= 0 else None
         end = other * d + spring.end if other < chain.cells else None

@@ -66,7 +66,7 @@ def test_waves_that_do_not_decay_are_null_in_json():
     At frequency 0 a lattice without springs to the ground moves as a whole, its dashpots do no work, and the decay
     length is infinite, which JSON cannot express.
     """
-    springs = (Spring(0, 0, 1e4, next_cell=True, damping=0.1), Spring(0, 1, 5e3, damping=0.1))
+    springs = (Spring(0, 0, 1e4, offset=1, damping=0.1), Spring(0, 1, 5e3, damping=0.1))
     cell = UnitCell(masses=(1e-3, 1e-3), springs=springs, host=0, resonator=1)
     moving = damping_table(cell, 1000.0)
     resting = damping_table(cell, 0.0)

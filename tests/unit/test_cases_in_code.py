@@ -113,11 +113,11 @@ def test_a_notebook_shows_a_case_with_its_cell():
 def test_every_cell_can_be_drawn():
     """Beads without springs, a stop at the ground and masses that nothing ties together are drawn too."""
     bead = UnitCell((0.03,), (), 0, 0)
-    assert drawing(bead, Pair(0, 0, next_cell=True)).count("circle") == 2
-    lone = UnitCell((0.1,), (Spring(0, 0, 1e3, next_cell=True),), 0, 0)
+    assert drawing(bead, Pair(0, 0, offset=1)).count("circle") == 2
+    lone = UnitCell((0.1,), (Spring(0, 0, 1e3, offset=1),), 0, 0)
     # The spring to the next cell, and two halves of the clearance.
     assert drawing(lone, Pair(-1, 0)).count("polyline") == 3
-    apart = UnitCell((0.1, 0.2, 0.3), (Spring(0, 0, 1e3, next_cell=True), Spring(1, 2, 1e3)), 0, 1)
+    apart = UnitCell((0.1, 0.2, 0.3), (Spring(0, 0, 1e3, offset=1), Spring(1, 2, 1e3)), 0, 1)
     assert drawing(apart, Pair(0, 1)).count("circle") == 4
 
 
@@ -146,8 +146,8 @@ def test_the_drawing_has_room_for_every_mass_of_the_next_cell():
     springs = (
         Spring(start=0, end=1, stiffness=1.0),
         Spring(start=1, end=2, stiffness=1.0),
-        Spring(start=2, end=0, stiffness=1.0, next_cell=True),
-        Spring(start=2, end=1, stiffness=1.0, next_cell=True),
+        Spring(start=2, end=0, stiffness=1.0, offset=1),
+        Spring(start=2, end=1, stiffness=1.0, offset=1),
     )
     root = ElementTree.fromstring(cell_svg(UnitCell((1.0, 1.0, 1.0), springs, host=0, resonator=1), None))
 

@@ -274,7 +274,7 @@ def test_the_rate_from_values_around_the_frequency_is_that_of_all_modes(stiffnes
 
     Without all modes its derivative is taken on a circle around the frequency, which must not contain the pole.
     """
-    cell = UnitCell((1.0, 0.15), (Spring(0, 0, 1e3, next_cell=True), Spring(0, 1, stiffness)), host=0, resonator=1)
+    cell = UnitCell((1.0, 0.15), (Spring(0, 0, 1e3, offset=1), Spring(0, 1, stiffness)), host=0, resonator=1)
     chain = Chain(cell, 3, sites=(1,))
     rows = ModalCompliance(chain).loads.T
     dense = DenseCompliance(chain.masses(), chain.stiffness_matrix().toarray(), rows)

@@ -95,8 +95,8 @@ def test_the_resolved_case_holds_what_was_drawn():
     for ratios in (masses, springs):
         assert 0 < np.abs(ratios - 1).max() < 0.1
     assert (after.host, after.resonator) == (before.host, before.resonator)
-    ends_before = [(s.start, s.end, s.next_cell) for s in before.springs]
-    assert [(s.start, s.end, s.next_cell) for s in after.springs] == ends_before
+    ends_before = [(s.start, s.end, s.offset) for s in before.springs]
+    assert [(s.start, s.end, s.offset) for s in after.springs] == ends_before
     assert pass_bands(after)[1].high != pass_bands(before)[1].high
 
     assert 1e-3 < abs(case.contacts.stiffness / nominal.contacts.stiffness - 1) < 0.4
@@ -222,7 +222,7 @@ def test_a_cell_with_scattered_masses_keeps_all_that_its_springs_have():
     # Every optional number of a spring, coefficients of its force among them.
     numbers = {field.name: 0.5 + i for i, field in enumerate(fields(Spring)) if isinstance(field.default, float)}
     assert {"damping", "quadratic", "cubic"} <= numbers.keys()
-    springs = (Spring(0, 0, 3.0, next_cell=True, **numbers), Spring(0, 1, 4.0))
+    springs = (Spring(0, 0, 3.0, offset=1, **numbers), Spring(0, 1, 4.0))
     cell = UnitCell(masses=(1.0, 2.0), springs=springs, host=0, resonator=1)
 
     table = with_cell({"cells": 5}, cell, {"masses": [1.1, 2.2]})["cell"]

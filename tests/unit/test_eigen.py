@@ -20,7 +20,7 @@ from vipetsc.studies.linear_modes import first_largest
 pytestmark = pytest.mark.parallel(1)
 
 # Two masses a cell whose matrices are whole numbers: sums and products of them have no rounding.
-WHOLE = UnitCell((1.0, 1.0), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 1.0)), host=0, resonator=1)
+WHOLE = UnitCell((1.0, 1.0), (Spring(0, 0, 1.0, offset=1), Spring(0, 1, 1.0)), host=0, resonator=1)
 
 
 class RecordingTransformation:

@@ -73,18 +73,18 @@ def test_a_step_is_the_exponential_within_its_bound(ends, differing, damped, int
 # Pairs at sites with these indices of cells: ground and a mass, masses of one cell or of neighbours, both directions.
 PAIRS = {
     0: Pair(-1, 1),
-    1: Pair(0, 3, next_cell=True),
+    1: Pair(0, 3, offset=1),
     2: Pair(3, 0),
     3: Pair(1, 2),
-    11: Pair(2, 2, next_cell=True),
-    22: Pair(1, 0, next_cell=True),
+    11: Pair(2, 2, offset=1),
+    22: Pair(1, 0, offset=1),
 }
 
 
 def with_any_pairs(model: Model) -> Model:
     """Return the model with contacts of ``PAIRS``, a second one in cell 12, and one in the last cell."""
     ends_on_ring = model.chain.ends == "periodic"
-    pairs = PAIRS | {CELLS - 1: Pair(2, 0, next_cell=True) if ends_on_ring else Pair(-1, 3)}
+    pairs = PAIRS | {CELLS - 1: Pair(2, 0, offset=1) if ends_on_ring else Pair(-1, 3)}
     sites = (*pairs, 11)
     chain = replace(model.chain, sites=sites, pairs=(*pairs.values(), Pair(-1, 2)), clearances=(1e-4,) * len(sites))
     return replace(model, chain=chain)
@@ -101,7 +101,7 @@ def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
             continue
         pair = chain.contact_pairs[number]
         cell = chain.sites[number]
-        form[pair.resonator, (cell + pair.next_cell) % chain.cells] += 1
+        form[pair.resonator, (cell + pair.offset) % chain.cells] += 1
         if pair.host >= 0:
             form[pair.host, cell] -= 1
     return forms

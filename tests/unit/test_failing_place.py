@@ -23,7 +23,7 @@ from vipetsc.lattice.cell import Spring, UnitCell
     ],
 )
 def test_a_spring_loses_its_force_at_the_nearest_zero(quadratic, cubic, limits):
-    spring = Spring(0, 0, 1.0, next_cell=True, quadratic=quadratic, cubic=cubic)
+    spring = Spring(0, 0, 1.0, offset=1, quadratic=quadratic, cubic=cubic)
     chain = Chain(UnitCell(masses=(1.0,), springs=(spring,), host=0, resonator=0), 3)
     found = _elongations_without_force(chain, 1)
     assert {number: abs(z) if cubic < 0 else z for number, z in found.items()} == pytest.approx(limits)

@@ -327,7 +327,7 @@ def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
     cell = UnitCell(masses=(0.01,), springs=(), host=0, resonator=0)
     texts = []
     # -1 is the ground.
-    for pairs in ((), (Pair(0, 0, next_cell=True),), (Pair(-1, 0),)):
+    for pairs in ((), (Pair(0, 0, offset=1),), (Pair(-1, 0),)):
         with rc_style():
             axes = new_figure(5, 2).subplots()
             draw_unit_cell(axes, cell, pairs)
@@ -341,8 +341,7 @@ def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
 
 
 @pytest.mark.parametrize(
-    ("pairs", "has_stops"),
-    [((), True), ((Pair(0, 0, next_cell=True),), False), ((Pair(0, 0, next_cell=True), Pair(0, 1)), True)],
+    ("pairs", "has_stops"), [((), True), ((Pair(0, 0, offset=1),), False), ((Pair(0, 0, offset=1), Pair(0, 1)), True)]
 )
 def test_a_resonator_in_its_host_has_stops_where_it_meets_the_host(pairs, has_stops):
     """A grain whose contacts join it to the next grain alone is drawn without stops around its resonator."""
@@ -365,16 +364,16 @@ ODD_CELL = UnitCell(
         Spring(0, 1, 1e4),
         Spring(1, 2, 2e4),
         Spring(0, 2, 500.0),
-        Spring(2, 0, 3e4, next_cell=True),
+        Spring(2, 0, 3e4, offset=1),
         Spring(1, 3, 1.0),
         Spring(3, 4, 7e3),
-        Spring(1, 1, 50.0, next_cell=True),
+        Spring(1, 1, 50.0, offset=1),
     ),
     host=1,
     resonator=3,
 )
 UNCONNECTED_CELL = UnitCell(
-    masses=(1.0, 2.0, 3.0), springs=(Spring(0, 0, 5.0, next_cell=True), Spring(1, 2, 1.0)), host=0, resonator=2
+    masses=(1.0, 2.0, 3.0), springs=(Spring(0, 0, 5.0, offset=1), Spring(1, 2, 1.0)), host=0, resonator=2
 )
 
 

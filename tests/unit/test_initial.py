@@ -66,7 +66,7 @@ STIFFNESS = 5e4
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_modes_of_a_long_chain_are_those_in_closed_form(ends, number):
     """A chain of equal masses has omega = 2 sqrt(k/m) sin(phase/2), with nodes at walls and antinodes at free ends."""
-    chain = Chain(UnitCell((MASS,), (Spring(0, 0, STIFFNESS, next_cell=True),), 0, 0), LONG, ends)
+    chain = Chain(UnitCell((MASS,), (Spring(0, 0, STIFFNESS, offset=1),), 0, 0), LONG, ends)
     if ends == "fixed":
         phase = np.pi * number / (LONG + 1)
         shape = np.sin(phase * np.arange(1, LONG + 1))

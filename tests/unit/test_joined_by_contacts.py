@@ -167,7 +167,7 @@ def chain_of(pairs: tuple[Pair, ...]) -> Chain:
 
 def test_bodies_are_what_springs_and_pressed_contacts_hold_together():
     """Numbers of bodies are those of the ground, then of grain and resonator of each cell."""
-    between, ground = Pair(0, 0, next_cell=True), Pair(-1, 0)
+    between, ground = Pair(0, 0, offset=1), Pair(-1, 0)
     pressed, apart = (-1e-5, np.inf), (1e-5, np.inf)
     assert bodies_of(chain_of((between,)), [apart]) == [0, 1, 1, 2, 2]
     assert bodies_of(chain_of((between,)), [pressed]) == [0, 1, 1, 1, 1]

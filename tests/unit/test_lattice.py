@@ -38,7 +38,7 @@ def cells(draw):
     # The line connects all masses: a mass without springs would have the frequency 0.
     springs = [Spring(i, i + 1, draw(positive)) for i in range(n - 1)]
     for _ in range(draw(st.integers(1, 2))):
-        springs.append(Spring(draw(mass), draw(mass), draw(positive), next_cell=True))
+        springs.append(Spring(draw(mass), draw(mass), draw(positive), offset=1))
     host = draw(mass)
     return UnitCell(masses, tuple(springs), host, (host + 1) % n)
 
@@ -173,7 +173,7 @@ def test_fixed_ends_are_free_ones_with_springs_to_walls(cell, n):
 
     walls = np.zeros(n * cell.dofs)
     for spring in cell.springs:
-        if spring.next_cell:
+        if spring.offset:
             walls[spring.end] += spring.stiffness
             walls[-cell.dofs + spring.start] += spring.stiffness
     assert np.allclose(fixed - free, np.diag(walls), atol=1e-9)
@@ -356,7 +356,7 @@ def test_a_chain_of_equal_masses_has_no_gaps_in_whatever_cells_it_is_counted(mas
     Its waves have the speed cos(q/2) = (1 - omega^2/4)^(1/2) in masses/s, at the ends of the zone as elsewhere.
     """
     springs = [Spring(i, i + 1, 1.0) for i in range(masses - 1)]
-    cell = UnitCell((1.0,) * masses, (*springs, Spring(masses - 1, 0, 1.0, next_cell=True)), 0, 1)
+    cell = UnitCell((1.0,) * masses, (*springs, Spring(masses - 1, 0, 1.0, offset=1)), 0, 1)
     bands = pass_bands(cell)
     assert gaps(bands) == []
     assert all(below.high == above.low for below, above in pairwise(bands))
@@ -382,7 +382,7 @@ def test_a_chain_of_equal_masses_has_no_gaps_in_whatever_cells_it_is_counted(mas
 @pytest.mark.parametrize("detuning", [1e-2, 1e-6, 2e-8])
 def test_a_small_gap_is_a_gap(detuning):
     """Masses that differ a little open a gap from (2 k/m)^(1/2) to (2 k/M)^(1/2), however small."""
-    springs = (Spring(0, 1, 1.0), Spring(1, 0, 1.0, next_cell=True))
+    springs = (Spring(0, 1, 1.0), Spring(1, 0, 1.0, offset=1))
     cell = UnitCell((1.0, 1.0 + detuning), springs, 0, 1)
     ((low, high),) = gaps(pass_bands(cell))
     assert high - low == pytest.approx(np.sqrt(2) - np.sqrt(2 / (1 + detuning)), rel=1e-4)
@@ -393,7 +393,7 @@ def test_a_small_gap_is_a_gap(detuning):
 @pytest.mark.parametrize("coupling", [10.0, 1e-2, 1e-6, 1e-9, 1e-13])
 def test_cells_that_are_hardly_joined_have_slow_waves(coupling):
     """A rigid cell of two masses m has waves of sqrt(c/2m) cells/s, also where their omega^2 is rounding of others'."""
-    springs = (Spring(0, 0, coupling, next_cell=True), Spring(0, 1, 1e4))
+    springs = (Spring(0, 0, coupling, offset=1), Spring(0, 1, 1e4))
     cell = UnitCell((0.01, 0.01), springs, 0, 1)
     speed = np.sqrt(coupling / 0.02)
     assert abs(bloch(cell, 0.0).group_velocity[0]) == pytest.approx(speed, rel=2e-3)

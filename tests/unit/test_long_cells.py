@@ -10,7 +10,7 @@ from vipetsc.lattice import Spring, UnitCell, bands, fastest_speed, pass_bands
 
 def folded(masses: int) -> UnitCell:
     """Return the cell of a chain of equal masses and springs that takes ``masses`` of them as one cell."""
-    springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
+    springs = tuple(Spring(i, (i + 1) % masses, 1e4, offset=int(i == masses - 1)) for i in range(masses))
     return UnitCell(masses=(0.01,) * masses, springs=springs, host=0, resonator=1)
 
 
@@ -38,7 +38,7 @@ def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
 
 def graded(masses: int) -> UnitCell:
     """Return a cell whose masses grow along it, so that no two bands touch."""
-    springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
+    springs = tuple(Spring(i, (i + 1) % masses, 1e4, offset=int(i == masses - 1)) for i in range(masses))
     return UnitCell(masses=tuple(np.linspace(0.01, 0.02, masses)), springs=springs, host=0, resonator=1)
 
 
@@ -57,7 +57,7 @@ def test_extremes_of_bands_that_are_flat_to_rounding_are_not_refined(monkeypatch
     """Bands without width, of cells that springs of 1e-12 of the inner stiffness join, are not refined."""
     masses = bands.MANY_MASSES + 3
     within = tuple(Spring(i, i + 1, 1e4) for i in range(masses - 1))
-    between = Spring(masses - 1, 0, 1e-8, next_cell=True)
+    between = Spring(masses - 1, 0, 1e-8, offset=1)
     cell = UnitCell(masses=(0.01,) * masses, springs=(*within, between), host=0, resonator=1)
 
     refined = set()

@@ -126,7 +126,7 @@ def test_modes_of_equal_masses_are_those_of_the_formula(ends):
 
     An eigenvalue is often exact to the last bit in such a chain, and a matrix shifted by it has no inverse.
     """
-    cell = UnitCell((1e-3,), (Spring(0, 0, 1e4, next_cell=True),), 0, 0)
+    cell = UnitCell((1e-3,), (Spring(0, 0, 1e4, offset=1),), 0, 0)
     for cells in range(2, 41):
         found = linear_modes(Chain(cell, cells, ends))
         exact = 2 * np.sqrt(1e7) * np.sin(np.pi * np.arange(cells) / (2 * cells))

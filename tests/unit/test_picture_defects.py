@@ -181,7 +181,7 @@ def test_a_slope_that_was_not_fitted_is_not_drawn_as_fitted(sign):
         (Pair(1, 2), 301.0, 302.0),
         (Pair(0, 3), 300.0, 303.0),
         (Pair(-1, 2), 0.0, 302.0),
-        (Pair(3, 0, next_cell=True), 303.0, 400.0),
+        (Pair(3, 0, offset=1), 303.0, 400.0),
     ],
 )
 def test_a_portrait_shows_the_masses_that_its_contact_joins(pair, host, resonator):

@@ -29,7 +29,7 @@ CLEARANCE = 1e-5
 PRELOADS = (0.0, 0.0, 0.125, 0.0)
 # Springs that harden and soften, within the cell and between cells: a wrong end or sign shows in the sums.
 SPRINGS = (
-    Spring(0, 0, 3e4, next_cell=True, damping=0.4, quadratic=2e7, cubic=5e11),
+    Spring(0, 0, 3e4, offset=1, damping=0.4, quadratic=2e7, cubic=5e11),
     Spring(0, 1, 2e4, damping=0.2),
     Spring(1, 2, 1e4, damping=0.1, quadratic=-3e7, cubic=4e11),
 )
@@ -91,7 +91,7 @@ def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[floa
     for i, (side, approach) in enumerate(zip(sides, approaches, strict=True)):
         pair = chain.contact_pairs[i]
         host = motion.at(SITES[i], pair.host)
-        resonator = motion.at(SITES[i] + pair.next_cell, pair.resonator)
+        resonator = motion.at(SITES[i] + pair.offset, pair.resonator)
         w, rate = side * (resonator - host)
         x = w - CLEARANCE
         # The force of a closed site is continued to x < 0, until a step ends on the change of mode.
@@ -111,11 +111,11 @@ def accelerations(model: Model, motion: Motion) -> np.ndarray:
 
     for spring in chain.cell.springs:
         for left in range(-1, CELLS):
-            right = left + spring.next_cell
+            right = left + spring.offset
             if chain.ends == "periodic":
                 right = right % CELLS
             # Cell -1 stands for the wall on the left, which holds springs to the next cell only.
-            if left < 0 and not (spring.next_cell and chain.ends == "fixed"):
+            if left < 0 and not (spring.offset and chain.ends == "fixed"):
                 continue
             if right == CELLS and chain.ends == "free":
                 continue
@@ -132,7 +132,7 @@ def accelerations(model: Model, motion: Motion) -> np.ndarray:
         push = forces[i] - PRELOADS[i]
         if pair.host >= 0:
             force[SITES[i], pair.host] += push
-        force[(SITES[i] + pair.next_cell) % CELLS, pair.resonator] -= push
+        force[(SITES[i] + pair.offset) % CELLS, pair.resonator] -= push
 
     for drive in model.drives:
         force[drive.cell, drive.mass] += float(drive.waveform.force(motion.t))
@@ -180,7 +180,7 @@ def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
 PAIRS = {
     "the cell's pair": (),
     # The pairs are to ground, to the next cell, and within the cell.
-    "any pair": (Pair(-1, 0), Pair(2, 1, next_cell=True), Pair(0, 2), Pair(1, 2)),
+    "any pair": (Pair(-1, 0), Pair(2, 1, offset=1), Pair(0, 2), Pair(1, 2)),
 }
 
 
@@ -227,7 +227,7 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
         expected = np.zeros((len(SITES), 3))
         acceleration = accelerations(model, motion)
         for i, pair in enumerate(model.chain.contact_pairs):
-            right = (SITES[i] + pair.next_cell) % CELLS
+            right = (SITES[i] + pair.offset) % CELLS
             host = motion.at(SITES[i], pair.host)
             expected[i, :2] = motion.at(right, pair.resonator) - host
             expected[i, 2] = acceleration[right, pair.resonator]

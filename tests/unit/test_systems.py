@@ -125,9 +125,9 @@ def test_a_chain_has_the_modes_and_sites_of_its_cells():
 
 def test_a_contact_that_symmetry_keeps_at_rest_is_never_touched():
     """Where all cells of a ring move alike no contact between cells moves, but for rounding."""
-    springs = (Spring(0, 0, 1e4, next_cell=True), Spring(0, 1, 5e3))
+    springs = (Spring(0, 0, 1e4, offset=1), Spring(0, 1, 5e3))
     cell = UnitCell((4e-3, 2e-3), springs, host=0, resonator=1)
-    chain = Chain(cell, 12, "periodic", sites=(5, 7), pairs=(Pair(0, 0, next_cell=True),) * 2)
+    chain = Chain(cell, 12, "periodic", sites=(5, 7), pairs=(Pair(0, 0, offset=1),) * 2)
     system = System.from_chain(chain, [Stops.both(Contact("hertz", 1e7), 1e-4)] * 2)
 
     # The modes of cells that move alike: the ring as a whole, and resonators against hosts, the lowest of their band.
@@ -141,7 +141,7 @@ def test_a_chain_keeps_its_nonlinear_springs(ends, springs, held):
     """A lattice that moves as a whole by 1 m strains the springs to its walls alone, one by 1 m, one by -1 m."""
     quadratic = 2.0
     cubic = 3.0
-    nonlinear = Spring(1, 0, 5.0, next_cell=True, quadratic=quadratic, cubic=cubic)
+    nonlinear = Spring(1, 0, 5.0, offset=1, quadratic=quadratic, cubic=cubic)
     cell = UnitCell((1.0, 2.0), (Spring(0, 1, 7.0), nonlinear), host=0, resonator=1)
 
     system = System.from_chain(Chain(cell, 3, ends), [])

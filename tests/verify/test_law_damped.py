@@ -106,7 +106,7 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
     waves = runs.site_waves
     force = waves.force(ring.motion(run), linear, contact["onset"], contact["separation"])
 
-    [spring] = [spring for spring in runs.cell.springs if spring.next_cell]
+    [spring] = [spring for spring in runs.cell.springs if spring.offset]
     amplitudes = waves.amplitudes(force / amplitude)
 
     def through(cell: int) -> float:

@@ -28,7 +28,7 @@ from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
-CELL = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 0.5)), host=0, resonator=1)
+CELL = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, offset=1), Spring(0, 1, 0.5)), host=0, resonator=1)
 SPRINGS = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 0.5}]
 
 
@@ -92,7 +92,7 @@ def test_dashpots_cells_that_differ_and_contacts_to_ground_stay_what_they_are():
 
     The long lattice has 240 cells and a strong loss, so that nothing comes back from its far end.
     """
-    pairs = (Pair(-1, 1), Pair(0, 0, next_cell=True))
+    pairs = (Pair(-1, 1), Pair(0, 0, offset=1))
     short = Chain(rounded_cell((0.05, 0.2)), 5, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
     long = Chain(rounded_cell((0.05, 0.2)), 240, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
     here = OpenCompliance(short, ((0, 0),), open_ends=("right",))

@@ -97,7 +97,7 @@ def test_what_has_no_response_is_refused_with_its_reason(section, values, key, r
 
 def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
     """A cell of two masses with dashpots parallel to its springs, and ``grounding`` dashpots (N s/m) to the ground."""
-    springs = (Spring(0, 0, 1.0, next_cell=True, damping=0.1), Spring(0, 1, 0.5, damping=0.02))
+    springs = (Spring(0, 0, 1.0, offset=1, damping=0.1), Spring(0, 1, 0.5, damping=0.02))
     return UnitCell((1.0, 0.3), springs, host=0, resonator=1, grounding=grounding)
 
 
@@ -105,7 +105,7 @@ def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
 @pytest.mark.parametrize("grounding", [(), (0.05, 0.2)])
 def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, grounding):
     """The compliance as a sum over poles is the inverse of K + i omega C - omega^2 M, also with rigid motions."""
-    pairs = (Pair(0, 1), Pair(0, 0, next_cell=True))
+    pairs = (Pair(0, 1), Pair(0, 0, offset=1))
     chain = Chain(rounded_cell(grounding), 5, ends, sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
     compliance = ModalCompliance(chain, ((0, 0),))
     loads = compliance.loads
@@ -119,7 +119,7 @@ def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, ground
 
 def test_without_dashpots_it_is_that_of_bloch_waves():
     """Without dashpots the compliance by poles is that by Bloch waves, and real."""
-    cell = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 0.5)), host=0, resonator=1)
+    cell = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, offset=1), Spring(0, 1, 0.5)), host=0, resonator=1)
     chain = Chain(cell, 9, "free", sites=(2, 6), clearances=(1.0, 1.0))
     omega = np.array([0.0, 0.31, 1.27, 2.9])
     modal = ModalCompliance(chain, ((0, 0),)).response(omega)

@@ -14,7 +14,7 @@ from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
-from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, nonlinear_places
+from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, nonlinear_springs
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -166,7 +166,7 @@ def test_walls_feel_the_whole_force_of_their_springs():
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_elongations_are_those_of_every_nonlinear_spring(ends):
     """The compliance of elongations is b^T (K - om^2 M)^-1 b, with a column of b for each nonlinear spring."""
-    springs = (Spring(0, 1, 1.0, cubic=1.0), Spring(1, 0, 2.0, next_cell=True, quadratic=1.0))
+    springs = (Spring(0, 1, 1.0, cubic=1.0), Spring(1, 0, 2.0, offset=1, quadratic=1.0))
     chain = Chain(UnitCell((1.0, 0.5), springs, host=0, resonator=1), 3, ends, sites=(1,), clearances=(1.0,))
     rows = []
     for cell in range(3):
@@ -183,19 +183,18 @@ def test_elongations_are_those_of_every_nonlinear_spring(ends):
         for mass, sign in row.items():
             b[mass, column] = sign
 
-    places = nonlinear_places(chain)
-    assert len(places) == len(rows)
+    springs = nonlinear_springs(chain)
+    assert len(springs.cell) == len(rows)
     found = ModalCompliance(chain).at(0.7)[0][1:, 1:]
     dynamic = chain.stiffness_matrix().toarray() - 0.49 * np.diag(chain.masses())
     expected = b.T @ np.linalg.solve(dynamic, b)
     # The package numbers springs cell by cell, those within the cell and those to the next one in turn.
-    order = [row if place.number == 0 else 3 + row for place in places for row in [_rank(places, place)]]
+    counts = [0, 3]
+    order = []
+    for number in springs.number:
+        order.append(counts[number])
+        counts[number] += 1
     np.testing.assert_allclose(found, expected[np.ix_(order, order)], atol=1e-10)
-
-
-def _rank(places: list[Any], place: Any) -> int:
-    """The number of a place among those of the same spring of the cell."""
-    return [other for other in places if other.number == place.number].index(place)
 
 
 def test_files_and_pictures_have_the_springs(duffing, tmp_path):

@@ -19,7 +19,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.dynamics import simulate
 from vipetsc.identification.motion import SampledModel
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice import linear_modes, nonlinear_places
+from vipetsc.lattice import linear_modes, nonlinear_springs, spring_laws
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.system import System
@@ -182,10 +182,10 @@ def test_equal_lists_are_the_lattice_of_equal_cells(term):
 
 def test_places_are_those_of_the_profile():
     chain = changed().model().chain
-    places = nonlinear_places(chain)
-    assert [(place.cell + 1, place.number + 1) for place in places] == sorted(TERMS)
-    assert [(place.law.quadratic, place.law.cubic) for place in places] == [TERMS[key] for key in sorted(TERMS)]
-    assert [(place.start, place.end) for place in places] == [(10, 11), (16, 18), (22, -1)]
+    springs = nonlinear_springs(chain)
+    assert [*zip(springs.cell + 1, springs.number + 1, strict=True)] == sorted(TERMS)
+    assert [(law.quadratic, law.cubic) for law in spring_laws(chain)] == [TERMS[key] for key in sorted(TERMS)]
+    assert springs.ends() == [(10, 11), (16, 18), (22, -1)]
     assert not chain.is_linear
     # With quadratic terms the force is not an odd function.
     assert not chain.is_odd

@@ -26,9 +26,9 @@ from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
 # A row of masses on which resonators sit, with springs between neighbouring resonators as well.
-SPRINGS = (Spring(0, 0, 1e4, next_cell=True), Spring(0, 1, 5e3), Spring(1, 1, 1e3, next_cell=True))
+SPRINGS = (Spring(0, 0, 1e4, offset=1), Spring(0, 1, 5e3), Spring(1, 1, 1e3, offset=1))
 CELL = UnitCell((4e-3, 2e-3), SPRINGS, host=0, resonator=1)
-PAIRS = (Pair(-1, 1), Pair(1, 0, next_cell=True), Pair(0, 1), Pair(-1, 0))
+PAIRS = (Pair(-1, 1), Pair(1, 0, offset=1), Pair(0, 1), Pair(-1, 0))
 SITES = (500, 501, 503, 503)
 
 
@@ -37,7 +37,7 @@ def rows_of(chain: Chain) -> np.ndarray:
     d = chain.cell.dofs
     rows = np.zeros((len(chain.sites), chain.cells * d))
     for row, site, pair in zip(rows, chain.sites, chain.contact_pairs, strict=True):
-        row[(site + pair.next_cell) * d + pair.resonator] = 1
+        row[(site + pair.offset) * d + pair.resonator] = 1
         if pair.host >= 0:
             row[site * d + pair.host] = -1
     return rows
@@ -59,7 +59,7 @@ def test_compliances_are_those_of_a_long_damped_lattice(omega):
 
 def test_the_ends_of_a_ring_do_not_join_an_infinite_lattice():
     """In an infinite lattice the compliance of a contact with the next cell is the same in every cell."""
-    pair = (Pair(1, 0, next_cell=True),)
+    pair = (Pair(1, 0, offset=1),)
     last = Chain(CELL, 5, "periodic", (4,), (1e-4,), pairs=pair)
     inner = replace(last, sites=(1,))
     answers = [WaveCompliance(chain, infinite=True).at(1000.0) for chain in (last, inner)]

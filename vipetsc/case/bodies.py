@@ -3,20 +3,14 @@
 from collections.abc import Iterator, Sequence
 
 from vipetsc.case.case_file import Problem
-from vipetsc.lattice import Chain
+from vipetsc.lattice import Chain, contacts
 from vipetsc.lattice.cell import connected_groups
 
 
 def contact_ends(chain: Chain) -> list[tuple[int, int]]:
     """Numbers of the host and of the resonator of each site: 0 for the ground, masses from 1 on, cell by cell."""
-    d = chain.cell.dofs
-    ends = []
-    for site, cell, pair in zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True):
-        host = 0
-        if pair.host >= 0:
-            host = 1 + site * d + pair.host
-        ends.append((host, 1 + cell * d + pair.resonator))
-    return ends
+    # The ground is the number -1 of a contact's ends.
+    return [(1 + host, 1 + resonator) for host, resonator in contacts(chain).ends()]
 
 
 def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:

@@ -253,7 +253,7 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
     next_cell = values_of_sites(contacts, "next_cell", count)
     for pair, is_in_next_cell in zip(given, next_cell, strict=True):
         host, resonator = pair or (cell.host + 1, cell.resonator + 1)
-        pairs.append(Pair(host - 1, resonator - 1, bool(is_in_next_cell)))
+        pairs.append(Pair(host - 1, resonator - 1, int(bool(is_in_next_cell))))
 
     # Without pairs, methods for one contact of the cell's own pair in a cell apply to the chain.
     comes_twice = isinstance(contacts.sites, list) and len(set(contacts.sites)) < len(contacts.sites)
@@ -275,10 +275,10 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
             remedy = f"{what}; the masses of the cell are numbered from 1 to {cell.dofs}, and host 0 is the ground"
             yield Problem(path_of(contacts, "pair"), [pair.host + 1, pair.resonator + 1], remedy)
             return
-        if pair.host == pair.resonator and not pair.next_cell:
+        if pair.host == pair.resonator and not pair.offset:
             yield Problem(path_of(contacts, "pair"), [pair.host + 1] * 2, f"{what}; did you mean next_cell = true?")
             return
-        if pair.next_cell and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
+        if pair.offset and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
             remedy = f"site {number} in cell {at} has no next cell to touch"
             yield Problem(path_of(contacts, "next_cell"), True, remedy)
             return
@@ -289,7 +289,7 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     twice = [at for (at, _), count in times.items() if count > 1]
     if has_pair and twice:
         yield Problem("contacts.sites", twice, "given twice with the same contact pair")
-    if cell.springs and not cell.joins_cells and any(pair.next_cell for pair in pairs):
+    if cell.springs and not cell.joins_cells and any(pair.offset for pair in pairs):
         yield from _check_loose(cell, pairs)
 
 
@@ -311,7 +311,7 @@ def _check_loose(cell: UnitCell, pairs: Sequence[Pair]) -> Iterator[Problem]:
     joined = [(spring.start + 1, spring.end + 1) for spring in cell.springs]
     for pair in pairs:
         other = pair.resonator + 1
-        if pair.next_cell:
+        if pair.offset:
             other = 0
         # The host of a contact with the ground is -1: it is joined to node 0, too.
         joined.append((pair.host + 1, other))

@@ -210,7 +210,7 @@ def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) 
     stiffness = drawn.get("springs", [spring.stiffness for spring in cell.springs])
     springs: list[Table] = []
     for spring, value in zip(cell.springs, stiffness, strict=True):
-        table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.next_cell}
+        table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.offset > 0}
         # All other parameters of the spring too: a spring without one of them would be another.
         for key in SPRING_PARAMETERS:
             if parameter := getattr(spring, key):

@@ -124,7 +124,7 @@ def _check_place(
     if lattice.ends != "fixed":
         remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
-    if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.next_cell):
+    if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.offset):
         yield Problem(
             f"{path}.end", drive.end, "a wall can only move a linear spring: remove damping, quadratic and cubic"
         )
@@ -143,7 +143,7 @@ def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
     """Pairs of a mass (0-based) of an ``end``'s cell that a spring ties to the wall, and the number of that spring."""
     masses = []
     for number, spring in enumerate(cell.springs):
-        if spring.next_cell:
+        if spring.offset:
             # On the left the wall takes the place of the cell before, in which such a spring starts.
             mass = {"left": spring.end, "right": spring.start}[end]
             masses.append((mass, number))

@@ -86,7 +86,7 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
     beyond = set()  # masses of the next cell that are drawn
     for spring in cell.springs:
         end = places[spring.end]
-        if spring.next_cell:
+        if spring.offset:
             end = next_places[spring.end]
             beyond.add(spring.end)
         parts.append(_zigzag(places[spring.start], end))
@@ -95,7 +95,7 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
     height = MARGIN - top
     if pair is not None:
         resonator = places[pair.resonator]
-        if pair.next_cell:
+        if pair.offset:
             resonator = next_places[pair.resonator]
             beyond.add(pair.resonator)
         host = places[pair.host]
@@ -121,7 +121,7 @@ def _places(cell: UnitCell) -> list[Point]:
     """The place of each mass: masses on the way through the cell form a row, others are above one that they join."""
     joined: dict[int, list[int]] = {mass: [] for mass in range(cell.dofs)}
     for spring in cell.springs:
-        if not spring.next_cell:
+        if not spring.offset:
             joined[spring.start].append(spring.end)
             joined[spring.end].append(spring.start)
 
@@ -146,7 +146,7 @@ def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
     """The shortest path from a mass that the cell before is tied to, to one that is tied to the next cell."""
     entry = last = 0
     for spring in cell.springs:
-        if spring.next_cell:
+        if spring.offset:
             entry = spring.end
             last = spring.start
             break

@@ -179,7 +179,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         return cell, problems
 
     # Node 0 stands for the next cell: what is not joined to it belongs to no chain.
-    to_next_cell = [(0, spring.start + 1) for spring in cell.springs if spring.next_cell]
+    to_next_cell = [(0, spring.start + 1) for spring in cell.springs if spring.offset]
     within = [(spring.start + 1, spring.end + 1) for spring in cell.springs]
     group = connected_groups(cell.dofs + 1, (*to_next_cell, *within))
     loose = [str(mass) for mass, number in enumerate(group) if number != group[0]]

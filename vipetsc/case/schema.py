@@ -148,7 +148,7 @@ class SpringTable(Section):
             start=self.start - 1,
             end=self.end - 1,
             stiffness=self.stiffness,
-            next_cell=self.next_cell,
+            offset=int(self.next_cell),
             damping=self.damping or 0.0,
             quadratic=self.quadratic or 0.0,
             cubic=self.cubic or 0.0,

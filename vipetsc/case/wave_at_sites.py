@@ -37,7 +37,7 @@ def _relative_amplitude(cell: UnitCell, pair: Pair, wave: tuple[int, float, floa
     """Return the amplitude of w of a ``pair`` in a ``wave`` of ``waves_at``, over that of the mass that moves most."""
     band, kappa, _ = wave
     shape = bloch(cell, kappa).vectors[:, band - 1]
-    w = shape[pair.resonator] * np.exp(1j * kappa * pair.next_cell)
+    w = shape[pair.resonator] * np.exp(1j * kappa * pair.offset)
     # Ground, number -1, does not move.
     if pair.host >= 0:
         w -= shape[pair.host]

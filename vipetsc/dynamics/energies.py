@@ -113,10 +113,10 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
         # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
-        leaves = spring.next_cell == 1 and first + energies.size == n
+        leaves = spring.offset == 1 and first + energies.size == n
         inside = energies.size - leaves
         begin = spring.start * n + first
-        end = spring.end * n + first + spring.next_cell
+        end = spring.end * n + first + spring.offset
         here = y[begin : begin + inside]
         other = y[end : end + inside]
 
@@ -126,7 +126,7 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
         if leaves and not shape.right_free:
             elongation = displacement(y, lattice, n, spring.end) - y[spring.start * n + n - 1]
             energies[inside] += 0.5 * spring.stiffness * elongation * elongation
-        if spring.next_cell == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
+        if spring.offset == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
             energies[0] += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
 
 

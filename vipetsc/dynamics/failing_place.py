@@ -3,7 +3,7 @@
 import numpy as np
 
 from vipetsc.dynamics.observers import Setup
-from vipetsc.lattice.chain import Chain, cells_between
+from vipetsc.lattice import Chain
 
 
 def failing_place(setup: Setup) -> str:
@@ -22,8 +22,8 @@ def failing_place(setup: Setup) -> str:
 
     chain = setup.model.chain
     place = f"cell {fastest + 1}"
-    if chain.sites:
-        nearest = int(np.argmin(cells_between(chain.sites, fastest, chain.cells, chain.ends)))
+    nearest = chain.topology.nearest(chain.sites, fastest)
+    if nearest is not None:
         place += f", nearest site {nearest + 1} in cell {chain.sites[nearest] + 1}"
     limits = _elongations_without_force(chain, fastest)
     if limits:

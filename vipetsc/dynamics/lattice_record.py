@@ -13,6 +13,7 @@ from vipetsc.dynamics.site_dofs import SITE_DOFS, create_site_dofs, site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
 from vipetsc.lattice import Chain
 from vipetsc.lattice.drive import PIECE
+from vipetsc.lattice.topology import NONE
 from vipetsc.records import Record, record_type
 
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
@@ -28,8 +29,8 @@ NONLINEAR = np.dtype(
 if all have one. ``sign`` is 1 where ``mass`` is the spring's ``start`` and -1 where it is its ``end``: the elongation
 is ``sign`` times the displacement of the other mass less that of this one.
 """
-SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
-"""A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
+SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("offset", np.int64), ("stiffness", np.float64)])
+"""A spring of the cell: its masses, of which ``end`` is ``offset`` cells further, N/m."""
 
 
 class Shape(NamedTuple):
@@ -103,8 +104,8 @@ def create_record(model: Model, layout: Layout) -> Record:
         shape=shape,
         masses=np.array(masses, MASS),
         couplings=np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
-        springs=np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
-        site_dofs=create_site_dofs(model, layout, (shape.left_ghost, shape.right_ghost)),
+        springs=np.array([(s.start, s.end, s.offset, s.stiffness) for s in cell.springs], SPRING),
+        site_dofs=create_site_dofs(model, layout),
         contacts=site_records(model, layout.contacts),
         drives=drives,
         nonlinear=nonlinear,
@@ -144,15 +145,8 @@ LATTICE = record_type(empty_record())
 def _create_shape(chain: Chain, layout: Layout) -> Shape:
     """Sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
     left, right = layout.neighbours()
-    # Behind the owned components lie the ghosts of the left neighbour, then those of the right one.
-    ghosted = layout.size
-    left_ghost = right_ghost = damping = -1
-    if left is not None:
-        left_ghost = ghosted
-        ghosted += layout.ghost_rows
-    if right is not None:
-        right_ghost = ghosted
-        ghosted += layout.ghost_rows
+    left_ghost, right_ghost = layout.ghost_places()
+    damping = -1
     if layout.integrates_damping:
         damping = 2 * layout.dofs * layout.owned
 
@@ -161,12 +155,12 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
         dofs=layout.dofs,
         paired=bool(chain.pairs),
         owned=layout.size,
-        ghosted=ghosted,
-        exchange=layout.comm.size > 1 or layout.periodic,
+        ghosted=layout.size + layout.ghost_rows * len(layout.ghosts),
+        exchange=layout.comm.size > 1 or layout.topology.is_ring,
         left_ghost=left_ghost,
         right_ghost=right_ghost,
-        left_free=chain.ends == "free" and left is None,
-        right_free=chain.ends == "free" and right is None,
+        left_free=left == NONE,
+        right_free=right == NONE,
         work=layout.rows * layout.owned,
         dissipated=layout.dissipated,
         damping=damping,
@@ -188,11 +182,10 @@ def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.n
     couplings = []
     for row, number in enumerate(numbers.tolist()):
         spring = chain.cell.springs[number]
-        offset = int(spring.next_cell)
         own_law = row * per_spring + stride
-        couplings.append((spring.start, offset, spring.end, own_law, stride, 1.0))
+        couplings.append((spring.start, spring.offset, spring.end, own_law, stride, 1.0))
         # The law of a spring from the cell before is stored with that cell.
-        couplings.append((spring.end, -offset, spring.start, own_law - stride * offset, stride, -1.0))
+        couplings.append((spring.end, -spring.offset, spring.start, own_law - stride * spring.offset, stride, -1.0))
     laws = np.zeros(len(numbers) * per_spring, SPRING_LAW)
     for place, name in enumerate(SPRING_LAW.names or ()):
         laws[name] = table[:, numbers, place].T.ravel()

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
-from vipetsc.lattice import Chain
+from vipetsc.lattice import Chain, contacts
+from vipetsc.lattice.topology import NONE, WALL
 
 LEDGER = np.dtype([("number", np.int64), ("energy", np.float64)])
 """A drive or a site, from 0, and its work or its dissipated energy in J."""
@@ -40,7 +41,7 @@ class Layout:
         self.comm = comm
         self.cells = chain.cells
         self.dofs = chain.cell.dofs
-        self.periodic = chain.ends == "periodic"
+        self.topology = chain.topology
         self.damped = dashpots and chain.is_damped
         self.integrates_damping = self.damped and integrates_damping
         self.rows = 2 * self.dofs + self.integrates_damping
@@ -57,25 +58,43 @@ class Layout:
         self.start, self.stop = self.ranges[comm.rank].tolist()
         self.owned = self.stop - self.start
         self.size = int(sizes[comm.rank])
-        self.sites, self.contacts = sites_within(chain, self.start, self.stop)
+        self.sites, self.contacts = _sites_within(chain, self.start, self.stop)
         self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
         self.dissipated = self.rows * self.owned + len(self.drives)
         # Asked for at every change of a contact.
         self._is_own = np.isin(self.contacts, self.sites)
 
-    def neighbours(self) -> tuple[int | None, int | None]:
-        """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
+    def neighbours(self) -> tuple[int, int]:
+        """Return the cells to the left and to the right of this rank's, ``WALL`` or ``NONE``, as on an empty rank."""
         if not self.owned:
-            return None, None
-        left: int | None = self.start - 1
-        right: int | None = self.stop
-        if self.periodic:
-            return (self.start - 1) % self.cells, self.stop % self.cells
-        if self.start == 0:
-            left = None
-        if self.stop == self.cells:
-            right = None
+            return NONE, NONE
+        left, right = self.topology.neighbour([self.start, self.stop - 1], [-1, 1]).tolist()
         return left, right
+
+    @property
+    def ghosts(self) -> list[int]:
+        """The neighbouring cells of which this rank has a copy, the left one first."""
+        return [cell for cell in self.neighbours() if cell >= 0]
+
+    def ghost_places(self) -> tuple[int, int]:
+        """Return the first components of the ghosts on the left and on the right, -1 where there is none."""
+        left, right = self.neighbours()
+        after_left = self.size + self.ghost_rows * (left >= 0)
+        return (self.size if left >= 0 else -1), (after_left if right >= 0 else -1)
+
+    def components(self, masses: np.ndarray) -> np.ndarray:
+        """Return where the state with its ghosts has displacement and velocity (mass, 2) of ``masses`` (mass,).
+
+        They are counted through all cells, and are in this rank's or in neighbouring ones; -1 for ``WALL``.
+        """
+        cells, mass = np.divmod(masses, self.dofs)
+        left_ghost, right_ghost = self.ghost_places()
+        ghost = np.where(cells == self.neighbours()[0], left_ghost, right_ghost)
+        is_own = (cells >= self.start) & (cells < self.stop)
+        first = np.where(is_own, mass * self.owned + cells - self.start, ghost + mass)
+        to_velocity = np.where(is_own, self.dofs * self.owned, self.dofs)
+        found = np.column_stack([first, first + to_velocity])
+        return np.where((masses == WALL)[:, None], -1, found)
 
     def state_indices(self, cells: ArrayLike) -> np.ndarray:
         """Global indices (cell, 2 dofs) of the displacements and then of the velocities of ``cells``, mass by mass."""
@@ -91,7 +110,7 @@ class Layout:
 
         It has its components in ``array`` (component,) if one is given: the rank's own, then those of the ghosts.
         """
-        indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])
+        indices = self.state_indices(self.ghosts)
         indices = indices[:, : self.ghost_rows].ravel()
         # One array holds owned components and ghosts, so that compiled code reads both without a copy.
         if array is None:
@@ -162,13 +181,12 @@ def cell_cuts(cells: int, ranks: int) -> list[int]:
     return [r * (cells // ranks) + min(r, cells % ranks) for r in range(ranks + 1)]
 
 
-def sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Numbers of the sites of the cells ``start`` to ``stop``, and of all that act on a mass there."""
-    cells = np.array(chain.sites, np.int64)
+    elements = contacts(chain)
+    owned = (elements.cell >= start) & (elements.cell < stop)
     # A site's host is in its own cell; its resonator may be in the next one, which another rank may own.
-    offsets = np.array([int(pair.next_cell) for pair in chain.pairs] or [0] * len(cells))
-    resonator_cells = (cells + offsets) % chain.cells
-    owned = (cells >= start) & (cells < stop)
+    resonator_cells = elements.end // chain.cell.dofs
     acting = owned | ((resonator_cells >= start) & (resonator_cells < stop))
     return tuple(np.flatnonzero(owned).tolist()), tuple(np.flatnonzero(acting).tolist())
 

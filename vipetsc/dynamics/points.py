@@ -183,7 +183,7 @@ class PointMotion:
 def _ends_of(chain: Chain, site: int, pair: Pair) -> list[tuple[int, tuple[int, int]]]:
     """The masses that the contact of a ``site`` acts on, as (cell, mass): 1 and the host, -1 and the resonator."""
     cell = chain.sites[site]
-    ends = [(-1, ((cell + pair.next_cell) % chain.cells, pair.resonator))]
+    ends = [(-1, ((cell + pair.offset) % chain.cells, pair.resonator))]
     if pair.host >= 0:
         ends.append((1, (cell, pair.host)))
     return ends

@@ -11,7 +11,7 @@ from vipetsc.case import Model
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import create_contacts, hold
 from vipetsc.dynamics.layout import Layout
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice import contacts
 
 END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
 """An end of a site: components of its displacement and velocity, -1 on ground; its owned cell, else -1; its mass."""
@@ -33,12 +33,12 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     # A number below 0 has no stops, and the cell's own pair.
     gaps = np.full((len(numbers), 2), np.inf)
     masses = np.full(len(numbers), chain.cell.reduced_mass)
-    joins_next_cell = np.zeros(len(numbers), bool)
+    joins_cells = np.zeros(len(numbers), bool)
     if asked:
         of_sites = model.gaps or chain.clearances
         gaps[exists] = np.reshape([of_sites[i] for i in asked], (len(asked), -1))
         masses[exists] = chain.reduced_masses(asked)
-        joins_next_cell[exists] = [bool(chain.pairs) and chain.pairs[i].next_cell for i in asked]
+        joins_cells[exists] = chain.pair_table[asked, 2] > 0
     # It takes any law that is used: without stops no law acts.
     laws = [model.used_laws[0]] * len(numbers)
     if model.laws:
@@ -49,41 +49,23 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     # Contacts that are pressed at rest, and beads of neighbouring cells that touch and do not dissipate, part and meet
     # all the time: no such change is landed on, and the force has a kink. With loss a contact needs an onset, at which
     # its approach velocity is taken.
-    permanent = (least < 0) | ((least == 0) & joins_next_cell & (sites["damping"] == 0))
+    permanent = (least < 0) | ((least == 0) & joins_cells & (sites["damping"] == 0))
     hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
     return sites
 
 
-def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> np.ndarray:
-    """Records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``.
-
-    ``ghosts`` are the first components of the neighbouring cells on the left and on the right.
-    """
-    chain = model.chain
-    n = layout.owned
-    d = layout.dofs
-
-    def end(cell: int, mass: int) -> tuple[int, int, int, int]:
-        if mass < 0:
-            return -1, -1, -1, -1
-        here = cell % chain.cells - layout.start
-        if 0 <= here < n:
-            return mass * n + here, (d + mass) * n + here, here, mass
-        first = ghosts[cell >= layout.stop]
-        return first + mass, first + d + mass, -1, mass
-
-    site_dofs = np.zeros(len(layout.contacts), SITE_DOFS)
-    own_pair = Pair(chain.cell.host, chain.cell.resonator)
-    for row, i in zip(site_dofs, layout.contacts, strict=True):
-        pair = own_pair
-        if chain.pairs:
-            pair = chain.pairs[i]
-        cell = chain.sites[i]
-        # The last cell of a ring is the one before the first: so the rank that owns the first cells counts it.
-        if cell == chain.cells - 1 and layout.start == 0 and n < chain.cells:
-            cell = -1
-        row["host"] = end(cell, pair.host)
-        row["resonator"] = end(cell + pair.next_cell, pair.resonator)
+def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:
+    """Records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``."""
+    elements = contacts(model.chain)
+    chosen = np.array(layout.contacts, np.int64)
+    site_dofs = np.zeros(len(chosen), SITE_DOFS)
+    for name, masses in (("host", elements.start[chosen]), ("resonator", elements.end[chosen])):
+        ends = site_dofs[name]
+        ends["u"], ends["v"] = layout.components(masses).T
+        cells, mass = np.divmod(masses, layout.dofs)
+        is_own = (cells >= layout.start) & (cells < layout.stop)
+        ends["cell"] = np.where(is_own, cells - layout.start, -1)
+        ends["mass"] = np.where(masses >= 0, mass, -1)
 
     owned = np.isin(layout.contacts, layout.sites)
     site_dofs["ledger"] = np.where(owned, layout.dissipated + np.cumsum(owned) - 1, -1)

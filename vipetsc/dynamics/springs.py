@@ -256,10 +256,10 @@ def add_squares(
         end = half + spring.end
         factors = values[s * (n + 1) + 1 + first :]
         # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
-        leaves = spring.next_cell == 1 and first + sums.size == n
+        leaves = spring.offset == 1 and first + sums.size == n
         inside = sums.size - leaves
         here = y[start * n + first :][:inside]
-        other = y[end * n + first + spring.next_cell :][:inside]
+        other = y[end * n + first + spring.offset :][:inside]
 
         for i in range(inside):
             elongation = other[i] - here[i]
@@ -267,7 +267,7 @@ def add_squares(
         if leaves and not shape.right_free:
             elongation = displacement(y, lattice, n, end) - y[start * n + n - 1]
             sums[inside] += factors[inside] * elongation * elongation
-        if spring.next_cell == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
+        if spring.offset == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
             sums[0] += values[s * (n + 1)] * y[end * n] * y[end * n]
 
 

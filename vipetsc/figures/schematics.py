@@ -200,7 +200,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> No
     borders = [layout.left, layout.right]
     axes.vlines(borders, low + 0.15, high - 0.1, color=style.GREY, lw=0.6, ls=style.DASHED)
     axes.text(layout.left + 0.07, low + 0.1, "one cell", color=style.GREY, va="bottom")
-    beyond = NEXT + 2 * HALF if any(pair.next_cell for pair in pairs) else 0.0
+    beyond = NEXT + 2 * HALF if any(pair.offset for pair in pairs) else 0.0
     axes.set(xlim=(layout.left - 0.5, layout.right + beyond + 0.5), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
 
@@ -215,7 +215,7 @@ def _draw_pair(axes: Axes, layout: CellLayout, pair: Pair) -> None:
         draw_wall(axes, (edge - 0.3, y - 2 * HALF - 0.2), 0.72, 0.2)
         axes.text(edge + 0.2, y - HALF, "contact, Δ", color=style.VERMILION, va="center")
         return
-    if not pair.next_cell:
+    if not pair.offset:
         _draw_contact(axes, layout.centre[pair.host], (x, y))
         return
 
@@ -240,12 +240,12 @@ def _draw_springs(axes: Axes, cell: UnitCell, layout: CellLayout, nested_pair: s
     level = TALL + 0.6
     highest = TALL
     for spring in cell.springs:
-        if not spring.next_cell and {spring.start, spring.end} == nested_pair:
+        if not spring.offset and {spring.start, spring.end} == nested_pair:
             continue
         start = layout.end_at(spring.start)
         end = layout.end_at(spring.end)
         text = with_prefix(spring.stiffness, "N/m")
-        if spring.next_cell:
+        if spring.offset:
             # One zigzag up to the right border, and the end of that of the cell before.
             leaving = layout.corners(start, SpringEnd(layout.right, start.y, 0), level)
             arriving = layout.corners(SpringEnd(layout.left, end.y, 0), end, level)
@@ -287,12 +287,12 @@ def _layout(cell: UnitCell) -> CellLayout:
     """
     held_by = [spring for spring in cell.springs if cell.resonator in (spring.start, spring.end)]
     pair = {cell.host, cell.resonator}
-    nested = bool(held_by) and all({s.start, s.end} == pair and not s.next_cell for s in held_by)
+    nested = bool(held_by) and all({s.start, s.end} == pair and not s.offset for s in held_by)
 
     joined = np.zeros((cell.dofs, cell.dofs), bool)
     for spring in cell.springs:
-        joined[spring.start, spring.end] |= not spring.next_cell
-    through = next((s for s in cell.springs if s.next_cell), Spring(cell.dofs - 1, 0, 1.0, next_cell=True))
+        joined[spring.start, spring.end] |= not spring.offset
+    through = next((s for s in cell.springs if s.offset), Spring(cell.dofs - 1, 0, 1.0, offset=1))
     # A wave comes into the cell at the end of the spring to the next cell, and leaves at its start. The numbers of
     # springs from the one and to the other have the least sum for masses on the shortest chain.
     ends = [through.end, through.start]

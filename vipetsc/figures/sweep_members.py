@@ -21,7 +21,6 @@ from vipetsc.figures.swept_axes import SweptAxis, in_pi
 from vipetsc.io.netcdf import naming_spoilt, open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
 from vipetsc.lattice import waves_at
-from vipetsc.lattice.chain import cells_between
 from vipetsc.wording import counted
 
 AMPLITUDE = "amplitude"
@@ -192,7 +191,7 @@ class AmplitudeSeries(NamedTuple):
         member = self.runs[0]
         chain = member.model.chain
         sites = recorded_sites(member.run)
-        delay = cells_between(sites - 1, member.model.drive_cell, chain.cells, chain.ends) / self.wave.speed
+        delay = chain.topology.distance(sites - 1, member.model.drive_cell) / self.wave.speed
         first = delay.min()
         last = delay.max()
         burst = member.model.drive.duration

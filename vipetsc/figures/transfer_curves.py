@@ -311,8 +311,7 @@ def _of_contact(run: xr.Dataset, model: Model, quantity: str) -> np.ndarray:
     """Return a ``quantity`` (t, 2) of the host and the resonator of the first contact; 0 for one with the ground."""
     pair = model.chain.contact_pairs[0]
     cell = int(run["sites/cell"].values[0])
-    # The resonator may be in the next cell, which of a ring's last cell is the first one.
-    resonator_cell = (cell - 1 + pair.next_cell) % model.chain.cells + 1
+    resonator_cell = int(model.chain.topology.neighbour(cell - 1, pair.offset)) + 1
     resonator = run[quantity].sel(cell=resonator_cell).isel(dof=pair.resonator).values
     host = np.zeros_like(resonator)
     if pair.host >= 0:

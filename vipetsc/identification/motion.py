@@ -152,13 +152,8 @@ class SampledModel:
         reached = np.zeros((len(chain.sites), 2))
         s = BETWEEN[:, None]
         for site, (cell, pair) in enumerate(zip(chain.sites, chain.contact_pairs, strict=True)):
-            far = (cell + pair.next_cell) % chain.cells
-            w = run.displacement[:, far, pair.resonator]
-            rate = interval * run.velocity[:, far, pair.resonator]
-            # The ground does not move.
-            if pair.host >= 0:
-                w = w - run.displacement[:, cell, pair.host]
-                rate = rate - interval * run.velocity[:, cell, pair.host]
+            w = pair.relative(run.displacement, cell)
+            rate = interval * pair.relative(run.velocity, cell)
 
             # Hermite's cubic through both ends of each interval.
             between = (1 - s) ** 2 * ((1 + 2 * s) * w[:-1] + s * rate[:-1])

@@ -16,7 +16,7 @@ import numpy as np
 
 from vipetsc.io.kinds import BRANCHES, RUN, STUDIES, SWEEP
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice.chain import nearest_site
+from vipetsc.lattice.topology import Topology
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -124,7 +124,7 @@ def first_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     case = tomllib.loads(run.attrs["case"])
     lattice = case["lattice"]
-    return nearest_site(run["sites/cell"].values, case["drive"]["cell"], lattice["cells"], lattice["ends"])
+    return Topology(lattice["cells"], lattice["ends"]).nearest(run["sites/cell"].values, case["drive"]["cell"])
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:

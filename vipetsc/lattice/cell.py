@@ -22,14 +22,14 @@ class Spring:
     """A spring between two masses (0-based) of one cell, or from one cell to the next.
 
     Its force at the elongation z is k z + q z^2 + c z^3: ``stiffness`` k in N/m, ``quadratic`` q in N/m^2 and ``cubic``
-    c in N/m^3, which bands and modes leave out. ``damping`` in N s/m is that of a dashpot parallel to it. With
-    ``next_cell`` the spring runs from mass ``start`` of a cell to mass ``end`` of the cell after it.
+    c in N/m^3, which bands and modes leave out. ``damping`` in N s/m is that of a dashpot parallel to it. It runs from
+    mass ``start`` of a cell to mass ``end`` of the cell ``offset`` further, the same one (0) or the next one (1).
     """
 
     start: int
     end: int
     stiffness: float
-    next_cell: bool = False
+    offset: int = 0
     damping: float = 0.0
     quadratic: float = 0.0
     cubic: float = 0.0
@@ -106,7 +106,7 @@ class UnitCell:
 
         Other cells, with springs within them or with none, are joined by contacts alone, as grains are.
         """
-        return any(spring.next_cell for spring in self.springs)
+        return any(spring.offset for spring in self.springs)
 
     @property
     def is_damped(self) -> bool:
@@ -125,8 +125,7 @@ class UnitCell:
         """
         ends = []
         for i, s in enumerate(self.springs):
-            cells = int(s.next_cell)
-            for mass, offset, other in ((s.start, cells, s.end), (s.end, -cells, s.start)):
+            for mass, offset, other in ((s.start, s.offset, s.end), (s.end, -s.offset, s.start)):
                 ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
         # Stable: couplings of one mass stay in the order of the springs.
         return sorted(ends, key=lambda c: c.mass)
@@ -197,7 +196,9 @@ def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
     for end in (spring.start, spring.end):
         if not 0 <= end < n:
             problems.append((key, f"mass {end + 1} is not one of the cell's {n}"))
-    if spring.start == spring.end and not spring.next_cell:
+    if spring.offset not in (0, 1):
+        problems.append((key, f"offset {spring.offset!r} must be 0 (the same cell) or 1 (the next one)"))
+    if spring.start == spring.end and not spring.offset:
         problems.append((key, f"joins mass {spring.start + 1} to itself; did you mean next_cell = true?"))
     return problems
 
@@ -229,7 +230,7 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
     """
     # Both springs alike: all frequencies scale together, and the bands keep their shape.
     k = {"printed": 9e4, "calibrated": 9e3}[reading]
-    springs = (Spring(0, 0, k, next_cell=True), Spring(0, 1, k))
+    springs = (Spring(0, 0, k, offset=1), Spring(0, 1, k))
     return UnitCell(masses=(0.01, 0.08), springs=springs, host=0, resonator=1)
 
 
@@ -246,5 +247,5 @@ def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) 
     k2 = 1e4
     k3 = lam * {"printed": k, "calibrated": k2}[reading]
     # eta divides one mass m into the host's and the resonator's part: the cell weighs the same for every eta.
-    springs = (Spring(3, 0, k, next_cell=True), Spring(0, 1, k2), Spring(1, 3, k2), Spring(1, 2, k3))
+    springs = (Spring(3, 0, k, offset=1), Spring(0, 1, k2), Spring(1, 3, k2), Spring(1, 2, k3))
     return UnitCell(masses=(m, m * (1 - eta), m * eta, m), springs=springs, host=1, resonator=2)

@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 
 from vipetsc.lattice.cell import Spring, UnitCell
 from vipetsc.lattice.drive import Waveform
+from vipetsc.lattice.topology import NONE, WALL, Ends, Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
-
-Ends = Literal["fixed", "free", "periodic"]
 
 # Cells at most whose linear response is solved for, in 2 ms. With 200 or 800 in its place the scale of waves changes by
 # 5e-4 and 2.5e-4 for a burst whose frequency is almost 0, and by 1e-13 to 1e-4 for others.
@@ -22,11 +20,11 @@ LONGEST = 400
 
 
 class Pair(NamedTuple):
-    """Masses that a contact joins (0-based; host -1 is ground), the ``resonator`` in the next cell if ``next_cell``."""
+    """Masses that a contact joins (0-based; host -1 is ground); ``resonator`` is ``offset`` cells further, 0 or 1."""
 
     host: int
     resonator: int
-    next_cell: bool = False
+    offset: int = 0
 
     def relative(self, field: np.ndarray, cell: int) -> np.ndarray:
         """Return the motion (...) of the resonator relative to its host in a ``cell`` (0-based).
@@ -34,7 +32,7 @@ class Pair(NamedTuple):
         ``field`` (..., cell, dof) is the displacement or the velocity of all cells. The resonator may be in the next
         cell, which of a ring's last cell is the first one; the ground does not move.
         """
-        w = field[..., (cell + self.next_cell) % field.shape[-2], self.resonator]
+        w = field[..., (cell + self.offset) % field.shape[-2], self.resonator]
         if self.host < 0:
             return np.asarray(w)
         return np.asarray(w - field[..., cell, self.host])
@@ -77,6 +75,11 @@ class Chain:
                 raise ValueError(f"variation of {name}: shape {array.shape}, not {shape}")
 
     @property
+    def topology(self) -> Topology:
+        """How its cells follow each other."""
+        return Topology(self.cells, self.ends)
+
+    @property
     def _varied(self) -> dict[str, np.ndarray]:
         """The arrays of ``variation`` by name; empty for a lattice of equal cells."""
         return dict(self.variation.items()) if self.variation else {}
@@ -110,7 +113,7 @@ class Chain:
     @property
     def _left_wall_springs(self) -> list[Spring]:
         """The springs to a wall on the left: those of the reference cell, since no cell's ``variation`` has them."""
-        return [spring for spring in self.cell.springs if spring.next_cell and self.ends == "fixed"]
+        return [spring for spring in self.cell.springs if spring.offset and self.topology.neighbour(-1) == WALL]
 
     def linearised(self) -> "Chain":
         """The lattice with the linear parts of its springs alone; itself if there is nothing else."""
@@ -136,15 +139,16 @@ class Chain:
         return self.pairs or (Pair(self.cell.host, self.cell.resonator),) * len(self.sites)
 
     @property
-    def resonator_cells(self) -> tuple[int, ...]:
-        """The cell of each site's resonator; after the last cell of a ring comes the first."""
-        cells = [site + pair.next_cell for site, pair in zip(self.sites, self.contact_pairs, strict=True)]
-        return tuple(cell % self.cells if self.ends == "periodic" else cell for cell in cells)
+    def pair_table(self) -> np.ndarray:
+        """Host, resonator and offset (site, 3) of the pair of each site."""
+        # One row for all sites where they have the cell's pair: a lattice may have a million sites.
+        pairs = np.array(self.pairs or [(self.cell.host, self.cell.resonator, 0)], np.int64)
+        return np.broadcast_to(pairs, (len(self.sites), 3))
 
     @property
     def is_joined(self) -> bool:
         """Whether contacts join cells."""
-        return any(pair.next_cell for pair in self.pairs)
+        return any(pair.offset for pair in self.pairs)
 
     def reduced_masses(self, numbers: Sequence[int] | None = None) -> list[float]:
         """Mass in kg of the relative motion of the sites with these ``numbers``, from 0, or of all."""
@@ -153,13 +157,11 @@ class Chain:
         # One row for all cells where they are equal, so that a long lattice costs no more than its sites.
         inverse = 1 / self._varied.get("masses", np.array([self.cell.masses]))
         rows = len(inverse)
-        sites = np.array([self.sites[i] for i in numbers], np.int64)
-        pairs = [Pair(self.cell.host, self.cell.resonator)] * len(numbers)
-        if self.pairs:
-            pairs = [self.pairs[i] for i in numbers]
-        host, resonator, next_cell = np.array(pairs, np.int64).reshape(-1, 3).T
+        chosen = np.array(numbers, np.int64)
+        sites = np.array(self.sites, np.int64)[chosen]
+        host, resonator, offset = self.pair_table[chosen].T
         inverse_host = np.where(host >= 0, inverse[sites % rows, host], 0.0)  # ground does not move
-        inverse_resonator = inverse[(sites + next_cell) % rows, resonator]
+        inverse_resonator = inverse[self.topology.neighbour(sites, offset) % rows, resonator]
         return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
@@ -169,12 +171,8 @@ class Chain:
         """
         if self.variation is None:
             return True
-        cells = np.arange(start, self.cells if stop is None else stop)
-        return not self.differs[cells[self._exist(cells)] % self.cells].any()
-
-    def _exist(self, cells: np.ndarray) -> np.ndarray:
-        """Whether the lattice has each of ``cells`` (cell,); on a ring every number stands for one of its cells."""
-        return (cells >= 0) & (cells < self.cells) | (self.ends == "periodic")
+        cells = self.topology.neighbour(np.arange(start, self.cells if stop is None else stop))
+        return not self.differs[cells[cells >= 0]].any()
 
     @cached_property
     def _reference(self) -> dict[str, np.ndarray]:
@@ -199,13 +197,13 @@ class Chain:
 
     def _arrays(self, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:
         """The arrays of these ``names`` of the cells ``start`` to ``stop``."""
-        cells = np.arange(start, stop)
-        exists = self._exist(cells)
+        cells = self.topology.neighbour(np.arange(start, stop))
+        exists = cells >= 0
         arrays = []
         for name in names:
             array = np.tile(self._reference[name], (len(cells), 1))
             if name in self._varied:
-                array[exists] = self._varied[name][cells[exists] % self.cells]
+                array[exists] = self._varied[name][cells[exists]]
             arrays.append(array)
         return arrays
 
@@ -258,24 +256,22 @@ class Chain:
 
         A spring to the next cell belongs to the cell in which it begins, hence the cell before ``start``.
         """
-        n = self.cells
         d = self.cell.dofs
         rows = [np.zeros(0, np.int64)]
         columns = [np.zeros(0, np.int64)]
         entries = [np.zeros(0)]
         index = np.arange(start, stop, dtype=np.int64)
-        every = np.ones(stop - start, bool)
         for coupling in self.cell.couplings():
-            neighbour = index + coupling.offset
-            inside = every if self.ends == "periodic" else (neighbour >= 0) & (neighbour < n)
-            held = every if self.ends == "fixed" else inside  # a wall holds, and does not move
+            neighbour = self.topology.neighbour(index, coupling.offset)
+            inside = neighbour >= 0
+            held = neighbour != NONE  # a wall holds, and does not move
             # The cell in which the spring begins, as a row of ``values``: this one's is 1.
             owner = 1 + min(coupling.offset, 0)
             value = values[owner : owner + stop - start, coupling.spring]
 
             here = index * d + coupling.mass
             rows += [here[held] - start * d, here[inside] - start * d]
-            columns += [here[held], neighbour[inside] % n * d + coupling.other]
+            columns += [here[held], neighbour[inside] * d + coupling.other]
             entries += [value[held], -value[inside]]
 
         return Entries(rows=np.concatenate(rows), columns=np.concatenate(columns), values=np.concatenate(entries))
@@ -334,24 +330,5 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
     force = np.zeros(cells * cell.dofs, complex)
     force[driven] = 1.0
     # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow as they run along it.
-    order = "MMD_AT_PLUS_A" if ends == "periodic" else "COLAMD"
+    order = "MMD_AT_PLUS_A" if chain.topology.is_ring else "COLAMD"
     return float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
-
-
-def nearest_site(sites: ArrayLike, cell: int, cells: int, ends: Ends) -> int | None:
-    """Return the number, from 0, of that of the ``sites`` (site,) which is nearest to a ``cell``; None without sites.
-
-    The first of two at the same distance counts. The site nearest to the drive is the one that its wave meets first.
-    """
-    distance = cells_between(sites, cell, cells, ends)
-    if not distance.size:
-        return None
-    return int(np.argmin(distance))
-
-
-def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
-    """Distance (...) in cells of each ``cell`` (...) to ``other`` in a chain of ``cells``; the shorter on a ring."""
-    distance = np.abs(np.asarray(cell, np.int64) - other)
-    if ends == "periodic":
-        distance = np.minimum(distance, cells - distance)
-    return np.asarray(distance)

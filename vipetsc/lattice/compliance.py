@@ -9,7 +9,7 @@ lattice has outgoing waves alone on either side. Cf. Lopez Sancho et al., J. Phy
 in place of waves.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands, waves_at
 from vipetsc.lattice.chain import Chain, Pair
+from vipetsc.lattice.elements import Elements, contacts, masses_of, unit_loads
 from vipetsc.lattice.modal_compliance import ComplianceError
-from vipetsc.lattice.unit_loads import unit_loads
+from vipetsc.lattice.topology import NONE, WALL, Topology
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
 AT_REST = 1e-12  # a contact pair that moves less than this fraction of its cell does not move
@@ -95,16 +96,23 @@ class WaveCompliance:
     @property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
-        loaded = {*self.chain.sites, *self._resonator_cells, *(cell for cell, _ in self.points)}
-        if not self.infinite and self.chain.ends != "periodic":
-            loaded |= {0, self.chain.cells - 1}
+        joined = np.concatenate([self._contacts.start, self._contacts.end])
+        loaded = {*(joined[joined >= 0] // self.chain.cell.dofs).tolist(), *(cell for cell, _ in self.points)}
+        last = self.chain.cells - 1
+        loaded |= {end for end, step in ((0, -1), (last, 1)) if self._topology.neighbour(end, step) < 0}
         return sorted(loaded) or [0]
 
     @property
-    def _resonator_cells(self) -> tuple[int, ...]:
-        """The cell of each site's resonator; an infinite lattice does not close to a ring."""
-        chain = replace(self.chain, ends="fixed") if self.infinite else self.chain
-        return chain.resonator_cells
+    def _topology(self) -> Topology:
+        """How the cells follow each other: in an infinite lattice for ever, whatever the ends of ``chain`` are."""
+        if self.infinite:
+            return Topology(self.chain.cells, None)
+        return self.chain.topology
+
+    @property
+    def _contacts(self) -> Elements:
+        """The contacts of all sites."""
+        return contacts(self.chain, self._topology)
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
@@ -225,13 +233,15 @@ class WaveCompliance:
         stretches = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
         if self.infinite:
             return [Stretch(None, 0, 0), *stretches, Stretch(last, None, 0)]
-        if self.chain.ends == "periodic":
+        if self._topology.is_ring:
             stretches.append(Stretch(last, 0, cells[0] + self.chain.cells - cells[-1] - 1))
         return stretches
 
     def _loads(self) -> np.ndarray:
         """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
-        return unit_loads(self.chain, self._resonator_cells, self.points, self.cells)
+        dofs = self.chain.cell.dofs
+        of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
+        return unit_loads([*self._contacts.ends(), *of_points], masses_of(self.cells, dofs))
 
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
         """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""
@@ -263,10 +273,11 @@ class WaveCompliance:
         dynamic = blocks.stiffness - omega[:, None, None] ** 2 * np.diag(chain.cell.masses)
         for cell in at:
             matrix[:, cell, cell] += dynamic
-        if chain.ends == "free" and not self.infinite:
+        beyond = self._topology.neighbour(-1)
+        if beyond == NONE:
             matrix[:, at[0], at[0]] -= blocks.left
             matrix[:, at[-1], at[-1]] -= blocks.right
-        if chain.ends != "fixed" or self.infinite:
+        if beyond != WALL or self.infinite:
             # At omega = 0 such a lattice may move as a whole. A spring to ground stops that: forces that sum to zero
             # put no load on it.
             matrix[omega == 0, chain.cell.host, chain.cell.host] += blocks.stiffness[0, 0]
@@ -342,7 +353,7 @@ def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
 
     The next cell has ``factor`` times that shape; the ground does not move.
     """
-    resonator = shape[pair.resonator] * factor if pair.next_cell else shape[pair.resonator]
+    resonator = shape[pair.resonator] * factor if pair.offset else shape[pair.resonator]
     host = shape[pair.host] if pair.host >= 0 else 0.0
     return complex(resonator - host)
 

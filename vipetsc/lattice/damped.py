@@ -86,7 +86,7 @@ def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tupl
     point = bloch(cell, KAPPAS)
 
     # What a dashpot of 1 N s/m adds to phi* C phi: |phi|^2 of its mass to ground, |difference|^2 of its spring's ends.
-    turn = np.exp(1j * np.multiply.outer(KAPPAS, [s.next_cell for s in cell.springs]))[:, :, None]
+    turn = np.exp(1j * np.multiply.outer(KAPPAS, [s.offset for s in cell.springs]))[:, :, None]
     start = point.vectors[:, [s.start for s in cell.springs]]
     end = point.vectors[:, [s.end for s in cell.springs]]
     rows = np.abs(np.concatenate([point.vectors, end * turn - start], axis=1)) ** 2

@@ -29,8 +29,8 @@ from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.dense_compliance import RIGID, UNMOVED
-from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
-from vipetsc.lattice.unit_loads import unit_loads
+from vipetsc.lattice.elements import Elements, contacts, masses_of, nonlinear_springs, unit_loads
+from vipetsc.lattice.topology import WALL
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
@@ -76,14 +76,14 @@ class ModalCompliance:
             raise ComplianceError(f"a lattice of {dofs} masses: all modes are computed of up to {MOST_DOFS}")
 
     @cached_property
-    def springs(self) -> list[SpringPlace]:
+    def springs(self) -> Elements:
         """The nonlinear springs."""
-        return nonlinear_places(self.chain)
+        return nonlinear_springs(self.chain)
 
     @property
     def pairs(self) -> int:
         """Number of contact pairs and of nonlinear springs."""
-        return len(self.chain.sites) + len(self.springs)
+        return len(self.chain.sites) + len(self.springs.cell)
 
     @cached_property
     def slowest(self) -> float:
@@ -98,14 +98,10 @@ class ModalCompliance:
     @cached_property
     def loads(self) -> np.ndarray:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
-        loads = unit_loads(self.chain, self.chain.resonator_cells, self.points, range(self.chain.cells))
-        elongations = np.zeros((len(loads), len(self.springs)))
-        for column, place in zip(elongations.T, self.springs, strict=True):
-            if place.end >= 0:
-                column[place.end] = 1
-            if place.start >= 0:
-                column[place.start] = -1
-        return np.insert(loads, [len(self.chain.sites)], elongations, axis=1)
+        dofs = self.chain.cell.dofs
+        of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
+        ends = [*contacts(self.chain).ends(), *self.springs.ends(), *of_points]
+        return unit_loads(ends, masses_of(range(self.chain.cells), dofs))
 
     @cached_property
     def stiffness(self) -> csc_matrix:

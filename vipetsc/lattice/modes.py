@@ -111,7 +111,7 @@ def linear_modes(chain: Chain) -> Modes:
 @lru_cache(maxsize=4)
 def _modes(chain: Chain) -> Modes:
     """The modes of a chain without sites, as ``linear_modes``."""
-    ring = chain.ends == "periodic"
+    ring = chain.topology.is_ring
     many = chain.cells * chain.cell.dofs > MOST_DOFS
     if chain.is_uniform() and (ring or many):
         # A wall on both sides is a cell of the ring that is at rest.
@@ -161,7 +161,7 @@ def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
 
 def number_near(chain: Chain, omega: float) -> int:
     """The number (from 1, lowest first) of the mode whose frequency is nearest to ``omega`` in rad/s."""
-    if chain.ends == "periodic":
+    if chain.topology.is_ring:
         frequency = np.sort(_ring(chain, chain.cells, exact=True).frequency)
         return int(np.argmin(np.abs(frequency - omega))) + 1
 
@@ -173,7 +173,7 @@ def number_near(chain: Chain, omega: float) -> int:
 @lru_cache(maxsize=4)
 def mode_frequency(chain: Chain, number: int) -> float:
     """Frequency in rad/s of mode ``number`` (from 1, lowest first) of a chain of any length, with ends by bisection."""
-    if chain.ends == "periodic":
+    if chain.topology.is_ring:
         frequencies = np.sort(_ring(chain, chain.cells, exact=True).frequency)
         squared = frequencies[number - 1] ** 2
         top = frequencies[-1] ** 2
@@ -201,7 +201,7 @@ def mode_shape(chain: Chain, number: int) -> np.ndarray:
 
     Of the two modes of a wave on a ring, the one that is largest at cell 1 has the lower number.
     """
-    if chain.ends == "periodic":
+    if chain.topology.is_ring:
         shape = _ring_shape(chain, number)
     else:
         shape = _standing_shape(chain, number)

@@ -72,7 +72,7 @@ class SeriesCompliance:
         chain = self.chain
         first = chain.sites[group[0]] - TERMS
         last = chain.sites[group[-1]] + TERMS
-        if chain.ends != "periodic":
+        if not chain.topology.is_ring:
             first = max(first, 0)
             last = min(last, chain.cells - 1)
         if last - first + 1 >= chain.cells:
@@ -83,7 +83,7 @@ class SeriesCompliance:
     def _groups(self) -> list[list[int]]:
         """Numbers of the sites in the chain's list, together where their pieces overlap; a ring's all together."""
         order = np.argsort(self.chain.sites, kind="stable").tolist()
-        if self.chain.ends == "periodic":
+        if self.chain.topology.is_ring:
             return [order]
 
         groups = [[order[0]]]

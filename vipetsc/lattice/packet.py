@@ -68,9 +68,8 @@ class Packet(NamedTuple):
 
     def on(self, chain: Chain, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement and velocity (cell, dof) of cells ``start`` to ``stop``; what lies beyond an end is left out."""
-        cells = self.centre - len(self.velocity) // 2 + np.arange(len(self.velocity))
-        if chain.ends == "periodic":
-            cells = cells % chain.cells
+        first = self.centre - len(self.velocity) // 2
+        cells = chain.topology.neighbour(first + np.arange(len(self.velocity)))
         inside = (cells >= start) & (cells < stop)
         # In a ring shorter than the packet, cells occur more than once.
         u, v = np.zeros((2, stop - start, chain.cell.dofs))

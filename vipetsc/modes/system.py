@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from vipetsc.case.nnm import NnmCase
-from vipetsc.lattice import Chain, Contact, Spring, UnitCell, nonlinear_places
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell, contacts, nonlinear_springs, spring_laws
 from vipetsc.modes.balance.stops import Stops
 
 # A contact does not move in a mode if its relative displacement is below this fraction of the mode's largest one: a
@@ -133,12 +133,9 @@ class System:
     @classmethod
     def from_chain(cls, chain: Chain, stops: Sequence[Stops]) -> Self:
         """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots."""
-        dofs = chain.cell.dofs
         pairs = []
-        places = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, stops, strict=True)
-        for site, resonator_cell, pair, of_site in places:
-            host = site * dofs + pair.host if pair.host >= 0 else None
-            pairs.append(contact_pair(host, resonator_cell * dofs + pair.resonator, of_site))
+        for (host, resonator), of_site in zip(contacts(chain).ends(), stops, strict=True):
+            pairs.append(contact_pair(None if host < 0 else host, resonator, of_site))
 
         return cls(
             masses=chain.masses(),
@@ -351,9 +348,9 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
 
 def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
     """The springs of a lattice that have more than a linear part, those to its walls among them."""
-    for place in nonlinear_places(chain):
-        if place.end >= 0:
-            yield SmoothSpring(place.start if place.start >= 0 else None, place.end, place.law)
+    for (start, end), law in zip(nonlinear_springs(chain).ends(), spring_laws(chain), strict=True):
+        if end >= 0:
+            yield SmoothSpring(None if start < 0 else start, end, law)
         else:
             # From the last mass to the wall the elongation is -u: an even part of the force changes its sign.
-            yield SmoothSpring(None, place.start, replace(place.law, quadratic=-place.law.quadratic))
+            yield SmoothSpring(None, start, replace(law, quadratic=-law.quadratic))

@@ -22,7 +22,6 @@ from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
-from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import divided, on_every_rank, on_root
 from vipetsc.sources import source_key
 from vipetsc.spectra.measures import MEASURES, PART, row_of, take
@@ -349,7 +348,7 @@ def _estimated_peak(record: VelocityRecord) -> float:
     chain = record.model.chain
     distance = 0
     if record.site is not None:
-        distance = int(cells_between(record.site - 1, record.model.drive_cell, chain.cells, chain.ends))
+        distance = int(chain.topology.distance(record.site - 1, record.model.drive_cell))
     return spectra.estimated_peak(record.model.drive.duration, distance, record.model.speed)
 
 

@@ -21,7 +21,7 @@ from vipetsc.dynamics.matrices import Joint, LatticeMatrices
 from vipetsc.dynamics.memory import LARGEST_MESSAGE
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
-from vipetsc.lattice import Band, Chain, wave_bands
+from vipetsc.lattice import Band, Chain, contacts, wave_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
 
@@ -110,19 +110,13 @@ def check_modes(case: Case, count: int, near: float) -> None:
 def pressed_contacts(model: Model) -> list[Joint]:
     """The contacts of a ``model`` that are pressed at rest: for small motions springs of the slope of their force."""
     chain = model.chain
-    dofs = chain.cell.dofs
     laws = model.laws or (model.contact,) * len(chain.sites)
     joints: list[Joint] = []
     # There are no gaps, and no rows, where all contacts have one clearance on both sides: none is pressed then.
-    rows = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, laws, model.gaps, strict=False)
-    for site, cell, pair, law, stops in rows:
+    for (host, resonator), law, stops in zip(contacts(chain).ends(), laws, model.gaps, strict=False):
         pressed = -min(stops)
         if pressed > 0:
-            # The ground has no row of the stiffness matrix.
-            host = -1
-            if pair.host >= 0:
-                host = site * dofs + pair.host
-            joints.append(Joint(host, cell * dofs + pair.resonator, float(law.elastic_slope(pressed))))
+            joints.append(Joint(host, resonator, float(law.elastic_slope(pressed))))
     return joints
 
 

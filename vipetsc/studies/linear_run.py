@@ -25,7 +25,8 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice.chain import Pair, cells_between
+from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.topology import Topology
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, group_of, is_measure, row_of
@@ -287,7 +288,7 @@ def first_site_cell(case: Case) -> int:
     cells = np.asarray(case.contacts.sites, np.int64)
     if not cells.size:
         return 0
-    distance = cells_between(cells, case.drive.cell, case.lattice.cells, case.lattice.ends)
+    distance = Topology(case.lattice.cells, case.lattice.ends).distance(cells, case.drive.cell)
     return int(cells[np.argmin(distance)])
 
 

@@ -22,7 +22,7 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.extras import require
 from vipetsc.io.kinds import OPTIMUM
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice.chain import cells_between
+from vipetsc.lattice.topology import Topology
 from vipetsc.parallel import on_root
 from vipetsc.progress import Progress
 from vipetsc.studies.designs import OptimumSearch
@@ -103,7 +103,7 @@ def _start(plan: OptimiseCase, work: StudyWork) -> np.ndarray:
         linear = LinearRun.of(data, result.statistics, sites=(), names=())
         # The law's sites are in the order in which the wave meets them, the plan's are not.
         sites = np.array(plan.sites)
-        order = np.argsort(cells_between(sites, drive.cell, lattice.cells, lattice.ends), kind="stable")
+        order = np.argsort(Topology(lattice.cells, lattice.ends).distance(sites, drive.cell), kind="stable")
         clearance = np.empty(len(sites))
         clearance[order] = matched_clearances(law, linear, sites[order].tolist(), drive.amplitude)
         return plan.begin(clearance.tolist())

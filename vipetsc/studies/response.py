@@ -77,7 +77,7 @@ def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | N
     vector = bloch(cell, kappa).vectors[:, number - 1]
     w = vector[pair.resonator]
     # The next cell moves as this one does, times Bloch's factor.
-    if pair.next_cell:
+    if pair.offset:
         w = w * np.exp(1j * kappa)
     # The ground does not move.
     if pair.host >= 0:

@@ -69,7 +69,7 @@ class Ring:
         """
         cell = self.setting.site + 1
         first = max(cell - neighbours, 1)
-        last = min(cell + self.kind.pair.next_cell + neighbours, self.setting.cells)
+        last = min(cell + self.kind.pair.offset + neighbours, self.setting.cells)
         return self._run(amplitude, with_site, {"window": [first, last]})
 
     def wall_peak(self) -> float:
@@ -85,7 +85,7 @@ class Ring:
             drive={"cell": None, "mass": None, "amplitude": 1.0},
             contacts=NO_SITES,
             time={"end": setting.end, "sample_interval": setting.interval},
-            output={"window": [cell, cell + self.kind.pair.next_cell]},
+            output={"window": [cell, cell + self.kind.pair.offset]},
         )
         run = self.recorded.run_in_memory(case)[0]
         return self.peak_of(PairMotion.between(run, [0], [self.kind.pair]))

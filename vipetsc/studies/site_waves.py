@@ -129,7 +129,7 @@ class SiteWaves:
             factor = waves.factor[wave]
             flux = _power_past_end(waves, wave, omega)
             # Past the cell's other end it is flux/|factor|^2. Past the middle it is the geometric mean of both.
-            if not self.pair.next_cell:
+            if not self.pair.offset:
                 flux = flux / abs(factor)
             # ``waves`` has the factor to the next higher cell, for waves to lower cells too.
             outwards = factor
@@ -146,7 +146,7 @@ class SiteWaves:
         resonator[self.pair.resonator] = 1.0
         amplitudes = np.concatenate(amplitudes_sent(waves, resonator, "right"))
         # From the next cell, in which the force acts, back to the site's.
-        if self.pair.next_cell:
+        if self.pair.offset:
             amplitudes = amplitudes / waves.factor
         # A contact with the ground has a force on one mass alone.
         if self.pair.host >= 0:

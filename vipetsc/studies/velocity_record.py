@@ -12,7 +12,7 @@ from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.read import field_interval, field_time
 from vipetsc.lattice import wave_bands
-from vipetsc.lattice.chain import nearest_site
+from vipetsc.lattice.topology import Topology
 
 
 class VelocityRecord:
@@ -42,7 +42,7 @@ class VelocityRecord:
         self.interval = field_interval(run)
         self.cells = run["cell"].values
         sites = run["sites/cell"].values
-        first = nearest_site(sites, case.drive.cell, case.lattice.cells, case.lattice.ends)
+        first = Topology(case.lattice.cells, case.lattice.ends).nearest(sites, case.drive.cell)
         self.site = None if first is None else int(sites[first])
 
         # Rounded up: a map has at most so many pixels on either side.

@@ -20,7 +20,7 @@ from vipetsc.case.nfrc.table import NfrcTable
 from vipetsc.case.nfrc.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
+from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_springs, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 from vipetsc.wording import distinct
@@ -147,7 +147,7 @@ class NfrcCase(Case):
             read.append(sections)
 
         chains = [build_chain(sections["lattice"], sections["contacts"]) for sections in read]
-        if len({tuple((place.cell, place.number) for place in nonlinear_places(chain)) for chain in chains}) > 1:
+        if len({tuple(nonlinear_springs(chain).labels()) for chain in chains}) > 1:
             remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin at another value"
             return read[0], [Problem("nfrc.range", options.range, remedy)]
 
@@ -379,7 +379,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         remedy = f"{dofs} masses: all modes of a lattice with dashpots, unlike cells or other contact pairs are needed"
         yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
     elif not chain.is_linear:
-        places = len(chain.sites) + len(nonlinear_places(chain))
+        places = len(chain.sites) + len(nonlinear_springs(chain).cell)
         unknowns = places * 2 * (nfrc.harmonics + 1)
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from vipetsc.case.nfrc.table import NfrcTable
 from vipetsc.case.schema import LatticeTable, OutputTable
-from vipetsc.lattice import Chain, nonlinear_places
+from vipetsc.lattice import Chain, nonlinear_springs
 from vipetsc.spectra.measures import JOINT
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS
 
@@ -36,7 +36,7 @@ def measures_of(
     members: dict[str, list[str]] = {}
     if sites:
         members |= {"largest": sites, "closed": sites}
-    springs = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
+    springs = nonlinear_springs(chain).labels()
     if springs:
         members["largest_elongation"] = springs
     if nfrc.infinite:

@@ -11,7 +11,7 @@ from vipetsc.case.nnm.table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
 from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Chain, UnitCell, nonlinear_places, wave_bands
+from vipetsc.lattice import Chain, UnitCell, nonlinear_springs, wave_bands
 from vipetsc.lattice.cell import connected_groups
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
@@ -180,7 +180,7 @@ def rigid_motions_of_pair(cell: UnitCell) -> int:
     joined = [(0, 0)]
     for spring in cell.springs:
         ends = [spring.start, spring.end]
-        if not spring.next_cell and {*ends} == {*nodes}:
+        if not spring.offset and {*ends} == {*nodes}:
             joined.append((1, 2))
         else:
             joined += [(0, nodes[mass]) for mass in ends if mass in nodes]
@@ -229,7 +229,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
         yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
 
     # Every place with a nonlinear force has harmonics of its own.
-    count = len(chain.sites) + len(nonlinear_places(chain))
+    count = len(chain.sites) + len(nonlinear_springs(chain).cell)
     yield from check_start_sites(nnm, count)
 
     cell = chain.cell

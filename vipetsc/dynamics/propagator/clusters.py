@@ -94,13 +94,9 @@ def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: La
 
     ``dofs`` (dof,) are the records of ``contact_dofs`` of ``groups.numbers``, in that order.
     """
-    # On a ring a DoF also stands one turn before and one turn after its own place.
-    turns: tuple[int, ...] = (0,)
-    if layout.periodic:
-        turns = (-layout.cells, 0, layout.cells)
     near = np.zeros(len(dofs), bool)
     # "last" is a DoF's last cell, ``stop`` the cell after the rank's last one.
-    for turn in turns:
+    for turn in layout.topology.turns:
         near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
 
     # A group is near if one of its DoFs is; a rank without cells has no group, though its place is near some.
@@ -159,9 +155,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
 
 def _owned_cells(leftmost: np.ndarray, count: int, layout: Layout) -> np.ndarray:
     """Local numbers (dof, count) of the ``count`` cells from ``leftmost`` (dof,) on, -1 for a cell of another rank."""
-    cells = leftmost[:, None] + np.arange(count)
-    if layout.periodic:
-        cells = cells % layout.cells
+    cells = layout.topology.neighbour(leftmost[:, None], np.arange(count))
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
@@ -217,9 +211,8 @@ def create_responses(groups: Groups, tables: Record, model: Model, series: StepS
     for j, targets, sources in groups.pairs():
         # Columns of the target's rows in which the cells of the source lie. A ring has at least ``width`` cells: each
         # of them is in one column at most.
-        columns = series.reach + (cells[sources] - cells[targets])[:, None] + form_cells
-        if model.chain.ends == "periodic":
-            columns = columns % model.chain.cells
+        leftmost = cells[targets] - series.reach
+        columns = model.chain.topology.steps(leftmost[:, None], cells[sources][:, None] + form_cells)
         columns = np.where((columns >= 0) & (columns < series.width), columns, series.width)
         near = np.any(columns < series.width, axis=1)
         targets = targets[near]

@@ -179,18 +179,17 @@ class Propagator(Engine):
         self._regions = HaloRegions(layout)
         self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
-        ghosts = [cell for cell in layout.neighbours() if cell is not None]
-        for cell in ghosts:
+        for cell in layout.ghosts:
             self._regions.add(cell, 1)
 
-        self._components = np.zeros((2, layout.size + layout.ghost_rows * len(ghosts)))
+        self._components = np.zeros((2, layout.size + layout.ghost_rows * len(layout.ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
         self._halo = self._regions.bind_columns(self._states)
         self._record = Record(
             States(
                 components=self._components,
                 owned=layout.owned,
-                ghosts=len(ghosts),
+                ghosts=len(layout.ghosts),
                 ghost_rows=layout.ghost_rows,
                 parts=round(model.sample_interval / series.interval),
                 sample_interval=model.sample_interval,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.lattice import Chain, nonlinear_numbers
+from vipetsc.lattice import Chain, Elements, contacts, nonlinear_springs
 
 # A spring's force beyond its linear part counts from this fraction of the linear part on: below, it is rounding.
 NEGLIGIBLE = float(np.finfo(float).epsneg)
@@ -46,12 +46,11 @@ class Groups(NamedTuple):
 
 def spans_cells(chain: Chain) -> bool:
     """Whether forces act between masses of two cells: by contacts, or by nonlinear springs."""
-    cells, numbers = nonlinear_numbers(chain).T
-    inside = cells[[chain.cell.springs[number].next_cell for number in numbers]]
-    if chain.ends == "fixed":
-        # Springs to a wall act on one mass.
-        inside = inside[(inside >= 0) & (inside < chain.cells - 1)]
-    return chain.is_joined or inside.size > 0
+    springs = nonlinear_springs(chain)
+    # Springs to a wall act on one mass.
+    joins = (springs.start >= 0) & (springs.end >= 0)
+    apart = springs.start // chain.cell.dofs != springs.end // chain.cell.dofs
+    return chain.is_joined or bool(np.any(joins & apart))
 
 
 @lru_cache(maxsize=2)  # each table of an engine asks for those of its model
@@ -67,63 +66,55 @@ def contact_dofs(model: Model) -> np.ndarray:
     """
     lattice = model.chain
     drives = model.drives[::-1]
-    sites = np.arange(len(lattice.sites))
-    springs = nonlinear_numbers(lattice)
+    springs = nonlinear_springs(lattice)
+    of_sites = contacts(lattice)
+    first_spring = len(of_sites.cell)
+    first_drive = first_spring + len(springs.cell)
 
     shape = (1 + spans_cells(lattice), lattice.cell.dofs)
     fields = [("cell", int), ("last", int), ("form", float, shape), ("clearance", float)]
-    dofs = np.zeros(len(sites) + len(springs) + len(drives), [*fields, ("quadratic", float), ("cubic", float)])
-    first_drive = len(sites) + len(springs)
-    dofs["cell"][sites] = lattice.sites
-    dofs["cell"][first_drive:] = [drive.cell for drive in drives]
-
-    # ``pairs`` is empty where all sites join the masses of the cell's own pair: one row for all.
-    pairs = lattice.pairs or [(lattice.cell.host, lattice.cell.resonator, 0)]
-    host, resonator, joins = np.broadcast_to(np.array(pairs, np.int64), (len(sites), 3)).T
-
-    # A site's w is the second mass's displacement, in the next cell if it ``joins`` cells, less the host's. Ground has
-    # the number -1, and so the last row, of zeros.
-    unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
-    dofs["form"][sites, joins] = unit[resonator]
-    dofs["form"][sites, 0] -= unit[host]
-    dofs["form"][first_drive:, 0] = unit[[drive.mass for drive in drives]]
-    dofs["last"] = dofs["cell"]
-    dofs["last"][sites] += joins
+    dofs = np.zeros(first_drive + len(drives), [*fields, ("quadratic", float), ("cubic", float)])
+    _fill_forms(dofs[:first_spring], of_sites, lattice)
+    _fill_forms(dofs[first_spring:first_drive], springs, lattice)
+    driven = dofs[first_drive:]
+    driven["cell"] = driven["last"] = [drive.cell for drive in drives]
+    driven["form"][np.arange(len(drives)), 0, [drive.mass for drive in drives]] = 1.0
 
     # ``gaps`` is empty where the clearances of every site are equal on both sides.
-    dofs["clearance"][sites] = lattice.clearances
+    dofs["clearance"][:first_spring] = lattice.clearances
     if model.gaps:
-        dofs["clearance"][sites] = np.min(model.gaps, axis=1)
-    dofs["clearance"][first_drive:] = np.inf
-    if len(springs):
-        _fill_springs(dofs[len(sites) : first_drive], lattice, springs)
+        dofs["clearance"][:first_spring] = np.min(model.gaps, axis=1)
+    driven["clearance"] = np.inf
+    if len(springs.cell):
+        _fill_springs(dofs[first_spring:first_drive], lattice, springs)
     dofs.flags.writeable = False  # all who ask get the same array
     return dofs
 
 
-def _fill_springs(dofs: np.ndarray, lattice: Chain, springs: np.ndarray) -> None:
-    """Fill the ``dofs`` (spring,) of the ``springs`` (spring, 2), cells and numbers, whose elongations they are."""
-    cells, numbers = springs.T
-    start, end, next_cell = np.array([(s.start, s.end, s.next_cell) for s in lattice.cell.springs], np.int64)[numbers].T
-    starts_inside = cells >= 0
-    ends_inside = (cells + next_cell < lattice.cells) | (lattice.ends == "periodic")
-    joins = next_cell * (starts_inside & ends_inside)
-    dofs["cell"] = np.maximum(cells, 0)
-    dofs["last"] = dofs["cell"] + joins
+def _fill_forms(dofs: np.ndarray, elements: Elements, lattice: Chain) -> None:
+    """Fill cells and forms of the ``dofs`` (element,) that are the elongations of ``elements``."""
+    # The first cell of an element is that of its start, or of its end where it starts in a wall or on the ground.
+    masses = lattice.cell.dofs
+    dofs["cell"] = np.where(elements.start >= 0, elements.start, elements.end) // masses
+    dofs["last"] = dofs["cell"]
+    for weight, ends in ((1.0, elements.end), (-1.0, elements.start)):
+        moves = np.flatnonzero(ends >= 0)
+        cells, mass = np.divmod(ends[moves], masses)
+        further = lattice.topology.steps(dofs["cell"][moves], cells)
+        dofs["form"][moves, further, mass] += weight
+        dofs["last"][moves] = np.maximum(dofs["last"][moves], dofs["cell"][moves] + further)
 
-    # The elongation is the displacement at the end less that at the start; a wall, number -1, does not move.
-    unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
-    every = np.arange(len(springs))
-    dofs["form"][every, joins] = unit[np.where(ends_inside, end, -1)]
-    dofs["form"][every, 0] -= unit[np.where(starts_inside, start, -1)]
 
+def _fill_springs(dofs: np.ndarray, lattice: Chain, springs: Elements) -> None:
+    """Fill the laws of the ``dofs`` (spring,) that are elongations of ``springs``, and where these begin to count."""
     terms = lattice.spring_terms(-1, lattice.cells)
-    quadratic = terms.quadratic[cells + 1, numbers]
-    cubic = terms.cubic[cells + 1, numbers]
+    quadratic = terms.quadratic[springs.cell + 1, springs.number]
+    cubic = terms.cubic[springs.cell + 1, springs.number]
     dofs["quadratic"] = quadratic
     dofs["cubic"] = cubic
     # The root of |c| z^2 + |q| z = NEGLIGIBLE k.
-    least = NEGLIGIBLE * lattice.coefficients(-1, lattice.cells).stiffness[cells + 1, numbers]
+    stiffness = lattice.coefficients(-1, lattice.cells).stiffness[springs.cell + 1, springs.number]
+    least = NEGLIGIBLE * stiffness
     dofs["clearance"] = 2 * least / (np.abs(quadratic) + np.sqrt(quadratic**2 + 4 * np.abs(cubic) * least))
 
 
@@ -144,8 +135,8 @@ def group_dofs(model: Model, reach: int) -> Groups:
     group = np.zeros(len(dofs), np.int64)
     group[order[1:]] = np.cumsum(cells[1:] - lasts[:-1] > reach)
 
-    # On a ring the last group may reach the first one across the joint.
-    if lattice.ends == "periodic" and cells[0] + lattice.cells - lasts[-1] <= reach:
+    # On a ring the last group may reach the first one across the joint. Elsewhere all are in one group if it does.
+    if len(dofs) and lattice.topology.distance(lasts[-1], cells[0]) <= reach:
         group[group == group.max()] = 0
 
     first = np.append(0, np.cumsum(np.bincount(group)))

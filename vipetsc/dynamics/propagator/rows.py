@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.topology import NONE
 from vipetsc.lattice.variation import Coefficients
 
 # Cells whose coefficients are looked at together, some MB: a lattice of millions is not copied as a whole.
@@ -81,7 +82,7 @@ def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np
 
     # No power reaches the outermost neighbours: what np.roll carries across them is zero.
     acts = np.ones_like(exists)
-    if chain.ends == "free":
+    if chain.topology.neighbour(-1) == NONE:
         acts = exists & np.roll(exists, -1, axis=-1)
     neighbours = _Neighbourhoods(chain=chain, masses=masses[:, None], exists=exists[:, None, None], acts=acts[:, None])
 
@@ -127,7 +128,7 @@ def _multiply(
     for spring, value in zip(neighbours.chain.cell.springs, springs.swapaxes(0, 1)[:, :, None], strict=True):
         start = x[:, :, spring.start]
         end = x[:, :, spring.end]
-        if spring.next_cell:
+        if spring.offset:
             pull = (np.roll(end, -1, axis=-1) - start) * (value * neighbours.acts)
             out[:, :, spring.start] += pull
             out[:, :, spring.end] -= np.roll(pull, 1, axis=-1)

@@ -195,8 +195,7 @@ class StepSeries:
         """The rows of each of ``cells``, see ``rows``."""
         distances = np.arange(-self._outermost, self._outermost + 1)
         for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
-            neighbours = batch[:, None] + distances
-            is_inside = (neighbours >= 0) & (neighbours < self.chain.cells)
+            is_inside = self.chain.topology.neighbour(batch[:, None], distances) >= 0
             exists = is_inside | ~self.is_near_end(batch)[:, None]
             # One cell more than the reach: the spring that enters the leftmost cell is stored with the cell before.
             recursion = local_recursion(self.chain, self.interval, batch, exists, self.reach + 1)
@@ -221,9 +220,8 @@ class StepSeries:
 
     def is_near_end(self, cells: ArrayLike) -> np.ndarray:
         """Whether an end lies within the reach of each of ``cells``."""
-        leftmost = np.asarray(cells) - self.reach
-        rightmost = leftmost + 2 * self.reach
-        return ((leftmost < 0) | (rightmost >= self.chain.cells)) & (self.chain.ends != "periodic")
+        topology = self.chain.topology
+        return np.asarray((topology.neighbour(cells, -self.reach) < 0) | (topology.neighbour(cells, self.reach) < 0))
 
     @cached_property
     def _differing_before(self) -> np.ndarray:
@@ -232,11 +230,8 @@ class StepSeries:
         How many of a window of cells differ is then a difference of two entries.
         """
         near = self.reach + 1
-        differs = self.chain.differs.astype(int)
-        if self.chain.ends == "periodic":
-            differs = np.pad(differs, near, mode="wrap")
-        else:
-            differs = np.pad(differs, near)
+        cells = self.chain.topology.neighbour(np.arange(-near, self.chain.cells + near))
+        differs = self.chain.differs[np.maximum(cells, 0)] & (cells >= 0)
         return np.append(0, np.cumsum(differs))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:

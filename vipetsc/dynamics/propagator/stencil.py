@@ -33,7 +33,7 @@ class HaloRegions:
     """Ranges of cells that a rank reads, its own and those of other ranks, to be copied side by side.
 
     ``add`` the ranges and call ``bind_columns`` once; ``exchange`` then fills the columns of its ``Halo``. Cells beyond
-    an end of a lattice that is not periodic are replaced by its last one.
+    an end of the lattice are replaced by its last one.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -52,11 +52,9 @@ class HaloRegions:
     def bind_columns(self, states: Sequence[PETSc.Vec]) -> Record:
         """The columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
         layout = self._layout
-        cells = np.concatenate(self._ranges)
-        if layout.periodic:
-            cells = cells % layout.cells
-        else:
-            cells = np.clip(cells, 0, layout.cells - 1)
+        wanted = np.concatenate(self._ranges)
+        cells = layout.topology.neighbour(wanted)
+        cells = np.where(cells < 0, np.clip(wanted, 0, layout.cells - 1), cells)
         columns = np.zeros((2 * layout.dofs, len(cells)))
 
         # One rank has all cells in memory and copies them; its handles stay 0.
@@ -65,9 +63,9 @@ class HaloRegions:
         if layout.comm.size > 1:
             self._vector = PETSc.Vec().createWithArray(columns, comm=PETSc.COMM_SELF)
             # By component, as the rows of ``columns`` are.
-            wanted = PETSc.IS().createGeneral(layout.state_indices(cells).T.ravel(), comm=layout.comm)
-            self._scatter = PETSc.Scatter().create(states[0], wanted, self._vector, None)
-            wanted.destroy()
+            indices = PETSc.IS().createGeneral(layout.state_indices(cells).T.ravel(), comm=layout.comm)
+            self._scatter = PETSc.Scatter().create(states[0], indices, self._vector, None)
+            indices.destroy()
             scatter = self._scatter.handle
             vector = self._vector.handle
         native.bind_symbols()
@@ -144,7 +142,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Rec
     # Cells that no end is within reach of, and among them those whose stencil stays among the rank's own.
     first = layout.start
     last = layout.stop
-    if not layout.periodic:
+    if not layout.topology.is_ring:
         first = max(first, reach)
         last = min(last, layout.cells - reach)
     inner = np.arange(first, max(first, last))

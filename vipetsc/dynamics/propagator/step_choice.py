@@ -14,7 +14,7 @@ from vipetsc.case import Model
 from vipetsc.dynamics.propagator.groups import group_dofs, spans_cells
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
-from vipetsc.lattice import Chain, ToneBurst, nonlinear_numbers
+from vipetsc.lattice import Chain, ToneBurst, nonlinear_springs
 from vipetsc.wording import counted
 
 # The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
@@ -136,7 +136,7 @@ def refusal(model: Model) -> str | None:
 
 def spring_cost(chain: Chain, reach: int) -> float:
     """Cost in us of the nonlinear springs of ``chain`` in a step in which forces reach so many cells."""
-    cells = np.sort(nonlinear_numbers(chain)[:, 0])
+    cells = np.sort(nonlinear_springs(chain).cell)
     near = np.searchsorted(cells, cells + reach, "right") - np.searchsorted(cells, cells - reach, "left")
     return SPRING_COST * len(cells) + PAIR_COST * float(near.sum())
 
@@ -144,7 +144,7 @@ def spring_cost(chain: Chain, reach: int) -> float:
 def _too_many_springs(model: Model, reach: int, radians: float) -> str | None:
     """Why the nonlinear springs of ``model`` make steps of so many ``radians`` dearer than ``ts``; None if not."""
     chain = model.chain
-    count = len(nonlinear_numbers(chain))
+    count = len(nonlinear_springs(chain).cell)
     if not count:
         return None
     linear = STEP_COST + CELL_COST * chain.cells

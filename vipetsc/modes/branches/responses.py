@@ -13,7 +13,7 @@ from vipetsc.case.nfrc import FRACTIONS, WALLS, NfrcCase, ResponseCurve, value_o
 from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
+from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_springs
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import RESPONSE_KINDS
 from vipetsc.modes.branches.method import CrossingBranch, Method, value_kind
@@ -312,7 +312,7 @@ def _axes(case: NfrcCase) -> Variables:
     }
 
     if not chain.is_linear:
-        labels = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
+        labels = nonlinear_springs(chain).labels()
         text = "cell in which a nonlinear spring begins (0: left wall), and its number there, both from 1"
         axes["spring"] = variable("spring", np.array(labels), "1", text)
     output = case.output

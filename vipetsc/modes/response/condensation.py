@@ -28,7 +28,7 @@ import numpy as np
 from vipetsc.case.drive import build_drive
 from vipetsc.case.nfrc import NfrcCase, needs_modes
 from vipetsc.case.resolve import build_chain
-from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, nonlinear_places
+from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, spring_laws
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
 
@@ -92,7 +92,7 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
 def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
     """The contacts of a ``case``, with a ``restitution``, and its springs that are not linear."""
     chain = case.model().chain
-    springs = [place.law for place in nonlinear_places(chain)]
+    springs = spring_laws(chain)
     return SiteForces(stops_of(case, restitution), springs)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
+from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_springs
 from vipetsc.modes.response.condensation import driven_points, stops_of
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, magnitude
 from vipetsc.modes.response.state import Measures, Response
@@ -30,7 +30,7 @@ def linear_states(case: NfrcCase, fixed: float, compliance: WaveCompliance | Mod
     outputs = ResponseOutputs(case, compliance, contacts)
     weights = driven_points(case).weights
     sites = len(contacts)
-    pairs = sites + len(nonlinear_places(compliance.chain))
+    pairs = sites + len(nonlinear_springs(compliance.chain).number)
     low, high = options.range
     scale = (high - low) / 2
 

@@ -67,9 +67,9 @@ class ResponseOutputs:
         self.pairs = [(names.index(source), names.index(receiver)) for source, receiver in output.transmission or []]
 
         chain = compliance.chain
-        self._springs = []
+        self._springs: list[tuple[int, int]] = []
         if isinstance(compliance, ModalCompliance):
-            self._springs = compliance.springs
+            self._springs = compliance.springs.ends()
         self.walls: list[WallSprings] = []
         if self.wants_forces and not (case.nfrc.infinite or case.nfrc.open_ends) and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
@@ -155,10 +155,10 @@ class ResponseOutputs:
             force = (wall.stiffness * u + wall.damping * rate * u).sum(axis=1)
             # Forces are positive towards higher cells at both walls. A nonlinear spring pulls the left wall that way
             # where u > 0 stretches it, and the right wall the other way where u < 0 stretches it.
-            for place, beyond in zip(self._springs, motion.forces[len(self.contacts) :], strict=True):
-                if name == "left" and place.start < 0:
+            for (start, end), beyond in zip(self._springs, motion.forces[len(self.contacts) :], strict=True):
+                if name == "left" and start < 0:
                     force += beyond
-                if name != "left" and place.end < 0:
+                if name != "left" and end < 0:
                     force -= beyond
             # A wall that moves by w stretches its springs by u - w.
             for moved, ratio in self._moved:
@@ -185,7 +185,7 @@ class WallSprings(NamedTuple):
 def wall_springs(chain: Chain, wall: str) -> WallSprings:
     """The springs of a lattice with fixed ends to its ``wall``, "left" or "right"."""
     # A spring between cells belongs to the left one: those to the left wall to the cell before the first one.
-    numbers = [number for number, spring in enumerate(chain.cell.springs) if spring.next_cell]
+    numbers = [number for number, spring in enumerate(chain.cell.springs) if spring.offset]
     springs = [chain.cell.springs[number] for number in numbers]
     cell = chain.cells - 1
     owner = chain.cells - 1
