@@ -93,8 +93,8 @@ class Layout:
         is_own = (cells >= self.start) & (cells < self.stop)
         first = np.where(is_own, mass * self.owned + cells - self.start, ghost + mass)
         to_velocity = np.where(is_own, self.dofs * self.owned, self.dofs)
-        found = np.column_stack([first, first + to_velocity])
-        return np.where((masses == WALL)[:, None], -1, found)
+        components = np.column_stack([first, first + to_velocity])
+        return np.where((masses == WALL)[:, None], -1, components)
 
     def state_indices(self, cells: ArrayLike) -> np.ndarray:
         """Global indices (cell, 2 dofs) of the displacements and then of the velocities of ``cells``, mass by mass."""
