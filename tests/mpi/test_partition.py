@@ -18,6 +18,7 @@ from vipetsc.dynamics.observers import Observer
 from vipetsc.dynamics.propagator import engine
 from vipetsc.dynamics.propagator.engine import Forces
 from vipetsc.io.store import RunMemory
+from vipetsc.lattice.topology import Topology
 from vipetsc.parallel import on_root, wait_for_all
 
 
@@ -141,7 +142,9 @@ def test_of_cells_that_move_equally_fast_the_first_is_named(ends, site):
     comm = MPI.COMM_WORLD
     layout = SimpleNamespace(comm=comm, dofs=1, owned=3, start=3 * comm.rank)
     engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
-    model = SimpleNamespace(chain=SimpleNamespace(sites=(5, 19), cells=20, ends=ends, cell=SimpleNamespace(springs=())))
+    model = SimpleNamespace(
+        chain=SimpleNamespace(sites=(5, 19), topology=Topology(20, ends), cell=SimpleNamespace(springs=()))
+    )
     place = failing_place(SimpleNamespace(layout=layout, engine=engine, model=model))
     assert place == f"cell 2, nearest {site}"
 

@@ -19,6 +19,7 @@ from vipetsc.figures.warning_lines import warned
 from vipetsc.io.errors import ResultFileError
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.topology import Topology
 
 
 @pytest.fixture(autouse=True)
@@ -191,7 +192,7 @@ def test_a_portrait_shows_the_masses_that_its_contact_joins(pair, host, resonato
         {"displacement": (("time", "cell", "dof"), motion[None]), "sites/cell": ("site", [3])},
         {"cell": np.arange(1, 6)},
     )
-    model = SimpleNamespace(chain=SimpleNamespace(contact_pairs=(pair,), cells=5))
+    model = SimpleNamespace(chain=SimpleNamespace(contact_pairs=(pair,), topology=Topology(5)))
     assert _of_contact(run, model, "displacement").tolist() == [[host, resonator]]
 
 
