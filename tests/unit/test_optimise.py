@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from tests.conftest import run_of, search_table
 from vipetsc.case import Case, CaseError, case_id
 from vipetsc.case.disorder import Deviation
-from vipetsc.case.named_files import relative_names, with_absolute_names
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.reading import relative_names, with_absolute_names
 from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.optimum import compared_curves
 from vipetsc.figures.style import rc_style

@@ -7,9 +7,9 @@ import pytest
 
 from tests.conftest import search_table, with_sections
 from vipetsc.case import CaseError, case_id
-from vipetsc.case.changes import put, value_at
 from vipetsc.case.keys import unit_of
 from vipetsc.case.optimise import OptimiseCase, SearchSpace, Variable
+from vipetsc.case.reading import put, value_at
 from vipetsc.studies.sampler import CmaEs
 
 OWN_CELL = {

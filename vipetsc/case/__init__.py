@@ -1,13 +1,13 @@
 """Cases, which define simulations: strict TOML is read into a typed, immutable and fully resolved case.
 
-``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case).
+``reading`` turns a TOML file into sections, with all problems at once; ``CaseFile`` is the base of every verb's case.
 ``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers. Each verb has a module or
 a folder with its case and the conditions between its keys: ``case`` that of ``run``, all others one of the verb's name;
 ``verb_cases`` lists them. The manual lists keys and units.
 
 A case file passes these stages, each of which reports all of its problems at once:
 
-1. ``read_toml``: the text is TOML; ``--set`` changes it (``changes``).
+1. ``read_toml``: the text is TOML; ``--set`` changes it (``with_overrides``).
 2. ``CaseFile.fields_of``: the sections exist, the modules of ``[plugins]`` can be imported (``parts``).
 3. ``read_section``: each key has a type and bounds that its field states (pydantic), and a magnitude that products of a
    few numbers can bear.

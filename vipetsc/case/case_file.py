@@ -1,49 +1,39 @@
-"""Strict reading of case files: TOML tables into typed sections, every problem reported at once.
+"""The base class of every verb's case: its sections are read strictly, and every problem is reported at once.
 
-A key that is unknown, of the wrong type or impossible becomes a ``Problem``: the key's path, the value, what to do
-and, where there is one, the nearest valid key. ``CaseFile`` reads every case from its TOML file; every verb's
-case is a subclass that declares the sections it reads.
+A subclass declares the sections that its verb reads; ``reading`` turns tables into sections.
 """
 
-import math
 import re
-import sys
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache, lru_cache
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import tomli_w
-from pydantic import ValidationError
 
-from vipetsc.case.changes import put as put
-from vipetsc.case.changes import with_overrides as with_overrides
-from vipetsc.case.named_files import with_absolute_names
-from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
-from vipetsc.case.plain import plain_table, wrong_keys
-from vipetsc.case.section import MARK, described, is_within, unit_at
+from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_parts
+from vipetsc.case.reading import LARGEST as LARGEST
+from vipetsc.case.reading import Table as Table
+from vipetsc.case.reading import parsed, plain_table, unknown_key, wrong_keys
+from vipetsc.case.reading import put as put
+from vipetsc.case.reading import read_section as read_section
+from vipetsc.case.reading import read_toml as read_toml
+from vipetsc.case.reading import sections_in as sections_in
+from vipetsc.case.reading import with_overrides as with_overrides
 from vipetsc.case.section import CaseError as CaseError
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
+from vipetsc.case.section import described, is_within
 from vipetsc.plugins import only
 from vipetsc.register import PartError
-from vipetsc.wording import nearest
 
 if TYPE_CHECKING:
     import xarray as xr
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")  # a name of a folder that is neither hidden nor taken for an option
-# Magnitude of a number in a case. A product of six is at most 1e300, and one of six of the smallest at least 1e-300:
-# both are ordinary numbers, while products of seven overflow or vanish.
-LARGEST = 1e50
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
-Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
-
-
-AnySection = TypeVar("AnySection", bound=Section)
 
 
 class CaseFile(Section):
@@ -167,7 +157,7 @@ class CaseFile(Section):
             table, problems = with_overrides(table, overrides)
         # One file may have sections of several verbs. A dictionary keeps their order, which a message shows.
         valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}
-        problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
+        problems += [unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
         problems += _check_name(name)
 
@@ -276,143 +266,3 @@ def _check_name(name: Any) -> Iterator[Problem]:
             f"names the output folder: use at most {LONGEST_NAME} bytes, no / or \\, and no dot or dash at the start"
         )
         yield Problem("name", name, remedy)
-
-
-def read_toml(path: str | Path) -> Table:
-    """The table in a TOML file, named after the file if it has no name, with absolute names of files.
-
-    Raises CaseError.
-    """
-    sys.audit("vipetsc.read", str(path))
-    path = Path(path)
-    try:
-        # utf-8-sig: editors on Windows begin files with a byte order mark, which TOML does not allow.
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise CaseError([Problem(str(path), None, f"{error.strerror}; a case file (TOML) is needed")]) from None
-    except ValueError as error:
-        raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
-    table = {"name": path.stem} | parsed(text, str(path))
-    try:
-        return with_located(with_absolute_names(table, path.parent), path.parent)
-    except RecursionError as error:
-        raise CaseError([Problem(str(path), None, f"tables are nested too deeply ({error})")]) from None
-
-
-def parsed(text: str, source: str) -> Table:
-    """Return the table that a ``text`` in TOML is; raises CaseError, with the ``source`` of the text as its key."""
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CaseError([Problem(source, None, f"not a TOML file ({error})")]) from None
-
-
-def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
-    """The problem of a key that is not one of ``valid``, with the nearest one that is."""
-    parents, dot, key = path.rpartition(".")
-    near = nearest(key, valid)
-    remedy = f"valid keys: {', '.join(sorted(valid))}"
-    if near:
-        remedy = f"did you mean {parents}{dot}{near}?"
-    return Problem(path, value, f"unknown key; {remedy}")
-
-
-def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:
-    """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
-    if not isinstance(table, dict):
-        return kind(), [Problem(name, table, f"must be a section [{name}]")]
-
-    problems: dict[str, Problem] = {}
-    # Numbers that are out of range may be of the right type; they are left out in the second reading too.
-    invalid = {key for key, value in table.items() if any(_out_of_range(value, ""))}
-    try:
-        section = kind(**table)
-    except ValidationError as error:
-        for item in error.errors(include_url=False):
-            problem = _problem_of(kind, name, item)
-            problems.setdefault(problem.key, problem)
-            # A problem of the section as a whole leaves none of its keys.
-            invalid.update(item["loc"][:1] or table)
-
-    # The type of a value comes first: of a value that is not of its key's type the range says nothing.
-    mistyped = tuple(problems)
-    problems |= {p.key: p for p in _out_of_range(table, name) if not is_within(p.key, mistyped)}
-    if problems:
-        # Read again without the invalid keys: the valid ones can still be checked against other sections.
-        section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
-    return section, list(problems.values())
-
-
-def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
-    """Numbers anywhere in ``value`` that are so large or small that products of a few of them overflow."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _out_of_range(item, f"{path}.{key}")
-    elif isinstance(value, list):
-        for i, item in enumerate(value, 1):
-            yield from _out_of_range(item, f"{path}[{i}]")
-    # ``type`` rather than ``isinstance``: a boolean is an ``int`` for the latter.
-    elif type(value) in (int, float) and (0 < abs(value) < 1 / LARGEST or LARGEST < abs(value) < math.inf):
-        yield Problem(path, value, f"must have a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
-
-
-def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
-    """The problem behind one of pydantic's errors in section ``name``."""
-    path = name
-    for part in item["loc"]:
-        # Items count from 1. The names of shapes are no part of a key's path.
-        if isinstance(part, int):
-            path += f"[{part + 1}]"
-        elif not part.startswith(MARK):
-            path += f".{part}"
-    if item["type"] == "extra_forbidden":
-        fields = _section_at(kind, item["loc"][:-1]).model_fields
-        return _unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
-
-    message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    if item["type"] == "missing":
-        # pydantic reports the whole section as the input of a missing key.
-        return Problem(path, None, "missing; this key is needed here")
-    value = item["input"]
-    details = item.get("ctx", {})
-    for limit in ("ge", "gt", "le", "lt"):
-        if isinstance(details.get(limit), float):
-            # pydantic writes small numbers with all their zeros.
-            message = re.sub(r"[\d.]+$", f"{details[limit]:g}", message)
-    if item["type"] == "list_type" and isinstance(value, dict):
-        message += f" of tables; write [[{path}]]"
-    choices = details.get("expected")
-    if isinstance(value, str) and choices:
-        near = nearest(value, re.findall(r"'([^']+)'", choices), cutoff=0.4)
-        if near:
-            message += f"; did you mean {near!r}?"
-    if isinstance(value, str) and (unit := unit_at({name: kind}, path, {})):
-        message += f', in {unit}, or a text with such a unit, as "1 {unit}"'
-    return Problem(path, value, message)
-
-
-def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]:
-    """The class of the section to which a ``path`` within the section ``kind`` leads.
-
-    The path has keys, numbers of items and, behind a key that may have several sections, the name of one of these.
-    """
-    choices: list[type[Section]] = []
-    for key in path:
-        fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
-        if key in fields:
-            choices = [*sections_in(fields[str(key)])] or choices
-            kind = choices[0]
-        # A class name in the path says which of the sections that the key before it may have was tried.
-        for choice in choices:
-            if f"{MARK}{choice.__name__}" == key:
-                kind = choice
-                break
-    return kind
-
-
-def sections_in(annotation: Any) -> Iterator[type[Section]]:
-    """The classes of sections in a type, those in a union, list or dictionary among them."""
-    if isinstance(annotation, type) and issubclass(annotation, Section):
-        yield annotation
-    for argument in get_args(annotation):
-        yield from sections_in(argument)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
-from vipetsc.case.named_files import MISSING
+from vipetsc.case.reading import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.case.section import described
 from vipetsc.io.names import resolved_path

@@ -10,8 +10,8 @@ import numpy as np
 
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.initial import file_hash
-from vipetsc.case.named_files import MISSING
 from vipetsc.case.points import masses_remedy
+from vipetsc.case.reading import MISSING
 from vipetsc.case.schema import Finite, Positive, Range
 from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.io.names import resolved_path

@@ -10,10 +10,10 @@ import numpy as np
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import LARGEST, Table, put
-from vipetsc.case.changes import value_at
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.optimise.variables import Kind, Variable, VariablesTable
+from vipetsc.case.reading import value_at
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import number
 from vipetsc.case.value_ranges import RANGES

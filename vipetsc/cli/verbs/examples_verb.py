@@ -11,8 +11,8 @@ from typing import NamedTuple
 from mpi4py import MPI
 
 from vipetsc.case import CaseError, Problem
-from vipetsc.case.named_files import relative_names
 from vipetsc.case.parts import relative_modules
+from vipetsc.case.reading import relative_names
 from vipetsc.cli.arguments import argument
 from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
