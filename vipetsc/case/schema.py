@@ -346,10 +346,13 @@ class OutputTable(Section):
         " and on fixed walls",
         None,
     )
+    lyapunov: bool | None = described(
+        "whether the largest Lyapunov exponent is measured, which takes twice the time", None
+    )
 
     def of_points(self) -> dict[str, Any]:
-        """The keys about named points, for a run of which nothing else is kept."""
-        return self.model_dump(include={"points", "transmission"}, exclude_none=True)
+        """The keys about named points and measures, for a run of which nothing else is kept."""
+        return self.model_dump(include={"points", "transmission", "lyapunov"}, exclude_none=True)
 
 
 class AnalysisTable(Section):

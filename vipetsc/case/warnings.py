@@ -79,7 +79,8 @@ def wave_warnings(model: Model) -> Iterator[str]:
     """Warnings of evanescent and slow waves."""
     cell = model.chain.cell
     drive = model.drive
-    if not model.first_drive_acts or not cell.joins_cells:
+    # A single cell has no waves.
+    if not model.first_drive_acts or not cell.joins_cells or model.chain.cells == 1:
         return
 
     waves = waves_at(cell, drive.frequency)

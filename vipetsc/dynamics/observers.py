@@ -63,7 +63,7 @@ class Observer:
     """
 
     name: ClassVar[str]
-    longest: ClassVar[int] = sys.maxsize
+    longest: int = sys.maxsize  # read after ``begin``
     saved: ClassVar[tuple[str, ...]] = ()  # numbers among its attributes that a checkpoint keeps
 
     def begin(self, setup: Setup) -> None:

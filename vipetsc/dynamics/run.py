@@ -20,6 +20,7 @@ from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.initial import initial_fields, set_in_motion
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.lyapunov import LargestExponent
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
@@ -123,6 +124,8 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
+    if case.output.lyapunov:
+        watching.append(LargestExponent)
 
     simulation = Simulation(case=case, model=model, engine=choice, stop=stop, watching=watching)
     if isinstance(target, RunOutput):
@@ -225,12 +228,12 @@ class Run:
         self.recorder = Recorder()
         # The recorder is the last one: it keeps what all others accept.
         self.observers = [*(kind() for kind in observers), self.recorder]
-        longest = max(BLOCK_CELLS // setup.layout.cells, 1)
-        self.longest = min(longest, *(observer.longest for observer in self.observers))
         self.samples = 0
         self.last: float | None = None  # time of the last good sample
         for observer in self.observers:
             observer.begin(setup)
+        longest = max(BLOCK_CELLS // setup.layout.cells, 1)
+        self.longest = min(longest, *(observer.longest for observer in self.observers))
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go on after a checkpoint, given the parts of all ranks that wrote it; their number may differ."""
@@ -252,7 +255,9 @@ class Run:
         engine = self.setup.engine
         total = setup.model.samples
         while self.samples < total:
-            samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
+            # Blocks end with multiples of their length, wherever a run is resumed.
+            room = self.longest - self.samples % self.longest
+            samples = self.recorder.room(self.samples, min(room, total - self.samples))
             with subnormals_as_zero():
                 filled = engine.fill(samples)
             block, failure = self._observe(samples, filled)

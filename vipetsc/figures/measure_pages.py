@@ -52,6 +52,7 @@ ON_REQUEST = {
     "rms_velocity",
     "rms_acceleration",
     "steady_drift",
+    "lyapunov_error",
 }
 
 

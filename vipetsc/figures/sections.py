@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case
@@ -73,12 +74,16 @@ def poincare(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 class SweptStates(NamedTuple):
-    """Members of one sweep along its axis ``key``: values of it (dot,) and displacements (dot,) in m by point."""
+    """Members of one sweep along its axis ``key``: values of it (dot,) and displacements (dot,) in m by point.
+
+    ``exponents`` (value of the axis,) in 1/s are the members' largest Lyapunov exponents, NaN where there is none.
+    """
 
     key: SweptKey
     direction: str
     values: np.ndarray
     displacement: dict[str, np.ndarray]
+    exponents: np.ndarray
 
 
 # Looks of the members of a sweep by the order in which they follow one another. What goes down is drawn first and
@@ -123,15 +128,28 @@ def _branch_of(ensemble: xr.Dataset, sweeps: Sweeps) -> SweptStates | None:
         return None
     options = tomllib.loads(ensemble.attrs["case"])["sweep"]
     whole = {point: np.concatenate(parts) for point, parts in displacement.items()}
-    return SweptStates(axes[0].first_number, options.get("follow", "none"), np.concatenate(values), whole)
+    exponents = np.full(ensemble.sizes[axes[0].dimension], np.nan)
+    if "lyapunov" in ensemble:
+        exponents = ensemble["lyapunov"].values
+    return SweptStates(
+        key=axes[0].first_number,
+        direction=options.get("follow", "none"),
+        values=np.concatenate(values),
+        displacement=whole,
+        exponents=exponents,
+    )
 
 
 def _draw_bifurcation(branches: list[SweptStates]) -> Figure:
-    """Draw ``branches`` over one key, a row for each point."""
+    """Draw ``branches`` over one key, a row for each point and one for the Lyapunov exponents, if there are any."""
     points = list(branches[0].displacement)[:MOST_POINTS]
-    figure = style.new_figure(style.PAGE, 2.2 * len(points) + 0.3)
-    grid = figure.subplots(len(points), 1, squeeze=False, sharex=True)[:, 0]
-    for axes, point in zip(grid, points, strict=True):
+    with_exponents = any(np.isfinite(branch.exponents).any() for branch in branches)
+    rows = len(points) + with_exponents
+    figure = style.new_figure(style.PAGE, 2.2 * rows + 0.3)
+    grid = figure.subplots(rows, 1, squeeze=False, sharex=True)[:, 0]
+    if with_exponents:
+        _draw_exponents(grid[-1], branches)
+    for axes, point in zip(grid[: len(points)], points, strict=True):
         for direction, look in LOOKS.items():
             for branch in branches:
                 if branch.direction == direction and point in branch.displacement:
@@ -141,6 +159,16 @@ def _draw_bifurcation(branches: list[SweptStates]) -> Figure:
     grid[-1].set_xlabel(with_unit(key_name(branches[0].key.path), branches[0].key.unit))
     if len(branches) > 1:
         grid[0].legend(loc="best", markerscale=3)
-    if len(points) > 1:
+    if rows > 1:
         panels.label_panels(grid)
     return figure
+
+
+def _draw_exponents(axes: Axes, branches: list[SweptStates]) -> None:
+    """Draw the Lyapunov exponents of ``branches`` in ``axes``: above zero a motion is chaotic."""
+    axes.axhline(0.0, color=style.GREY, lw=0.8)
+    for direction, look in LOOKS.items():
+        for branch in branches:
+            if branch.direction == direction:
+                axes.plot(branch.key.values, branch.exponents, color=look["color"], marker=".", ms=4)
+    axes.set_ylabel("Lyapunov exponent (1/s)")

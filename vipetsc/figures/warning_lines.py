@@ -33,7 +33,7 @@ def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], F
 
 
 def warning_lines(shown: Sequence[Shown]) -> list[str]:
-    """Return the warnings of the results ``shown``, each once; if several are shown, with the names of its members.
+    """Return the warnings of the results ``shown``, each once; if several names are shown, with those of its members.
 
     Of sentences that differ only in numbers the first is given.
     """
@@ -46,7 +46,7 @@ def warning_lines(shown: Sequence[Shown]) -> list[str]:
             names.setdefault(kind, []).append(member.name)
 
     lines = [sentences[0] for sentences in by_kind.values()]
-    if len(shown) > 1:
+    if len({member.name for member in shown}) > 1:
         lines = [f"{_listed(names[kind], by_kind[kind])}: {by_kind[kind][0]}" for kind in by_kind]
     if len(lines) > MOST_WARNINGS:
         lines[MOST_WARNINGS - 1 :] = [f"{len(lines) - MOST_WARNINGS + 1} more warnings are in the file"]

@@ -6,6 +6,7 @@ has a value for each of these, under a name of its own: ``peak_velocity/tip``, `
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -274,6 +275,18 @@ def _largest_force(record: RunRecord) -> float | None:
     return float(record.run["impacts/force"].max())
 
 
+def _of_statistics(name: str) -> Callable[[RunRecord], float | None]:
+    """The measure that the run itself has left among its statistics, under this ``name``."""
+
+    def of(record: RunRecord) -> float | None:
+        statistics = record.run.attrs.get("statistics", {})
+        if isinstance(statistics, str):
+            statistics = json.loads(statistics)
+        return statistics.get(name)
+
+    return of
+
+
 def _velocities(record: RunRecord, source: str, receiver: str) -> tuple[np.ndarray, np.ndarray]:
     return record.points[source].velocity, record.points[receiver].velocity
 
@@ -349,6 +362,9 @@ STANDARD = (
     ),
     RunMeasure("bands/share", "1", MEAN_FRACTION, dimension=PART, group="transfer"),
     RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force, power=0.0),
+    # Of a linear lattice it does not depend on the amplitude.
+    RunMeasure("lyapunov", "1/s", "largest Lyapunov exponent", _of_statistics("lyapunov"), power=0.0),
+    RunMeasure("lyapunov_error", "1/s", "standard error of the exponent", _of_statistics("lyapunov_error"), power=0.0),
     *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
     RunMeasure(
         "steady_drift",
