@@ -13,9 +13,9 @@ from bench_peers import Solution, Solver
 from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Guard, Ledger, Setup
+from vipetsc.dynamics.plan import choose_engine
 from vipetsc.dynamics.run import ENGINES, Begin, Run
 from vipetsc.endings import Ending
 from vipetsc.io.store import RunMemory

@@ -79,7 +79,7 @@ def test_the_result_does_not_depend_on_the_ranks(folder, plan, whole):
 def test_a_stopped_identification_goes_on(folder, plan, whole):
     """A fit that is stopped and resumed has the bits of an uninterrupted one."""
     with pytest.raises(StoppedError):
-        run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAt(30))
+        run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAt(20))
     assert not (folder / "identified.h5").exists()
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
     assert_same_bits(datasets(folder / "identified.h5"), whole)
@@ -99,7 +99,7 @@ def test_ranks_divide_a_single_start_to_the_same_bits(folder, single):
 def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
     """A fit that is stopped twice within its only start solves every window once, with the bits of an unstopped fit."""
     plan, whole = single
-    solve = GrowingWindows._solve
+    solve = GrowingWindows.minimum
     solved: list[int] = []
 
     def counted(windows: GrowingWindows, *arguments: Any) -> Any:
@@ -108,7 +108,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
         return solution
 
     # Windows that are read from the records do not call this function.
-    monkeypatch.setattr(GrowingWindows, "_solve", counted)
+    monkeypatch.setattr(GrowingWindows, "minimum", counted)
     for resume in (False, True):
         with pytest.raises(StoppedError):
             run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAt(14), resume=resume)

@@ -10,6 +10,7 @@ import pytest
 
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.cost import estimate, expected_episodes
+from vipetsc.dynamics.plan import RunPlan
 
 CYCLES = 10
 
@@ -20,16 +21,16 @@ def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
     short = Case.load(overrides=[f"time.engine={engine}"])
     long = short.varied(overrides=["lattice.cells=3000"])
 
-    assert estimate(short, 2).one_rank_suffices
-    assert not estimate(short, 1).one_rank_suffices
-    assert not estimate(long, 2).one_rank_suffices
-    assert "one rank would be as fast" in estimate(short, 2).faster
-    assert estimate(short, 2).seconds == pytest.approx(estimate(short, 1).seconds, rel=0.1)
-    assert "one rank" not in estimate(short, 1).faster
+    assert estimate(RunPlan.of(short), 2).one_rank_suffices
+    assert not estimate(RunPlan.of(short), 1).one_rank_suffices
+    assert not estimate(RunPlan.of(long), 2).one_rank_suffices
+    assert "one rank would be as fast" in estimate(RunPlan.of(short), 2).faster
+    assert estimate(RunPlan.of(short), 2).seconds == pytest.approx(estimate(RunPlan.of(short), 1).seconds, rel=0.1)
+    assert "one rank" not in estimate(RunPlan.of(short), 1).faster
 
-    assert "one rank" not in estimate(long, 2).faster
-    assert estimate(long, 2).seconds < 0.75 * estimate(long, 2).alone
-    assert estimate(long, 2).alone == estimate(long, 1).seconds
+    assert "one rank" not in estimate(RunPlan.of(long), 2).faster
+    assert estimate(RunPlan.of(long), 2).seconds < 0.75 * estimate(RunPlan.of(long), 2).alone
+    assert estimate(RunPlan.of(long), 2).alone == estimate(RunPlan.of(long), 1).seconds
 
 
 def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: float) -> Model:

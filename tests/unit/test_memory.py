@@ -18,6 +18,7 @@ from vipetsc.dynamics.cost import estimate
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import memory_available, memory_needed
+from vipetsc.dynamics.plan import RunPlan
 from vipetsc.io.store import RunFolder
 
 HUGE = {"lattice": {"cells": 50_000_000}, "contacts": {"sites": [6], "clearance": 1e-4}}
@@ -120,7 +121,7 @@ def test_a_billion_equal_linear_cells_cost_an_estimate_and_a_rank_next_to_nothin
     case = small_case(lattice={"cells": 1_000_000_000, "ends": ends}, contacts={"sites": [300]}, output={"fields": []})
     model = case.model()
     tracemalloc.start()
-    estimate(case, 1000)
+    estimate(RunPlan.of(case), 1000)
     create_record(model, Layout(model, SimpleNamespace(rank=0, size=1000)))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vipetsc.identification.least_squares import Minimum
 from vipetsc.identification.misfit_profile import MisfitProfile, profile_costs
 
 # The lattice has its second contact within this distance of the valley b = a + BEND a^2.
@@ -27,19 +28,16 @@ class BentValley:
     def distance(self, z: np.ndarray) -> float:
         return float(z[1] - z[0] - BEND * z[0] ** 2)
 
-    def tolerances(self, precision: Any) -> None:
-        """Return None, since no motion is integrated."""
-
-    def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
+    def onsets(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
         return np.zeros(2 if abs(self.distance(z)) < WIDTH else 1)
 
-    def solve(self, z: np.ndarray, ends: Any, active: list[int], precision: Any) -> np.ndarray:
+    def minimum(self, z: np.ndarray, ends: Any, active: list[int], precision: Any, slopes: np.ndarray) -> Minimum:
         """Return the point of the valley at the same a, or ``z`` beyond the jump, where no derivative leads back."""
         assert active == [1]
         self.solutions += 1
         if abs(self.distance(z)) >= WIDTH:
-            return z
-        return np.array([z[0], z[1] - self.distance(z)])
+            return Minimum(z, slopes)
+        return Minimum(np.array([z[0], z[1] - self.distance(z)]), slopes)
 
     def cost(self, z: np.ndarray, ends: Any) -> float:
         missing = len(self.onsets(z, 0, 1.0)) < 2
@@ -50,7 +48,7 @@ class BentValley:
 def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
     """A profile along the bent valley has the costs a^2, without the jump, and few solutions are needed."""
     windows = BentValley()
-    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
+    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)), np.zeros((0, 2)))
     costs = profile_costs(windows, np.zeros(2), profile, 0, side)
     assert costs == pytest.approx(np.square(places), abs=1e-12)
     # The lines of the covariance and through two fits leave the valley, hence some steps are halved.
@@ -61,17 +59,17 @@ def test_a_contact_that_no_motion_keeps_is_given_up():
     """A profile has the cost with the jump for a < -2, where the motion has one contact for any b."""
 
     class Lost(BentValley):
-        def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
+        def onsets(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
             return np.zeros(2 if z[0] > -2 else 1)
 
-    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
+    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)), np.zeros((0, 2)))
     costs = profile_costs(Lost(), np.zeros(2), profile, 0, "below")
     assert costs == pytest.approx([1.5**2, 3**2 + JUMP])
 
 
 def test_places_that_bounds_cut_are_followed_from_the_fit():
     """Places are listed outwards from the fit on one side; a fit at its lower bound has none below."""
-    profile = MisfitProfile(np.linspace(0, 3, 4)[None], np.ones((1, 2)))
+    profile = MisfitProfile(np.linspace(0, 3, 4)[None], np.ones((1, 2)), np.zeros((0, 2)))
     assert profile.outwards(0, 0.0, "below").tolist() == []
     assert profile.outwards(0, 0.0, "above").tolist() == [0, 1, 2, 3]
     assert profile.outwards(0, 1.5, "below").tolist() == [1, 0]

@@ -13,7 +13,7 @@ from tests.conftest import StopAt, assert_same_bits, datasets, simulated, small_
 from tests.mpi.test_drives import InParts
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.engine_choice import choose_engine
+from vipetsc.dynamics.plan import choose_engine
 from vipetsc.dynamics.propagator.groups import contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.step_choice import refusal, step_series
 from vipetsc.io.store import RunMemory

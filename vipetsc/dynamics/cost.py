@@ -12,9 +12,9 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from vipetsc.case import Case, Model
+from vipetsc.case import Model
 from vipetsc.case.wave_at_sites import wave_over_clearance
-from vipetsc.dynamics.engine_choice import PROPAGATOR, choose_engine
+from vipetsc.dynamics.plan import PROPAGATOR, RunPlan
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import refusal, spring_cost, step_series
 from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
@@ -119,10 +119,9 @@ class Cost:
         return f"one rank would be as fast: in so short a lattice messages cost what {self.ranks} ranks save"
 
 
-def estimate(case: Case, ranks: int = 1) -> Cost:
-    """The cost of a run of ``case`` on so many ranks; every site is assumed to meet the linear wave of the drive."""
-    model = case.model()
-    engine, note = choose_engine(case, model)
+def estimate(plan: RunPlan, ranks: int = 1) -> Cost:
+    """The cost of the run that a ``plan`` says, on so many ranks; every site is assumed to meet the drive's wave."""
+    case, model, (engine, note), _ = plan
     episodes = expected_episodes(model)
 
     by_ts = functools.partial(_runge_kutta_seconds, model, episodes)

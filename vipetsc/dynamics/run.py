@@ -12,18 +12,18 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case, Model
+from vipetsc.case import Case
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult
-from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.initial import initial_fields, set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.lyapunov import LargestExponent
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
-from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
+from vipetsc.dynamics.options import options_of, petsc_options
+from vipetsc.dynamics.plan import RunPlan
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.result import Result
@@ -114,11 +114,8 @@ def simulate(
 
     # What is wrong with the case is refused before anything is allocated or written.
     on_every_rank(ranks, case.import_plugins)
-    case = with_database(case)
-    check_options(case)
-    model = case.model()
-    choice = choose_engine(case, model)
-    check_memory(model, case.output, choice.name, ranks)
+    plan = RunPlan.of(case)
+    check_memory(plan.model, plan.case.output, plan.engine.name, ranks)
 
     # The guard first: the others see only samples that it accepts.
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
@@ -127,7 +124,7 @@ def simulate(
     if case.output.lyapunov:
         watching.append(LargestExponent)
 
-    simulation = Simulation(case=case, model=model, engine=choice, stop=stop, watching=watching)
+    simulation = Simulation(plan, stop=stop, watching=watching)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
         if folder is None:
@@ -136,9 +133,9 @@ def simulate(
 
     output = RunFolder(Path(target), comm, keeps_end=True)
     obstacle = output.extension_obstacle if extend else None
-    with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume, extend=obstacle) as claim:
+    with claimed(comm, target, RUN, plan.case.to_toml(), force=force, resume=resume, extend=obstacle) as claim:
         # Also without ``extend``: a command that was to extend the run may have been killed.
-        output.reopen(model.end)
+        output.reopen(plan.model.end)
         # A run that a kill has ended after its file was written is complete.
         ended = output.ending()
         if ended:
@@ -152,36 +149,35 @@ def simulate(
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: case, model and engine, observers.
+    """A simulation as its ``plan`` says, with observers.
 
     A new run begins in the ``state``, displacements and velocities (cell, dof) of the rank's cells, if one is given,
     else as the model says.
     """
 
-    case: Case
-    model: Model
-    engine: EngineChoice
+    plan: RunPlan
     stop: StopRequest | None
     watching: Sequence[type[Observer]]
     state: tuple[np.ndarray, np.ndarray] | None = None
 
     def make(self, output: RunOutput) -> Result:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
-        output.begin(self.case.to_toml())
+        case, model, engine_choice, _ = self.plan
+        output.begin(case.to_toml())
         checkpoints = output.last_state()
 
         begin = Begin(wall=time.perf_counter(), cpu=time.process_time())
-        sys.audit("vipetsc.set-up", self.case.name)
-        with log.SET_UP, petsc_options(options_of(self.case)):
-            kind = ENGINES[self.engine.name]
-            layout = Layout(self.model, output.comm, dashpots=True, integrates_damping=kind.integrates_damping)
-            engine = kind(self.model, layout, self.stop)
+        sys.audit("vipetsc.set-up", case.name)
+        with log.SET_UP, petsc_options(options_of(case)):
+            kind = ENGINES[engine_choice.name]
+            layout = Layout(model, output.comm, dashpots=True, integrates_damping=kind.integrates_damping)
+            engine = kind(model, layout, self.stop)
         with released(engine, output.comm):
             setup = Setup(
-                case=self.case,
-                model=self.model,
+                case=case,
+                model=model,
                 layout=layout,
-                meter=EnergyMeter(self.model, layout, engine.lattice),
+                meter=EnergyMeter(model, layout, engine.lattice),
                 engine=engine,
                 output=output,
             )
@@ -190,16 +186,15 @@ class Simulation:
                 run.restore(checkpoints)
             elif self.state is not None:
                 set_in_motion(run.setup, self.state)
-            elif self.model.initial is not None:
-                layout = run.setup.layout
-                set_in_motion(run.setup, initial_fields(self.model, range(layout.start, layout.stop), layout.comm))
+            elif model.initial is not None:
+                set_in_motion(run.setup, initial_fields(model, range(layout.start, layout.stop), layout.comm))
             with log.SAMPLES:
                 ended = run.advance()
             note = {}
-            if self.engine.refused:
-                note["engine_note"] = self.engine.refused
+            if engine_choice.refused:
+                note["engine_note"] = engine_choice.refused
             with log.ENDING:
-                return run.finish(ended, begin, note)
+                return run.finish(ended, begin, note, self.plan.warnings)
 
 
 @contextmanager
@@ -322,8 +317,11 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.save_state(state)
 
-    def finish(self, ended: Ended, begin: Begin, note: dict[str, str]) -> Result:
-        """Write the last checkpoint of a run that was stopped or can be extended, and the files of one that ended."""
+    def finish(self, ended: Ended, begin: Begin, note: dict[str, str], noticed: Sequence[str] = ()) -> Result:
+        """Write the last checkpoint of a run that was stopped or can be extended, and the files of one that ended.
+
+        The result warns of what was ``noticed`` before the run, too.
+        """
         engine = self.setup.engine
         output = self.setup.output
         comm = self.setup.output.comm
@@ -337,7 +335,7 @@ class Run:
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         statistics["effective_restitution"] = self.setup.model.effective_restitution
 
-        warnings = self.setup.case.warnings()
+        warnings = [*noticed]
         for observer in self.observers:
             observer.finish(is_stopped)
             statistics |= observer.statistics()

@@ -9,10 +9,7 @@ A window is the beginning of every record up to some time; the last one is all o
 
 Section 2 of the package's docstring says why windows grow.
 
-Each fit is one of least squares by SciPy's trust region within bounds (``least_residuals``). SciPy asks for the
-Jacobian after every step that is taken, and checks only then whether the fit ends with that step. A fit of two or three
-steps computes a third of its Jacobians for nothing, and each costs several times as much as a motion. Here the same
-check comes first, and ends the fit.
+Each fit is one of least squares (``least_squares``).
 
 **Clearances** (``other_contacts``). The misfit does not depend on a clearance that is larger than the motion, and its
 valley of values without contact is apart from those of values with contact: no derivative leads from one to the other.
@@ -23,10 +20,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vipetsc.case import CaseError
 from vipetsc.case.identify import IdentifyCase, SoughtParameter, differs_by_side
+from vipetsc.identification.least_squares import CLOSE, FINAL, GROWING, Minimum, Precision, least_residuals
 from vipetsc.identification.misfit import NARROW, WIDTH, Misfit
 from vipetsc.identification.motion import MotionError
 
@@ -143,120 +140,6 @@ def _clearances_tried(
     return tried
 
 
-TOLERANCE = 1e-12  # relative change of cost or coordinates; a sum of a thousand squares is rounded at 1e-14
-
-
-class Precision(NamedTuple):
-    """How a fit ends.
-
-    It ends after so many ``steps`` (None: those of the case), or where the relative change of the ``cost`` or of the
-    coordinates, ``step``, is less than these. ``has_prior``: a prior holds the coordinates near those at which the fit
-    begins. ``is_rough``: derivatives are one-sided differences.
-    """
-
-    steps: int | None = None
-    cost: float = TOLERANCE
-    step: float = TOLERANCE
-    has_prior: bool = False
-    is_rough: bool = False
-
-
-# While windows grow a fit only has to stay in its valley; the next window goes on from there.
-GROWING = Precision(cost=1e-2, step=1e-3, has_prior=True, is_rough=True)
-FINAL = Precision()
-
-
-# Least reduction of the cost in a step, over the one expected from the Jacobian, for a small reduction to end the fit.
-# SciPy has the same number: below it the linear model of the step is bad, and the next step may reduce the cost more.
-LEAST_RATIO = 0.25
-
-Function = Callable[[np.ndarray], np.ndarray]
-
-
-def least_residuals(
-    residuals: Function,
-    jacobian: Function,
-    start: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
-    precision: Precision,
-    steps: int,
-) -> np.ndarray:
-    """The coordinates (active,) with the least squares of ``residuals`` (datum,), from ``start`` (active,) on.
-
-    ``jacobian`` gives derivatives (datum, active); ``bounds`` are the lowest and the highest coordinates (active,). The
-    residuals are evaluated ``steps`` times at most. Raises what ``residuals`` and ``jacobian`` raise.
-    """
-    latest = np.zeros(0)
-    # The step that SciPy has taken last, by the state in which it began.
-    step: _Step | None = None
-
-    def evaluate(x: np.ndarray) -> np.ndarray:
-        nonlocal latest
-        latest = residuals(x)
-        return latest
-
-    def differentiate(x: np.ndarray) -> np.ndarray:
-        nonlocal step
-        # SciPy calls this at the start and after every step that is taken: the latest residuals are those at x.
-        if step is not None and step.ends_at(x, latest, precision):
-            raise _FitEnd(x.copy())
-        slopes = jacobian(x)
-        step = _Step(x.copy(), latest, slopes)
-        return slopes
-
-    low, high = bounds
-    try:
-        solution = least_squares(
-            evaluate,
-            # SciPy moves a start on a bound inside and refuses one outside, where rounding may have put it.
-            np.clip(start, low, high),
-            jac=differentiate,
-            bounds=bounds,
-            method="trf",
-            x_scale=1.0,
-            xtol=precision.step,
-            ftol=precision.cost,
-            gtol=TOLERANCE,
-            max_nfev=steps,
-        )
-    except _FitEnd as end:
-        return end.solution
-    return np.asarray(solution.x)
-
-
-class _FitEnd(Exception):
-    """A fit that has come to its ``solution`` (active,)."""
-
-    def __init__(self, solution: np.ndarray) -> None:
-        super().__init__("the fit has come to its end")
-        self.solution = solution
-
-
-class _Step(NamedTuple):
-    """Where a step begins: coordinates ``x`` (active,), ``residuals`` (datum,) and their ``slopes`` (datum, active)."""
-
-    x: np.ndarray
-    residuals: np.ndarray
-    slopes: np.ndarray
-
-    def ends_at(self, x: np.ndarray, residuals: np.ndarray, precision: Precision) -> bool:
-        """Whether a fit ends with the step to ``x`` (active,), where the residuals are ``residuals`` (datum,).
-
-        The conditions are SciPy's for a small step, relative to where it begins, and for a small reduction of the cost,
-        the latter without the terms by which its trust region keeps away from the bounds.
-        """
-        moved = x - self.x
-        if np.linalg.norm(moved) < precision.step * (precision.step + np.linalg.norm(self.x)):
-            return True
-
-        cost = float(self.residuals @ self.residuals)
-        gain = cost - float(residuals @ residuals)
-        # The reduction that the Jacobian at the beginning of the step let expect.
-        linear = self.residuals + self.slopes @ moved
-        expected = cost - float(linear @ linear)
-        return gain < precision.cost * cost and gain > LEAST_RATIO * expected
-
-
 # While windows grow, a change of a coordinate by PRIOR from its last value weighs as one datum missed by its noise.
 PRIOR = 1.0
 # Noise that is not given, over the size of a channel, until residuals show it.
@@ -366,7 +249,7 @@ class GrowingWindows:
             if repeated.deviance < best.deviance:
                 best = repeated
         self.misfit.noise = best.noise
-        return best._replace(windows=windows)
+        return self._fit_at(self.solve(best.coordinates, self.last, self._every(), FINAL), windows)
 
     def _pass(self, z: np.ndarray, windows: list[Window]) -> Fit:
         """Fit all coordinates from ``z`` (coordinate,) on over growing windows, then with the noise of the residuals.
@@ -377,7 +260,11 @@ class GrowingWindows:
         if not all(map(all, self._is_given)):
             for _ in range(REWEIGHTINGS):
                 self._estimate_noise(z)
-                z = self.solve(z, self.last, self._every())
+                z = self.solve(z, self.last, self._every(), CLOSE)
+        return self._fit_at(z, windows)
+
+    def _fit_at(self, z: np.ndarray, windows: list[Window]) -> Fit:
+        """Return the fit to the whole records that has come to ``z`` (coordinate,); its window goes to ``windows``."""
         window = self._window(z, self.last)
         windows.append(window)
         return Fit(
@@ -431,7 +318,7 @@ class GrowingWindows:
                 if is_silent:
                     end = first + fraction * (last - first)
                 ends.append(end)
-            precision = FINAL
+            precision = CLOSE
             if fraction < 1:
                 precision = GROWING
             z = self.solve(z, ends, active, precision)
@@ -455,7 +342,7 @@ class GrowingWindows:
             is_last = ends == self.last
             precision = GROWING
             if is_last:
-                precision = FINAL
+                precision = CLOSE
             fitted = self.solve(z, ends, self._every(), precision)
             window = self._window(fitted, ends)
             other = None
@@ -551,9 +438,7 @@ class GrowingWindows:
             coordinates=z.copy(),
         )
 
-    def solve(
-        self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
-    ) -> np.ndarray:
+    def solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
         """The coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds.
 
         The fit begins at ``z`` (coordinate,), of which the ``active`` coordinates are fitted, to data up to ``ends``
@@ -563,12 +448,23 @@ class GrowingWindows:
         self._solutions += 1
         if number < len(self._solved):
             return self._solved[number].copy()
-        solution = self._solve(z, ends, active, precision)
+        solution = self.minimum(z, ends, active, precision).coordinates
         self.keep(number, solution)
         return solution
 
-    def _solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
-        """Compute the solution that ``solve`` returns."""
+    def minimum(
+        self,
+        z: np.ndarray,
+        ends: Sequence[float],
+        active: Sequence[int],
+        precision: Precision,
+        slopes: np.ndarray | None = None,
+    ) -> Minimum:
+        """Return the solution that ``solve`` records, with all of its coordinates (coordinate,).
+
+        The fit begins with ``slopes`` (datum, active), derivatives of the residuals of data near ``z``, if it is given
+        them; those of the result are derivatives of the same residuals.
+        """
         active = list(active)
         start = z[active].copy()
         # While windows grow, parameters have a prior about the start of this fit; states always have one about rest.
@@ -588,16 +484,21 @@ class GrowingWindows:
             data = self.misfit.residuals(whole(x), ends)
             return np.concatenate([data, weights * (x - centre)])
 
-        def jacobian(x: np.ndarray) -> np.ndarray:
-            data = self.misfit.jacobian(whole(x), ends, active, precision.is_rough)
+        def with_prior(data: np.ndarray) -> np.ndarray:
             # The first Jacobian sets the weights: it is asked for at the start, where the residuals of the prior are
             # zero with any weight.
             weights[is_parameter] = np.maximum(weights[is_parameter], RIDGE * np.linalg.norm(data))
             return np.concatenate([data, np.diag(weights)])
 
+        def jacobian(x: np.ndarray) -> np.ndarray:
+            return with_prior(self.misfit.jacobian(whole(x), ends, active, precision.is_rough))
+
+        if slopes is not None:
+            slopes = with_prior(slopes)
         bounds = (self.low[active], self.high[active])
         steps = precision.steps or self.misfit.plan.options.steps
-        return whole(least_residuals(residuals, jacobian, start, bounds, precision, steps))
+        minimum = least_residuals(residuals, jacobian, start, bounds, precision, steps, slopes)
+        return Minimum(whole(minimum.coordinates), minimum.slopes[: len(minimum.slopes) - len(active)])
 
     def _estimate_noise(self, z: np.ndarray) -> None:
         """Estimate the noise of the channels for which none is given from their residuals at ``z`` (coordinate,)."""

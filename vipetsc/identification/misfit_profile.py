@@ -9,7 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vipetsc.identification.growing_windows import GrowingWindows, Precision
+from vipetsc.identification.growing_windows import GrowingWindows
+from vipetsc.identification.least_squares import Precision
 from vipetsc.identification.uncertainty import uncertainty_of
 
 # Distance in standard errors of the outermost values of a profile.
@@ -41,11 +42,12 @@ class MisfitProfile(NamedTuple):
     """Coordinates ``places`` (parameter, place) at which each parameter is held.
 
     ``along`` (parameter, coordinate) is how far each coordinate moves, by the covariance, with a parameter that is held
-    at a coordinate larger by 1.
+    at a coordinate larger by 1. ``slopes`` (datum, coordinate) are the derivatives of the residuals at the fit.
     """
 
     places: np.ndarray
     along: np.ndarray
+    slopes: np.ndarray
 
     def outwards(self, number: int, middle: float, side: Side) -> np.ndarray:
         """Numbers (place,) of the places of parameter ``number`` on one ``side`` of the coordinate ``middle``.
@@ -60,7 +62,8 @@ class MisfitProfile(NamedTuple):
 
 def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
     """The profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
-    uncertainty = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
+    slopes = windows.misfit.whole_jacobian(z, windows.last)
+    uncertainty = uncertainty_of(slopes)
     errors = uncertainty.errors
     sought = range(windows.misfit.count)
     # A parameter that is not determined is held at values between its bounds.
@@ -70,7 +73,8 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
     # In a linear problem the fit with coordinate i held at a distance of 1 has coordinate j moved by cov_ij/cov_ii.
     along = (uncertainty.correlation * errors / errors[:, None])[sought]
     along = np.where(uncertainty.determined[sought, None], along, 0.0)
-    return MisfitProfile(np.linspace(low, high, count, axis=1), along)
+    data = len(slopes) - len(windows.misfit.prior())
+    return MisfitProfile(np.linspace(low, high, count, axis=1), along, slopes[:data])
 
 
 def profile_costs(
@@ -80,29 +84,39 @@ def profile_costs(
 
     The nearest place comes first. Raises CaseError, MotionError.
     """
-    held = z.copy()
-    slope = profile.along[number]
+    others = np.delete(np.arange(len(z)), number)
+    held = _Held(z.copy(), profile.along[number], profile.slopes[:, others])
     costs = []
     for place in profile.outwards(number, float(z[number]), side):
-        held, slope = _follow(windows, held, slope, number, float(profile.places[number, place]))
-        costs.append(windows.misfit.cost(held, windows.last))
+        held = _follow(windows, held, number, float(profile.places[number, place]))
+        costs.append(windows.misfit.cost(held.z, windows.last))
     return costs
 
 
-def _follow(
-    windows: GrowingWindows, z: np.ndarray, slope: np.ndarray, number: int, value: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The fit (coordinate,) with coordinate ``number`` held at ``value``, from the fit ``z`` on, and its slope there.
+class _Held(NamedTuple):
+    """A fit ``z`` (coordinate,) with one coordinate held.
 
-    The ``slope`` (coordinate,) of all coordinates, over the one that is held, predicts the fit. Steps in which a
-    contact comes or goes are halved.
+    ``along`` (coordinate,) is how far each coordinate moves over the one that is held. ``slopes`` (datum, other
+    coordinate) are the derivatives of the residuals there.
     """
+
+    z: np.ndarray
+    along: np.ndarray
+    slopes: np.ndarray
+
+
+def _follow(windows: GrowingWindows, held: _Held, number: int, value: float) -> _Held:
+    """Return the fit with coordinate ``number`` held at ``value``, from the fit ``held`` on.
+
+    Steps in which a contact comes or goes are halved.
+    """
+    z, along, slopes = held
     others = [other for other in range(len(z)) if other != number]
     contacts = _contacts(windows, z)
     fraction = 1.0
     while abs(value - z[number]) > SAME:
         step = fraction * (value - z[number])
-        begin = np.clip(z + slope * step, windows.low, windows.high)
+        begin = np.clip(z + along * step, windows.low, windows.high)
         # The last step ends on the value itself, not on a sum that is rounded.
         begin[number] = value
         if fraction < 1:
@@ -113,12 +127,13 @@ def _follow(
 
         fitted = begin
         if others:
-            fitted = windows.solve(begin, windows.last, others, PRECISION)
-        slope = (fitted - z) / (fitted[number] - z[number])
+            # Between neighbouring fits derivatives change little.
+            fitted, slopes = windows.minimum(begin, windows.last, others, PRECISION, slopes)
+        along = (fitted - z) / (fitted[number] - z[number])
         z = fitted
         contacts = _contacts(windows, z)
         fraction = 1.0
-    return z, slope
+    return _Held(z, along, slopes)
 
 
 def _contacts(windows: GrowingWindows, z: np.ndarray) -> list[int]:

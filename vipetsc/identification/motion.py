@@ -17,8 +17,8 @@ import numpy as np
 from vipetsc.case import Case, Model
 from vipetsc.case.points import PointTable
 from vipetsc.case.schema import OutputTable
-from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.observers import Guard
+from vipetsc.dynamics.plan import RunPlan, choose_engine
 from vipetsc.dynamics.run import Simulation
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Chain, Drive, ToneBurst
@@ -131,8 +131,8 @@ class SampledModel:
         time = self.case.time.model_copy(update={"engine": "auto"})
         case = self.case.model_copy(update={"output": OutputTable(points=points), "time": time})
         memory = RunMemory(MPI.COMM_SELF)
-        choice = choose_engine(case, model)
-        result = Simulation(case, model, engine=choice, stop=None, watching=[Guard], state=state).make(memory)
+        plan = RunPlan(case, model, choose_engine(case, model))
+        result = Simulation(plan, stop=None, watching=[Guard], state=state).make(memory)
         if not result.complete:
             raise MotionError(result.sentence)
 

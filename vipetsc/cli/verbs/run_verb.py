@@ -78,11 +78,12 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     """Simulate the case, and measure its fields and the motion of its named points, as far as they are stored."""
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
+    from vipetsc.dynamics.plan import RunPlan
     from vipetsc.io.export import has_xdmf, write_xdmf
 
     result = simulate(case, work.folder, work.comm, extend=work.options.extend, **work.keywords)
     work.warn(result.warnings)
-    faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
+    faster = on_root(work.comm, lambda: estimate(RunPlan.of(case), work.comm.size).faster)
     work.report(run_table(result, faster))
     if work.comm.rank == 0:
         logger.debug("statistics %s", json.dumps(result.statistics))
@@ -127,12 +128,14 @@ def run_rows(case: Case, ranks: int) -> Rows:
     """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_numbers, memory_available, memory_needed
+    from vipetsc.dynamics.plan import RunPlan
     from vipetsc.dynamics.recorded_sizes import recorded_cells
 
-    model = case.model()
+    plan = RunPlan.of(case)
+    model = plan.model
     check_numbers(model)
     chain = model.chain
-    cost = estimate(case, ranks)
+    cost = estimate(plan, ranks)
 
     begins_with = ""
     if case.initial:

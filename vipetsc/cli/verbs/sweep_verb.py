@@ -40,6 +40,7 @@ def failure_of(result: "SweepResult") -> list[str]:
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     """Return rows of ``validate`` with the number of members, how many of those tried are not valid, and their time."""
     from vipetsc.dynamics.cost import estimate
+    from vipetsc.dynamics.plan import RunPlan
 
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
@@ -53,7 +54,7 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     possible = [member.case for member in tried if member.case]
     some = possible[:: max(1, len(possible) // MOST_ESTIMATED)]
     if some:
-        mean = sum(estimate(case).seconds for case in some) / len(some)
+        mean = sum(estimate(RunPlan.of(case)).seconds for case in some) / len(some)
         seconds = mean * plan.count * len(possible) / len(tried) / ranks
         rows.append(("sweep takes", f"about {duration(seconds)} on {counted(ranks, 'rank')}, and its measures"))
     return rows

@@ -1,0 +1,53 @@
+"""Plan of a run: its case, its model and the engine that simulates it, settled once, before any kernel is loaded."""
+
+from typing import NamedTuple, Self
+
+from vipetsc.case import Case, Model
+from vipetsc.dynamics.options import check_options, options_of, with_database
+from vipetsc.dynamics.propagator.step_choice import refusal
+
+PROPAGATOR = "propagator"
+TS = "ts"  # which suits every lattice
+
+
+class EngineChoice(NamedTuple):
+    """The ``name`` of an engine in case files; ``refused`` says why it is not the one that the case asks for, or None.
+
+    A case that asks for none gets the propagator, if it can.
+    """
+
+    name: str
+    refused: str | None
+
+
+class RunPlan(NamedTuple):
+    """A run of ``case``: its ``model``, the choice of its ``engine``, and ``warnings`` that its result repeats.
+
+    What a run needs to know of its case is asked for here, once. A run of many, whose result nobody reads, may have a
+    model of its own and no warnings.
+    """
+
+    case: Case
+    model: Model
+    engine: EngineChoice
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, case: Case) -> Self:
+        """Return the plan of a run of ``case``, with options from PETSc's database; raises CaseError for bad ones."""
+        case = with_database(case)
+        check_options(case)
+        model = case.model()
+        return cls(case, model, choose_engine(case, model), tuple(case.warnings()))
+
+
+def choose_engine(case: Case, model: Model) -> EngineChoice:
+    """Return the engine that ``case`` names, by default the propagator; ``ts`` where that does not suit ``model``."""
+    if case.time.engine == TS:
+        return EngineChoice(TS, None)
+    if options_of(case):
+        return EngineChoice(TS, f"{PROPAGATOR} refused: PETSc options require ts")
+    reason = refusal(model)
+    if reason is not None:
+        return EngineChoice(TS, f"{PROPAGATOR} refused: {reason}")
+    return EngineChoice(PROPAGATOR, None)
