@@ -8,6 +8,7 @@
     follow    solutions of your own equations F(x, p) = 0: folds, branch points, the branches that cross there
     open      result files as xarray datasets
     impacts   the impacts of a run as a table of pandas: a row for each, with its loss, impulse and what it moved
+    plot      a picture of results, by the name that the command ``plot`` gives it, as a figure of matplotlib
     CaseError raised for an invalid case: key, value and remedy of every problem
     register  contact laws, dissipation factors, waveforms, measures and figures of a user's module, by name
 
@@ -35,6 +36,7 @@ __all__ = [
     "impacts",
     "install_abort_hook",
     "open",
+    "plot",
     "register",
     "simulate",
     "sweep",
@@ -49,6 +51,7 @@ MODULES = {
     "impacts": ("vipetsc.io.impacts", "impacts"),
     "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
     "open": ("vipetsc.io.read", "open_results"),
+    "plot": ("vipetsc.studies.pictures", "plot"),
     "register": ("vipetsc", "register"),
     "simulate": ("vipetsc.dynamics.run", "simulate"),
     "sweep": ("vipetsc.studies.sweep", "run_sweep"),

@@ -9,6 +9,7 @@ from vipetsc.io.read import open_results as open
 from vipetsc.modes.user_equations import follow as follow
 from vipetsc.parallel import install_abort_hook as install_abort_hook
 from vipetsc.studies.analysis import analyse as analyse
+from vipetsc.studies.pictures import plot as plot
 from vipetsc.studies.sweep import run_sweep as sweep
 
 __version__: str
@@ -21,6 +22,7 @@ __all__ = [
     "impacts",
     "install_abort_hook",
     "open",
+    "plot",
     "register",
     "simulate",
     "sweep",

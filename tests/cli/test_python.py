@@ -16,7 +16,7 @@ import vipetsc as package
 ROOT = Path(package.__file__).parents[1]
 CHAPTER = (ROOT / "vipetsc/manual/python.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", CHAPTER, flags=re.M | re.S)
-FRONT = {"Case", "CaseError", "Sweep", "analyse", "follow", "impacts", "open", "simulate", "sweep"}
+FRONT = {"Case", "CaseError", "Sweep", "analyse", "follow", "impacts", "open", "plot", "simulate", "sweep"}
 pytestmark = pytest.mark.parallel(1)
 
 
@@ -98,3 +98,35 @@ def test_stubs_say_what_the_module_does():
     listed = re.search(r"^__all__ = (\[.*?\])$", stub, flags=re.M | re.S)[1]
     assert re.findall(r'"(\w+)"', listed) == package.__all__
     assert (ROOT / "vipetsc/py.typed").exists()
+
+
+def test_pictures_are_figures(tmp_path):
+    """A result, a run in memory and a folder of either kind are drawn by one function, which refuses with reasons."""
+    case = package.Case(
+        lattice={"cells": 12}, contacts={"sites": [6], "clearance": 2e-4}, drive={"cycles": 2}, time={"end": 0.02}
+    )
+    held = package.simulate(case)
+    kept = package.simulate(case, tmp_path / "run")
+    drawn = [held.plot("ledger"), kept.plot("ledger"), package.plot(tmp_path / "run", "ledger")]
+    lines = [figure.axes[0].lines[0].get_ydata() for figure in drawn]
+    assert len(lines[0]) > 10
+    assert all((line == lines[0]).all() for line in lines[1:])
+    assert package.plot(held.dataset, "spacetime").axes
+
+    plan = package.Sweep(
+        **{name: dict(table) for name, table in case.varied_table(without=[]).items() if name in ("lattice", "time")},
+        contacts={"sites": [6], "clearance": 2e-4},
+        drive={"cycles": 2},
+        sweep={"drive": {"amplitude": [1.0, 40.0]}, "measures": ["motion"]},
+    )
+    package.sweep(plan, tmp_path / "sweep")
+    page = package.plot(tmp_path / "sweep", "largest_force")
+    assert page.axes[0].lines
+    for results, name, word in (
+        (held, "ledgr", "did you mean 'ledger'"),
+        (held, "poincare", "points"),
+        (tmp_path / "sweep", "spacetime", "no figure"),
+        (tmp_path, "ledger", "no results"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            package.plot(results, name)

@@ -133,8 +133,11 @@ class LargestExponent(Observer):
 
         deviation = of_companion["cells"] - cells
         grown = self._norm(deviation)
-        if not 0 < grown < np.inf:
-            self._reason = "the two runs have become equal"
+        if grown == 0:
+            # A mass that rests at its stop forgets where it came from. What follows may be chaotic all the same.
+            self.growth = []
+            self._begin_companion(cells)
+            self.last = time
             return
         self.growth.append((time, time - self.last, float(np.log(grown / self.size))))
         self.size = SIZE * self.largest

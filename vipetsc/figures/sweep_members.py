@@ -299,8 +299,8 @@ def _in_words(member: xr.Dataset, name: str, joint: str) -> str:
 
 
 def table(ensemble: xr.Dataset) -> dict[str, Any]:
-    """Return the sweep's case file as a table."""
-    return tomllib.loads(ensemble.attrs["case"])
+    """Return the sweep's case file as a table; one that was made in code may have no name."""
+    return {"name": "sweep"} | tomllib.loads(ensemble.attrs["case"])
 
 
 def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
