@@ -11,8 +11,8 @@ import xarray as xr
 
 from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
-from vipetsc.case import measured as measured_module
 from vipetsc.case.identify import IdentifyCase, RecordTable, SensorTable, read_measured
+from vipetsc.case.identify import measured as measured_module
 from vipetsc.studies.further_sensor import _further_sensor
 from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples, parameter_lines
 
