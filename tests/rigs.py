@@ -59,7 +59,7 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
     for (cell, mass), weight in zip(states.points, states.weights, strict=True):
         drive[cell * d + mass] += weight * amplitude
     # Clearances, and with them the loads at rest, are those of the case, not those that the response was computed with.
-    gaps = states.case.model().gaps or [(gap, gap) for gap in chain.clearances]
+    gaps = states.case.model().gaps
     joins = []
     for site, pair, stops, (plus, minus) in zip(
         chain.sites, chain.contact_pairs, states.forces.contacts, gaps, strict=True

@@ -47,9 +47,7 @@ def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: flo
         "time": {"end": 0.2},
     }
     model = Case.from_table(table).model()
-    # A model without gaps has one clearance for both sides.
-    gaps = np.array(model.gaps or [2 * model.chain.clearances])
-    gaps = np.where(np.isfinite(gaps), model.scale / over, np.inf)
+    gaps = np.where(np.isfinite(model.gaps), model.scale / over, np.inf)
     return replace(model, gaps=tuple(map(tuple, gaps.tolist())))
 
 

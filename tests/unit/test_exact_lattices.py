@@ -87,7 +87,7 @@ def with_any_pairs(model: Model) -> Model:
     pairs = PAIRS | {CELLS - 1: Pair(2, 0, offset=1) if ends_on_ring else Pair(-1, 3)}
     sites = (*pairs, 11)
     chain = replace(model.chain, sites=sites, pairs=(*pairs.values(), Pair(-1, 2)), clearances=(1e-4,) * len(sites))
-    return replace(model, chain=chain)
+    return replace(model, chain=chain, gaps=((1e-4, 1e-4),) * len(sites))
 
 
 def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:

@@ -385,7 +385,7 @@ def test_any_cell_can_be_drawn(tmp_path, cell):
         upper, *lower = figure.subplots(4, 1)
         draw_unit_cell(upper, cell)
         for axes, ends in zip(lower, ("fixed", "free", "periodic"), strict=True):
-            draw_lattice(axes, Chain(cell, 30, ends, (3, 4, 20), (1e-3,) * 3), 2)
+            draw_lattice(axes, Chain(cell, 30, ends, (3, 4, 20), (1e-3,) * 3), 2, ((1e-3, 1e-3),) * 3)
         figure.savefig(tmp_path / "cell.png")
 
     labels = [text.get_text() for text in upper.texts]

@@ -167,8 +167,8 @@ def test_stops_are_described_by_what_they_are():
     """A stop is described by its clearances, as touching, or by its precompression, with the side."""
     gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
     expected = ["touches on side -", "precompressed by 0.002 mm on side +", "0.2 mm on side +, 0.3 mm on side -"]
-    assert describe_stops(gaps, (0.0, 0.0, 2e-4)) == expected
-    assert describe_stops((), (2e-4,)) == ["0.2 mm"]
+    assert describe_stops(gaps) == expected
+    assert describe_stops(((2e-4, 2e-4),)) == ["0.2 mm"]
 
 
 def test_a_drive_without_an_end_is_said_to_go_on():

@@ -65,7 +65,8 @@ def lattice(ends: str, pairs: tuple[Pair, ...] = ()) -> Model:
         Drive(replace(wave, amplitude=factor * wave.amplitude), cell=cell, mass=mass)
         for (cell, mass), factor in zip(targets, factors, strict=True)
     ]
-    return replace(model, chain=chain, contact=LAW, drives=tuple(drives))
+    gaps = ((CLEARANCE, CLEARANCE),) * len(SITES)
+    return replace(model, chain=chain, contact=LAW, drives=tuple(drives), gaps=gaps)
 
 
 def random_motion(model: Model) -> Motion:

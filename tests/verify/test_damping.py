@@ -38,7 +38,7 @@ def varied_model(ends: str, has_dashpots: bool):
         none = np.zeros((CELLS, 4))
         variation = replace(chain.variation, damping=none, grounding=none)
         chain = replace(chain, cell=cell, variation=variation)
-    return replace(small_case(**sections).model(), chain=chain)
+    return replace(small_case(**sections).model(), chain=chain, gaps=((1e-5, 1e-5),))
 
 
 @ENDS

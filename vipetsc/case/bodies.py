@@ -17,10 +17,10 @@ def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
     """The body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
 
     Springs, which are all within cells, join the masses of a body, and so do contacts that are pressed at rest.
-    ``gaps`` are the clearances in m of the sites on both sides; () if they are equal.
+    ``gaps`` are the clearances in m of the sites on both sides.
     """
     d = chain.cell.dofs
-    pressed = [ends for ends, gap in zip(contact_ends(chain), gaps, strict=False) if min(gap) < 0]
+    pressed = [ends for ends, gap in zip(contact_ends(chain), gaps, strict=True) if min(gap) < 0]
     sprung = [(1 + cell * d + s.start, 1 + cell * d + s.end) for cell in range(chain.cells) for s in chain.cell.springs]
     # A node is joined to itself, so that there is a pair where nothing else is joined.
     return connected_groups(1 + chain.cells * d, ((0, 0), *sprung, *pressed))

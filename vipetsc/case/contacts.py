@@ -125,8 +125,7 @@ def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence
     ``gaps`` are the clearances in m.
     """
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
-    stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
-    for number, (plus, minus) in enumerate(stops, 1):
+    for number, (plus, minus) in enumerate(gaps_of_sites(contacts, gaps), 1):
         is_singular = restitutions[number - 1] < 1 and contacts.approach_floor == 0
         if min(plus, minus) == 0 and at_rest[number - 1] and is_singular:
             remedy = (
@@ -141,16 +140,15 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
     """Problems with contacts that are closed at rest: a second stop, or an unbounded dissipation."""
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
-    stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     # Only the first problem is given, since similar sites all have the same.
-    for number, (plus, minus) in enumerate(stops, 1):
-        if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
-            remedy = "contacts that touch at rest or are precompressed have a stop on one side only; set contacts.side"
-            yield Problem("contacts.clearance", min(plus, minus), f"site {number}: {remedy}")
-            return
+    for number, (plus, minus) in enumerate(gaps_of_sites(contacts, gaps), 1):
         if precompressions[number - 1] and max(plus, minus) < np.inf:
             remedy = f"site {number} has stops on both sides; a precompressed contact has one: set contacts.side"
             yield Problem(path_of(contacts, "precompression"), precompressions[number - 1], remedy)
+            return
+        if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
+            remedy = "contacts that touch at rest have a stop on one side only; set contacts.side"
+            yield Problem("contacts.clearance", min(plus, minus), f"site {number}: {remedy}")
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = f"site {number}: {NO_APPROACH}"
@@ -225,10 +223,10 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
     return tuple(laws)
 
 
-def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
-    """Description of the stops of each site: by side if ``gaps`` differ, otherwise the ``clearances``."""
-    if not gaps:
-        return [f"{1e3 * gap:.4g} mm" for gap in clearances]
+def describe_stops(gaps: Gaps) -> list[str]:
+    """Return a description of the stops of each site: its clearance, or by side where sites differ on the two sides."""
+    if has_equal_sides(gaps):
+        return [f"{1e3 * gap:.4g} mm" for gap, _ in gaps]
 
     texts = []
     for plus, minus in gaps:
@@ -323,7 +321,7 @@ def _check_loose(cell: UnitCell, pairs: Sequence[Pair]) -> Iterator[Problem]:
 
 
 def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
-    """Clearances in m on the sides + and - of each site, inf without a stop; () if they are ``gaps`` on both."""
+    """Return the clearances in m on the sides + and - of each site, inf without a stop."""
     values = [values_of_sites(contacts, key, len(gaps)) for key in SIDES]
     stops = []
     for gap, side, minus_gap, precompression in zip(gaps, *values, strict=True):
@@ -337,7 +335,9 @@ def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
         elif side == "plus":
             minus = np.inf
         stops.append((plus, minus))
-    # () for equal clearances on both sides: motions of such sites may be symmetric, which is recognised by it.
-    if all(plus == minus for plus, minus in stops):
-        return ()
     return tuple(stops)
+
+
+def has_equal_sides(gaps: Gaps) -> bool:
+    """Return whether every site has one clearance on both sides, so that motions may be symmetric."""
+    return all(plus == minus for plus, minus in gaps)

@@ -57,7 +57,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
         rows += [
             ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
             ("sites", shortened([f"cell {site + 1}" for site in chain.sites])),
-            ("clearance", shortened(describe_stops(model.gaps, chain.clearances))),
+            ("clearance", shortened(describe_stops(model.gaps))),
         ]
     if model.initial:
         rows.append(("begins with", model.initial.describe()))

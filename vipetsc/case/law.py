@@ -350,7 +350,7 @@ def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
         yield Problem("contacts.stiffness", None, "missing; give it or contacts.modulus, radius and poisson")
 
     pressed = values_of_sites(contacts, "precompression", len(sites))
-    lesser = lesser_clearances(gaps_of_sites(contacts, clearances), clearances)
+    lesser = lesser_clearances(gaps_of_sites(contacts, clearances))
     for number, clearance in enumerate(lesser):
         if clearance <= 0:
             remedy = (
@@ -377,23 +377,16 @@ def _given_clearances(table: Table) -> list[float]:
     return list(preset.clearance_span(1))
 
 
-def lesser_clearances(gaps: Gaps, clearances: Sequence[float]) -> np.ndarray:
-    """Clearance (site,) in m on the side where it is less; ``gaps`` are those of both sides, () if they are equal."""
-    if not gaps:
-        return np.array(clearances, float)
-    return np.min(np.array(gaps), axis=1)
+def lesser_clearances(gaps: Gaps) -> np.ndarray:
+    """Return the clearance (site,) in m on the side where it is less; ``gaps`` are those of both sides."""
+    return np.reshape(gaps, (-1, 2)).min(axis=1)
 
 
 def site_kinds(model: Model) -> SiteKinds:
     """The kinds of the sites of a ``model`` whose clearances are above 0."""
-    chain = model.chain
-    count = len(chain.sites)
-    laws = model.laws or (model.contact,) * count
-    gaps = model.gaps or tuple((gap, gap) for gap in chain.clearances)
-
     number: dict[SiteKind, int] = {}
     of = []
-    for law, (plus, minus), pair in zip(laws, gaps, chain.contact_pairs, strict=True):
+    for law, (plus, minus), pair in zip(model.law_of_sites, model.gaps, model.chain.contact_pairs, strict=True):
         lesser = min(plus, minus)
         sides = (round(plus / lesser, DIGITS), round(minus / lesser, DIGITS))
         of.append(number.setdefault(SiteKind(law=law, sides=sides, pair=pair), len(number)))
@@ -403,7 +396,7 @@ def site_kinds(model: Model) -> SiteKinds:
 def mean_clearance(contacts: ContactsTable, clearances: Sequence[float], sites: Sequence[int]) -> float:
     """Geometric mean in m of the lesser clearances of those ``sites`` (from 0), all above 0."""
     # Geometric, since the law depends on ratios of amplitudes to clearances.
-    lesser = lesser_clearances(gaps_of_sites(contacts, list(clearances)), clearances)
+    lesser = lesser_clearances(gaps_of_sites(contacts, list(clearances)))
     return float(np.exp(np.mean(np.log(lesser[list(sites)]))))
 
 

@@ -15,7 +15,7 @@ class Model:
     ``atol`` are the absolute tolerances of displacements (m) and velocities (m/s); ``scale`` is the displacement in m
     of the drives' linear waves or of the ``initial`` state, ``packet`` the frequency in rad/s of the wave that arrives
     first, infinite for a pulse. ``laws`` has the law of each site, or is () if all have ``contact``; ``gaps`` has the
-    clearances in m of each site on the sides + and -, or is () if those of the chain hold on both sides.
+    clearances in m of each site on the sides + and -, inf without a stop.
     """
 
     chain: Chain
@@ -28,9 +28,9 @@ class Model:
     atol: tuple[float, float]
     scale: float
     packet: float
+    gaps: Gaps
     initial: InitialTable | None = None
     laws: tuple[Contact, ...] = ()
-    gaps: Gaps = ()
 
     @property
     def speed(self) -> float:
@@ -45,6 +45,11 @@ class Model:
         Where each site has its own law, ``contact`` holds at none of them, and its numbers may be impossible.
         """
         return self.laws or (self.contact,)
+
+    @property
+    def law_of_sites(self) -> tuple[Contact, ...]:
+        """The law of each site."""
+        return self.laws or (self.contact,) * len(self.chain.sites)
 
     @property
     def effective_restitution(self) -> float | list[float]:

@@ -261,8 +261,7 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
 
     # The briefest contact decides, at the speed of the undisturbed wave. A set, since similar sites have one duration.
     masses = model.chain.reduced_masses()
-    laws = model.laws or (model.contact,) * len(masses)
-    time = min(law.impact_time(speed, mass) for law, mass in {*zip(laws, masses, strict=True)})
+    time = min(law.impact_time(speed, mass) for law, mass in {*zip(model.law_of_sites, masses, strict=True)})
     step = DEFAULT_STEP / model.drive.frequency
     # Options of PETSc are text in a case. PETSc reads some that are no numbers here, such as "0x10" and "default".
     if is_number(petsc.get("ts_dt", "")):

@@ -21,7 +21,7 @@ def wave_over_clearance(model: Model) -> np.ndarray:
     """
     chain = model.chain
     drive = model.drive
-    gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances]).reshape(-1, 2)
+    gaps = np.reshape(model.gaps, (-1, 2))
     waves = waves_at(chain.cell, drive.frequency)
     if not (waves and drive.amplitude):
         return np.zeros(gaps.shape)

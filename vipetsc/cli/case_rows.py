@@ -31,7 +31,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     # Each of a million sites may have its own law: a list shows only the first ones. Without sites a law has no
     # stiffness.
     laws = model.used_laws[: min(len(chain.sites), MOST_SHOWN)]
-    clearances = describe_stops(model.gaps, chain.clearances)
+    clearances = describe_stops(model.gaps)
 
     return [
         ("case", case.name),

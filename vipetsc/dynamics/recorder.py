@@ -12,6 +12,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.case.contacts import has_equal_sides
 from vipetsc.case.points import PointTable
 from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.observers import Observer, Setup
@@ -280,7 +281,7 @@ def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
         "sites/cell": np.array(chain.sites, np.int64) + 1,
         "sites/clearance": np.array(chain.clearances, float),
     }
-    if model.gaps:
+    if not has_equal_sides(model.gaps):
         given["sites/clearance"], given["sites/clearance_minus"] = np.array(model.gaps).T
     if chain.variation:
         given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}

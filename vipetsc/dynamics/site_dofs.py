@@ -35,8 +35,7 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     masses = np.full(len(numbers), chain.cell.reduced_mass)
     joins_cells = np.zeros(len(numbers), bool)
     if asked:
-        of_sites = model.gaps or chain.clearances
-        gaps[exists] = np.reshape([of_sites[i] for i in asked], (len(asked), -1))
+        gaps[exists] = [model.gaps[i] for i in asked]
         masses[exists] = chain.reduced_masses(asked)
         joins_cells[exists] = chain.pair_table[asked, 2] > 0
     # It takes any law that is used: without stops no law acts.

@@ -4,15 +4,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
-from vipetsc.case.contacts import Gaps
+from vipetsc.case.contacts import Gaps, has_equal_sides
 from vipetsc.figures import style
 from vipetsc.lattice import Chain
 
 
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, gaps: Gaps = ()) -> None:
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: int, gaps: Gaps) -> None:
     """Draw the lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances.
 
-    ``gaps`` (site, 2) in m are the clearances of each site's sides + and -, where these differ. Cells have a width of 1
+    ``gaps`` (site, 2) in m are the clearances of each site's sides + and -. Cells have a width of 1
     on the axis, and the strip a height of 1.
     """
     n = chain.cells
@@ -43,10 +43,10 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
     """Draw a mark for every site, with its cell above and its clearance in mm below where there is room."""
     n = chain.cells
     width = min(max(0.006 * n, 1), 0.02 * n)
-    if gaps:
-        texts = [_gap_label(plus, minus) for plus, minus in gaps]
+    if has_equal_sides(gaps):
+        texts = [f"{1e3 * gap:#.3g}" for gap, _ in gaps]
     else:
-        texts = [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
+        texts = [_gap_label(plus, minus) for plus, minus in gaps]
     # From the left to the right, so that the first of a group of sites has the label.
     last_labelled = -np.inf
     for site, text in sorted(zip(chain.sites, texts, strict=True)):

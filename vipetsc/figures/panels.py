@@ -222,9 +222,8 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     """Return the indentation (site, t) in m of every contact of a ``run`` that recorded all displacements."""
     u = run["displacement"].values
     chain = model.chain
-    stops = model.gaps or [(gap, gap) for gap in chain.clearances]
     depth = []
-    for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, stops, strict=True):
+    for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, model.gaps, strict=True):
         w = pair.relative(u, cell)
         depth.append(np.maximum(np.maximum(w - plus, -w - minus), 0.0))
     return np.array(depth)

@@ -68,7 +68,7 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     rows = lower.subplots(len(sites), 1, squeeze=False).flat
     for i, (axes, count) in enumerate(zip(rows, sites, strict=True)):
         model = case.varied(contacts={"sites": count, "clearance": None}).model()
-        draw_lattice(axes, model.chain, model.drive_cell)
+        draw_lattice(axes, model.chain, model.drive_cell, model.gaps)
         title = f"(c.{i + 1}) {counted(count, 'contact site')}"
         axes.set_title(f"{title}; {LEGEND}" if i == 0 else title)
     return figure

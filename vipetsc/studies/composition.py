@@ -113,7 +113,7 @@ class Network:
         self.model = model
         self.cell = chain.cell
         self.om = drive.frequency
-        self.clearance = lesser_clearances(model.gaps, chain.clearances)
+        self.clearance = lesser_clearances(model.gaps)
 
         half = min(_half_width(drive), WIDEST * drive.frequency)
         self.line = SpectralLine(half=half, length=2 * model.end)

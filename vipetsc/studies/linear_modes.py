@@ -110,10 +110,8 @@ def check_modes(case: Case, count: int, near: float) -> None:
 def pressed_contacts(model: Model) -> list[Joint]:
     """The contacts of a ``model`` that are pressed at rest: for small motions springs of the slope of their force."""
     chain = model.chain
-    laws = model.laws or (model.contact,) * len(chain.sites)
     joints: list[Joint] = []
-    # There are no gaps, and no rows, where all contacts have one clearance on both sides: none is pressed then.
-    for (host, resonator), law, stops in zip(contacts(chain).ends(), laws, model.gaps, strict=False):
+    for (host, resonator), law, stops in zip(contacts(chain).ends(), model.law_of_sites, model.gaps, strict=True):
         pressed = -min(stops)
         if pressed > 0:
             joints.append(Joint(host, resonator, float(law.elastic_slope(pressed))))

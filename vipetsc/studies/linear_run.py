@@ -21,6 +21,7 @@ import xarray as xr
 from vipetsc import spectra
 from vipetsc.case import Case, case_id
 from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
+from vipetsc.case.law import lesser_clearances
 from vipetsc.dynamics import simulate
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record
@@ -176,10 +177,8 @@ def reached(envelope: np.ndarray, case: Case) -> np.ndarray:
     if other_pairs(case):
         return np.full(waves.shape, np.inf)
 
-    clearance = np.asarray(contacts.clearance or [], float)
-    gaps = gaps_of_sites(contacts, clearance.tolist())
-    if gaps:
-        clearance = np.min(gaps, axis=1)
+    clearances = np.asarray(contacts.clearance or [], float)
+    clearance = lesser_clearances(gaps_of_sites(contacts, clearances.tolist()))
     return np.divide(waves, clearance, out=np.full(waves.shape, np.inf), where=clearance > 0)
 
 

@@ -150,7 +150,7 @@ class PredictionRuns:
         linear = self.case.varied(without=("output",), drive={"amplitude": amplitude}, contacts=NO_SITES)
         run, statistics = self._run(linear)
         motion = PairMotion.between(run, chain.sites, chain.contact_pairs)
-        reached = motion.reached(self.model.gaps or [(gap, gap) for gap in chain.clearances])
+        reached = motion.reached(self.model.gaps)
         return {"reached": reached} | self._energies(run, statistics)
 
     def _site(self, z: float, kind: int, largest: float) -> Record:

@@ -7,7 +7,6 @@ from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import tomli_w
 from pydantic import Field
 
@@ -179,9 +178,9 @@ def _group_problems(
     ``taken`` are the pairs of a quantity and a member that are sought already. Those of the unknown are added to it.
     """
     quantity = unknown.quantity
-    gaps = base.model().gaps  # none where the clearances of both sides are equal
+    gaps = base.model().gaps
     for group in groups:
-        if quantity == "clearance_minus" and gaps and all(not isfinite(gaps[member][1]) for member in group):
+        if quantity == "clearance_minus" and all(not isfinite(gaps[member][1]) for member in group):
             remedy = f"site {group[0] + 1} has no stop on the side w < 0; name the other sites, as in of = [[1], [2]]"
             yield Problem(f"{at}.of", unknown.of, remedy)
         for member in group:
@@ -306,9 +305,7 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
 
 def _touches(base: Case) -> bool:
     """Whether a site of the case touches its stop, or is pressed against it, at rest."""
-    model = base.model()
-    gaps = [*model.chain.clearances, *(gap for both in model.gaps for gap in both)]
-    return min(gaps, default=np.inf) <= 0
+    return any(min(gaps) <= 0 for gaps in base.model().gaps)
 
 
 def _force_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:

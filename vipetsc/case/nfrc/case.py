@@ -11,7 +11,7 @@ import tomli_w
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
-from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, lists_of
+from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, has_equal_sides, lists_of
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.nfrc.ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc.family import FamilyMember, family_of
@@ -86,6 +86,7 @@ class NfrcCase(Case):
         nfrc = sections["nfrc"]
         contacts = sections["contacts"]
         chain = build_chain(sections["lattice"], contacts)
+        gaps = gaps_of_sites(contacts, list(chain.clearances))
         cell = chain.cell
         problems = [*_check_drives(nfrc, sections["drive"]), *_check_lattice(nfrc, contacts, chain)]
         if problems:
@@ -95,7 +96,7 @@ class NfrcCase(Case):
         if nfrc.infinite is None:
             update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
-            is_odd = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
+            is_odd = chain.is_odd and has_equal_sides(gaps)
             # In half of an even number of its periods the drive does not change its sign, as such a motion would.
             update["symmetric"] = is_odd and nfrc.subharmonic % 2 == 1
         if nfrc.over == "amplitude":
@@ -105,7 +106,7 @@ class NfrcCase(Case):
             nfrc = nfrc.model_copy(update={"band": _fastest_band(nfrc, cell)})
         problems = [
             *_check_waves(nfrc, cell),
-            *check_ground(nfrc, sections["lattice"], chain, gaps_of_sites(contacts, list(chain.clearances))),
+            *check_ground(nfrc, sections["lattice"], chain, gaps),
             *_check_points_at(nfrc, measures_of(nfrc, sections["lattice"], sections["output"], chain)),
         ]
         return sections | {"nfrc": nfrc}, problems
@@ -259,7 +260,7 @@ class NfrcCase(Case):
     def laws(self, restitution: float) -> list[Contact]:
         """The law of each site, with the ``restitution`` unless the case gives each site one of its own."""
         model = self.model()
-        laws = list(model.laws or (model.contact,) * len(model.chain.sites))
+        laws = list(model.law_of_sites)
         if self.contacts.each and self.contacts.each.restitution:
             return laws
         return [replace(law, restitution=restitution) for law in laws]
@@ -357,12 +358,11 @@ def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
 def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:
     """Problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
     gaps = gaps_of_sites(contacts, list(chain.clearances))
-    if nfrc.symmetric and gaps:
+    if nfrc.symmetric and not has_equal_sides(gaps):
         yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; omit it")
     if nfrc.symmetric and not chain.is_odd:
         yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
-    stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
-    smallest = min((min(gap) for gap in stops), default=np.inf)
+    smallest = min((min(gap) for gap in gaps), default=np.inf)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
         yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
     if nfrc.source == "wave" and smallest <= 0:

@@ -26,9 +26,9 @@ def are_contacts_springs(
 
     They are if nothing else holds the masses: contacts with the ground in a lattice without walls, and all contacts in
     a lattice without springs. A mean force would push masses that no spring holds away without bound. ``gaps`` are the
-    clearances in m of the sites of ``chain`` on both sides; () if they are equal, and then no contact is pressed.
+    clearances in m of the sites of ``chain`` on both sides.
     """
-    pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=False) if min(gap) < 0]
+    pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=True) if min(gap) < 0]
     if not lattice.unit_cell().joins_cells:
         return bool(pressed)
     return any(pair.host < 0 for pair in pressed) and not has_walls(nfrc, lattice)
@@ -54,7 +54,7 @@ def check_ground(
 ) -> Iterator[Problem]:
     """Problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds.
 
-    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides; () if they are equal.
+    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides.
     """
     if nfrc.symmetric:
         return

@@ -18,6 +18,7 @@ from vipetsc.case.contacts import (
     check_per_site,
     contact_of,
     gaps_of_sites,
+    has_equal_sides,
     laws_of_sites,
     path_of,
     with_stiffness,
@@ -159,7 +160,7 @@ class NnmCase(CaseFile):
         problems += _check_stops(contacts, given, valid)
         if problems:
             return problems
-        gaps = gaps_of_sites(contacts, given) or tuple((gap, gap) for gap in given)
+        gaps = gaps_of_sites(contacts, given)
         problems += check_lattice(lattice, contacts, cell, gaps, valid)
         if problems:
             return problems
@@ -208,8 +209,7 @@ class NnmCase(CaseFile):
 
     def gaps(self) -> Gaps:
         """Clearances in m of each contact on the sides + and -; inf where there is no stop."""
-        given = self._clearances()
-        return gaps_of_sites(self.contacts, given) or tuple((gap, gap) for gap in given)
+        return gaps_of_sites(self.contacts, self._clearances())
 
     def _clearances(self) -> list[float]:
         """The clearance in m of each contact, that of the side + unless its only stop is on the side -."""
@@ -258,8 +258,7 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
     rigid = 0
     if not wrong:
         joined = [(spring.start, spring.end) for spring in custom.springs]
-        # A contact that is pressed at rest is a spring of small motions. There are no gaps where all clearances are
-        # equal on both sides, and then no contact is pressed.
+        # A contact that is pressed at rest is a spring of small motions.
         gaps = gaps_of_sites(contacts, [pair.clearance for pair in custom.contacts])
         for number, gap in enumerate(gaps):
             if min(gap) < 0:
@@ -267,7 +266,7 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
         # Node 0 is the ground. Each further group of masses moves as a rigid body.
         group = connected_groups(masses + 1, tuple(joined))
         rigid = len(set(group)) - 1
-        if gaps:
+        if not has_equal_sides(gaps):
             smooth = [(spring.start, spring.end) for spring in custom.smooth]
             body = connected_groups(masses + 1, (*joined, *smooth))
             yield from check_apart(body, [(pair.host, pair.resonator) for pair in custom.contacts])

@@ -4,7 +4,16 @@ from collections.abc import Iterator
 
 from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
 from vipetsc.case.case_file import Problem, Valid
-from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites, path_of, values_of_sites
+from vipetsc.case.contacts import (
+    Gaps,
+    check_joined,
+    check_pairs,
+    has_equal_sides,
+    lists_of,
+    pairs_of_sites,
+    path_of,
+    values_of_sites,
+)
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
 from vipetsc.case.nnm.table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
@@ -122,7 +131,7 @@ def check_lattice(
         yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
 
     yield from _check_held(lattice, contacts, cell, gaps)
-    is_symmetric = _is_odd(lattice) and all(plus == minus for plus, minus in gaps)
+    is_symmetric = _is_odd(lattice) and has_equal_sides(gaps)
     # Symmetric motions have no mean forces, and springs that join cells make one body of a lattice.
     if not (cell.joins_cells or is_symmetric):
         chain = build_chain(lattice, contacts)
@@ -141,12 +150,12 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     fixed = 'use ends = "fixed", or equal stops on both sides'
     if not cell.joins_cells:
         fixed = "press it against the ground (contacts.precompression), or use equal stops on both sides"
-    if any(plus != minus for plus, minus in to_ground):
+    if not has_equal_sides(tuple(to_ground)):
         remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
         yield Problem(path_of(contacts, "pair"), contacts.pair, f"{remedy}; {fixed}")
     # Symmetric motions pass the centre between the stops. Unsymmetric ones have a mean position, which small motions,
     # without contact, do not determine.
-    elif any(plus != minus for plus, minus in gaps) or not _is_odd(lattice):
+    elif not (has_equal_sides(gaps) and _is_odd(lattice)):
         remedy = (
             "nothing holds this lattice between its stops to ground, and its other forces are not symmetric, so that"
         )

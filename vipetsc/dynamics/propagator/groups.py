@@ -80,10 +80,7 @@ def contact_dofs(model: Model) -> np.ndarray:
     driven["cell"] = driven["last"] = [drive.cell for drive in drives]
     driven["form"][np.arange(len(drives)), 0, [drive.mass for drive in drives]] = 1.0
 
-    # ``gaps`` is empty where the clearances of every site are equal on both sides.
-    dofs["clearance"][:first_spring] = lattice.clearances
-    if model.gaps:
-        dofs["clearance"][:first_spring] = np.min(model.gaps, axis=1)
+    dofs["clearance"][:first_spring] = np.reshape(model.gaps, (-1, 2)).min(axis=1)
     driven["clearance"] = np.inf
     if len(springs.cell):
         _fill_springs(dofs[first_spring:first_drive], lattice, springs)
