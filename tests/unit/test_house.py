@@ -94,6 +94,20 @@ def test_every_chapter_is_in_the_index_and_every_link_leads_somewhere():
     assert readme.read_text(encoding="utf-8").count("\n") <= 150
 
 
+def test_the_chapter_on_the_code_names_files_and_functions_that_are_there():
+    """Paths of modules in the chapter exist, and so do the names in the rows of what to change where."""
+    chapter = (ROOT / "manual/house.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`(\w[\w/]*/\w+\.py)`", chapter)
+    assert len(paths) > 20
+    assert [path for path in paths if not ((ROOT / path).exists() or (ROOT.parent / path).exists())] == []
+
+    rows = chapter.partition("Where to change something:")[2].partition("\n\nEach")[0]
+    names = set(re.findall(r"`(_?[a-z]+(?:_[a-z]+)*|[A-Z]\w+)`", rows))
+    assert {"refuses", "with_drawn", "_survey", "LAYOUT"} <= names
+    together = "\n".join(SOURCES.values())
+    assert [name for name in names if not re.search(rf"(def|class) {name}\b|^ *{name}\b.* = ", together, re.M)] == []
+
+
 def test_no_two_classes_have_one_name():
     """A name means one thing in the whole package; a private class may repeat one."""
     places = defaultdict(list)
