@@ -61,7 +61,11 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
 
 def key_name(path: str) -> str:
     """Return the words for the ``path`` of a key of a case: "Drive amplitude" for "drive.amplitude"."""
-    text = path.replace("contacts.", "contact.").replace("_", " ").replace(".", " ")
+    return capitalised(path.replace("contacts.", "contact.").replace("_", " ").replace(".", " "))
+
+
+def capitalised(text: str) -> str:
+    """Return a ``text`` with a capital letter at its beginning."""
     return text[:1].upper() + text[1:]
 
 

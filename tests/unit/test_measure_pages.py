@@ -107,7 +107,9 @@ def panels(figure: Figure) -> list[Axes]:
 
 def title(figure: Figure) -> str:
     bodies = [figure, *figure.subfigs]
-    return " ".join(body._suptitle.get_text() for body in bodies if body._suptitle).translate(BLANKS)
+    texts = [body._suptitle.get_text() for body in bodies if body._suptitle]
+    # The title is one line; notes are below the picture.
+    return " ".join([*texts, figure.get_label()]).translate(BLANKS)
 
 
 def legend(figure: Figure) -> list[str]:
@@ -126,7 +128,7 @@ def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
     np.testing.assert_allclose(high.get_ydata(), 0.01 * np.arange(7, 13))
     assert to_hex(low.get_color()) != to_hex(high.get_color())
     assert legend(figure) == ["contacts.restitution 0.3", "contacts.restitution 0.9"]
-    assert "over drive.amplitude (N), for each contacts.restitution" in title(figure)
+    assert "for each contact restitution" in title(figure)
     assert "largest (ring): 0.12 at contacts.restitution 0.9, drive.amplitude 32 N" in title(figure)
 
 
@@ -153,7 +155,7 @@ def test_two_numbers_are_a_map_with_contours_and_its_largest_marked(turned):
     # The ring is the only line, at the last member, whose value is the largest.
     assert {tuple(line.get_xydata()[0]) for line in axes.lines} == {(2e-3, 0.9)}
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0.0002", "0.0005", "0.001", "0.002"]
-    assert "over contacts.clearance (m) and contacts.restitution" in title(figure)
+    assert ": inter-band energy transfer largest (ring)" in title(figure)
 
 
 def test_a_map_over_falling_values_shows_each_at_its_place():
@@ -334,7 +336,7 @@ def test_measures_are_what_is_measured_of_every_member():
 def test_the_amplitude_has_the_unit_of_its_drive(drive):
     (axis,) = SweptAxis.all_of(ensemble_of(AMPLITUDES, drive=drive))
     unit = "m" if "end" in drive else "N s" if drive else "N"
-    assert axis.label == f"drive.amplitude ({unit})"
+    assert axis.label == f"Drive amplitude ({unit})"
 
 
 @pytest.mark.parametrize(
@@ -439,8 +441,8 @@ def test_roles_do_not_depend_on_equal_sizes():
     same = [{"drive.frequency": [1.0, 2.0, 3.0]}, {"drive.ramp": [1.0, 2.0, 3.0]}, {"drive.duration": [1.0, 2.0, 3.0]}]
     roles = Roles.of(Measure.of(ensemble_of(*same), "ibtet").axes)
     assert roles.y is not None
-    assert [roles.x.label, roles.y.label] == ["drive.frequency (rad/s)", "drive.ramp (s)"]
-    assert [axis.label for axis in roles.panels] == ["drive.duration (s)"]
+    assert [roles.x.label, roles.y.label] == ["Drive frequency (rad/s)", "Drive ramp (s)"]
+    assert [axis.label for axis in roles.panels] == ["Drive duration (s)"]
 
 
 OWN = {

@@ -30,7 +30,7 @@ from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
-from vipetsc.wording import with_unit
+from vipetsc.wording import capitalised, with_unit
 
 MOST_PAGES = 12  # of a measure, as many as a reader turns over; of more only the one with the largest value is drawn
 BAND = "band"  # the first word in the names of those parts of the frequency axis that are pass bands
@@ -128,8 +128,8 @@ class Measure(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name of the measure with its unit."""
-        return with_unit(self.name, self.unit)
+        """What the measure is, with its unit."""
+        return with_unit(capitalised(self.text or self.name), self.unit)
 
     @property
     def drawn(self) -> np.ndarray:
@@ -248,9 +248,7 @@ def measure_pages(
     """
     measure = Measure.of(ensemble, name)
     keys = [key.path for axis in measure.axes for key in axis.keys]
-    heading = f"{table(ensemble)['name']}: {name}"
-    if measure.text != name.replace("_", " "):
-        heading += f", {measure.text}"
+    heading = f"{table(ensemble)['name']}: {measure.text or name}"
 
     begin = "-".join(filter(None, [figure_name(name), sweep, "over"]))
     if set(keys) <= {BAND}:
@@ -338,10 +336,10 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
     best = measure.largest()
     # If bands are compared, the largest value is in the driven one, and to mark it says nothing.
     marks_largest = all(axis.dimension != PART for axis in measure.axes)
-    lines = _lines_above(measure, roles, title)
+    lines = _lines_of(measure, roles, title)
     if marks_largest:
         largest = f"{float(measure.values.isel(best)):.4g} {measure.unit}".strip()
-        lines.insert(1 + len(title), f"largest (ring): {largest} at {measure.place_text(best)}")
+        lines.insert(1, f"largest (ring): {largest} at {measure.place_text(best)}")
 
     panels = _by_place(measure, roles.panels)
     legend: list[str] = []
@@ -371,14 +369,14 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
     return page.finish_curves(roles.x, measure.drawn, common)
 
 
-def _lines_above(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]:
-    """Return the lines above the panels: the ``title``, what varies on the page, and what values are left out."""
+def _lines_of(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]:
+    """Return the lines of a page: the ``title``, what is compared on the page, and what values are left out."""
     heading, *further = title
-    over = f"over {joined([axis.label for axis in (roles.x, roles.y) if axis])}"
+    lines = [heading]
     compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
     if compared:
-        over += f", for each {compared}"
-    lines = [heading, over, *further]
+        lines.append(f"for each {compared[:1].lower()}{compared[1:]}")
+    lines += further
 
     if measure.samples:
         means = f"means over {measure.sample_text}"

@@ -17,10 +17,12 @@ from vipetsc.figures import style
 from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
 from vipetsc.figures.panels import colour_bar
 from vipetsc.figures.swept_axes import SweptAxis
+from vipetsc.wording import key_name
 
 MARKERS = "os^Dv*"  # of curves, in their order
 SINGLE = 4.8  # width in inches of a page with one panel
 LETTERS = 17  # letters of a page's title that fit into an inch
+BAR_LETTERS = 40  # of a line beside a colour bar
 PANEL_LETTERS = 15  # letters of a panel's title on an inch; fewer, since titles side by side must not touch
 LEGEND_LETTERS = 17  # letters of a legend that fit into an inch
 MOST_COLUMNS = 4  # columns of panels
@@ -71,14 +73,16 @@ class CommonAxes(NamedTuple):
 
 @dataclass
 class MeasurePage:
-    """A page of panels of a measure with its ``label``, under the lines of a ``title``, over a legend.
+    """A page of panels of a measure with its ``label``, over a legend; the first of its ``lines`` is the title.
+
+    The other lines are notes below the picture.
 
     ``legend_labels`` are the texts of the legend, empty for none. ``lay_out`` makes the ``figure`` and its ``panels``,
     which stand in ``body``, the figure without the strip of the legend; ``width`` is in inches.
     """
 
     label: str
-    title: Sequence[str]
+    lines: Sequence[str]
     legend_labels: Sequence[str] = ()
     figure: Figure = field(init=False)
     body: Figure | SubFigure = field(init=False)
@@ -97,13 +101,15 @@ class MeasurePage:
         if count == 1:
             self.width = SINGLE
 
-        heading = [part for line in self.title if line for part in wrap(line, int(LETTERS * self.width))]
+        heading = wrap(self.lines[0], int(LETTERS * self.width))
         height = 2.4
         if rows > 1:
             height = 0.3 + 1.75 * rows
         height += 0.15 * len(heading)
         strip = self._legend_height()
         self.figure = style.new_figure(self.width, height + strip)
+        for line in filter(None, self.lines[1:]):
+            style.add_note(self.figure, line)
         self.body = self.figure
         if strip:
             self.body, legend = self.figure.subfigures(2, 1, height_ratios=(height, strip), hspace=0)
@@ -264,7 +270,7 @@ def draw_maps(
     ticks: dict[str, Any] = {}
     if isinstance(norm, LogNorm):
         ticks = {"ticks": log_ticks(norm.vmin, norm.vmax), "format": "%g"}
-    colour_bar(image, page.panels, page.label, extend="neither", **ticks)
+    colour_bar(image, page.panels, "\n".join(wrap(page.label, BAR_LETTERS)), extend="neither", **ticks)
     return page.figure
 
 
@@ -313,7 +319,7 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
         axes.plot(seeds, curve.values, label=curve.label, **look | {"ls": ""})
         axes.axhspan(*np.nanquantile(curve.values, (0.05, 0.95)), color=look["color"], alpha=0.2, lw=0)
         axes.axhline(np.nanmean(curve.values), color=look["color"], lw=0.9)
-    axes.set(xlabel="disorder.seed", ylabel=page.label)
+    axes.set(xlabel=key_name("disorder.seed"), ylabel=page.label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return page.figure
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from vipetsc.case.keys import unit_of
 from vipetsc.io.read import axes as axes_of
-from vipetsc.wording import with_unit
+from vipetsc.wording import key_name, with_unit
 
 FEW_TOGETHER = 6  # values up to which keys that vary together are categories; of more they are numbers
 FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction: 5 degrees of phase
@@ -29,8 +29,8 @@ class SweptKey(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The path with the unit in brackets."""
-        return with_unit(self.path, self.unit)
+        """The words for the key, with its unit in brackets."""
+        return with_unit(key_name(self.path), self.unit)
 
     @property
     def is_number(self) -> bool:
