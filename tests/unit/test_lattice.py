@@ -201,9 +201,9 @@ def test_a_spring_is_linear_without_further_terms_and_odd_without_a_quadratic_on
 
 
 def test_cell_problems_are_all_named():
-    # The problems are a negative mass, a spring from a mass to itself, a spring of negative stiffness to a mass that
+    # The problems are a negative mass, a spring from a mass to itself, a spring of no stiffness to a mass that
     # does not exist, and a contact of a mass with itself.
-    springs = (Spring(0, 0, 1.0), Spring(0, 5, -1.0))
+    springs = (Spring(0, 0, 1.0), Spring(0, 5, 0.0))
     keys = {key for key, _ in cell_problems((1.0, -1.0), springs, 1, 1)}
     assert keys == {"masses[2]", "springs[1]", "springs[2].stiffness", "springs[2]", "contact"}
     assert cell_problems(diatomic().masses, diatomic().springs, 0, 1) == []

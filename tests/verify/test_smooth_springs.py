@@ -231,11 +231,11 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
     [
         ({"nfrc": {"source": "wave", "range": [0.5, 1.0]}}, "nfrc.source", "changes its shape as it travels"),
         ({"nfrc": DUFFING["nfrc"] | {"harmonics": 2000}}, "nfrc.harmonics", "unknown harmonics"),
-        ({"lattice": TWO_MASSES["lattice"]}, "contacts.sites", "a spring that is not linear"),
+        ({"lattice": TWO_MASSES["lattice"]}, "output.points", "name the masses"),
     ],
 )
 def test_refusals(changes, key, reason):
-    """A wave, too many unknowns, and a linear lattice without contacts are refused with their reasons."""
+    """A wave, too many unknowns, and a linear lattice of which no mass is named are refused with their reasons."""
     table = chain_of(2, {"cubic": 1.0})
     if "source" in changes.get("nfrc", {}) and changes["nfrc"]["source"] == "wave":
         table = table | {"lattice": {name: value for name, value in table["lattice"].items() if name != "damping"}}

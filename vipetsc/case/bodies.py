@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from vipetsc.case.case_file import Problem
 from vipetsc.lattice import Chain, contacts
-from vipetsc.lattice.cell import connected_groups
+from vipetsc.lattice.cell import GROUND, connected_groups
 
 
 def contact_ends(chain: Chain) -> list[tuple[int, int]]:
@@ -16,12 +16,18 @@ def contact_ends(chain: Chain) -> list[tuple[int, int]]:
 def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
     """The body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
 
-    Springs, which are all within cells, join the masses of a body, and so do contacts that are pressed at rest.
-    ``gaps`` are the clearances in m of the sites on both sides.
+    Springs, which are all within cells or to the ground, join the masses of a body, and so do contacts that are pressed
+    at rest. ``gaps`` are the clearances in m of the sites on both sides.
     """
     d = chain.cell.dofs
     pressed = [ends for ends, gap in zip(contact_ends(chain), gaps, strict=True) if min(gap) < 0]
-    sprung = [(1 + cell * d + s.start, 1 + cell * d + s.end) for cell in range(chain.cells) for s in chain.cell.springs]
+    sprung = []
+    for cell in range(chain.cells):
+        for spring in chain.cell.springs:
+            start = 0
+            if spring.start != GROUND:
+                start = 1 + cell * d + spring.start
+            sprung.append((start, 1 + cell * d + spring.end))
     # A node is joined to itself, so that there is a pair where nothing else is joined.
     return connected_groups(1 + chain.cells * d, ((0, 0), *sprung, *pressed))
 

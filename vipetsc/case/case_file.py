@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import tomli_w
 
+from vipetsc.case.cell_matrices import with_matrices
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_parts
 from vipetsc.case.reading import LARGEST as LARGEST
 from vipetsc.case.reading import Table as Table
@@ -161,6 +162,10 @@ class CaseFile(Section):
         name = table.get("name", "case")
         problems += _check_name(name)
 
+        table, unread = with_matrices(table)
+        # Without its cell a case has no other sense: only the matrices are reported.
+        if unread:
+            raise CaseError(problems + unread, source)
         table, wrong = with_parts(table)
         plugins: PluginsTable | None = None
         mistyped: list[Problem] = []

@@ -124,6 +124,11 @@ def _check_place(
     if lattice.ends != "fixed":
         remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
+    if lattice.cell and lattice.cell.matrices:
+        remedy = (
+            "a wall moves all degrees of freedom of its cell alike, which rotations do not; give drive.cell and mass"
+        )
+        yield Problem(f"{path}.end", drive.end, remedy)
     if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.offset):
         yield Problem(
             f"{path}.end", drive.end, "a wall can only move a linear spring: remove damping, quadratic and cubic"

@@ -8,6 +8,7 @@ import numpy as np
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.model import Model
 from vipetsc.lattice import UnitCell, wave_bands
+from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.chain import Pair
 from vipetsc.wording import MOST_SHOWN, counted, shortened
 
@@ -20,6 +21,7 @@ ROW = 62.0  # between rows
 RADIUS = 15.0  # of a mass
 MARGIN = 28.0  # around the centres of the outermost masses
 COILS = 7
+MOST_DRAWN = 24  # springs of a cell: a cell from matrices has more
 COIL_HEIGHT = 5.0  # from the line between the masses to a turn
 STYLE = {
     "spring": 'fill="none" stroke="#666" stroke-width="1.3"',
@@ -62,7 +64,10 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
     if model.initial:
         rows.append(("begins with", model.initial.describe()))
     rows += [("drive", "; ".join(drives) or "none"), ("end", f"{model.end:.5g} s, {model.samples} samples")]
-    return html_table(name, rows, cell_svg(cell, pair))
+    drawing = ""
+    if len(cell.springs) <= MOST_DRAWN:
+        drawing = cell_svg(cell, pair)
+    return html_table(name, rows, drawing)
 
 
 def _band_edges(cell: UnitCell) -> list[str]:
@@ -84,15 +89,21 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
     next_places = [_moved(place, shift) for place in places]
     parts = []
     beyond = set()  # masses of the next cell that are drawn
+    grounds = []  # places on the ground, below the masses that springs tie to it
     for spring in cell.springs:
         end = places[spring.end]
         if spring.offset:
             end = next_places[spring.end]
             beyond.add(spring.end)
-        parts.append(_zigzag(places[spring.start], end))
+        if spring.start == GROUND:
+            grounds.append(_moved(end, 0.0, ROW))
+            parts.append(_zigzag(grounds[-1], end))
+        else:
+            parts.append(_zigzag(places[spring.start], end))
+    parts += [_ground(place) for place in grounds]
 
     top = min(y for _, y in places) - MARGIN
-    height = MARGIN - top
+    height = max([y for _, y in grounds], default=0.0) + MARGIN - top
     if pair is not None:
         resonator = places[pair.resonator]
         if pair.offset:
@@ -102,7 +113,7 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
         if pair.host < 0:
             # The ground, below the mass that it stops.
             host = _moved(places[pair.resonator], 0.0, ROW)
-            height += ROW
+            height = max(height, host[1] + MARGIN - top)
         parts.append(_stops(host, resonator))
 
     parts += [_mass(next_places[mass], "", STYLE["next"]) for mass in sorted(beyond)]
@@ -121,7 +132,7 @@ def _places(cell: UnitCell) -> list[Point]:
     """The place of each mass: masses on the way through the cell form a row, others are above one that they join."""
     joined: dict[int, list[int]] = {mass: [] for mass in range(cell.dofs)}
     for spring in cell.springs:
-        if not spring.offset:
+        if not spring.offset and spring.start != GROUND:
             joined[spring.start].append(spring.end)
             joined[spring.end].append(spring.start)
 
@@ -202,6 +213,13 @@ def _zigzag(begin: Point, end: Point) -> str:
     points.append(start + along)
     text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     return f'<polyline points="{text}" {STYLE["spring"]}/>'
+
+
+def _ground(place: Point) -> str:
+    """The ground at the foot of a spring."""
+    x, y = place
+    points = f"{x - RADIUS:.1f},{y:.1f} {x + RADIUS:.1f},{y:.1f}"
+    return f'<polyline points="{points}" {STYLE["stop"]}/>'
 
 
 def _stops(host: Point, resonator: Point) -> str:

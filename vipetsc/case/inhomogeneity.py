@@ -94,6 +94,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], 
     """
     arrays = _arrays(Chain(cell, lattice.cells), 0, lattice.cells)
     problems: list[Problem] = []
+    negative = {name for name in ("stiffness", "damping", "grounding") if arrays[name].min(initial=0.0) < 0}
 
     def put(key: str, path: str, change: Callable[[np.ndarray], tuple[np.ndarray, str]]) -> None:
         """Put what ``change`` makes of the values (cells,) of the quantity ``key`` in their place."""
@@ -105,6 +106,12 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], 
             return
 
         name, index = place
+        if name in negative:
+            remedy = (
+                "some springs or dashpots of the cell are negative: whether cells that differ are stable is not known"
+            )
+            problems.append(Problem(path, None, f"{remedy}; omit it"))
+            return
         # A view into the array of all cells, which the change is written into.
         column = arrays[name][:, index]
         column[:], wrong = change(column.copy())

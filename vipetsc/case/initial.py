@@ -1,6 +1,5 @@
 """The section ``[initial]`` of a run: the motion at t = 0, and the numbers that follow from it."""
 
-import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from pydantic import Field
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
 from vipetsc.case.section import described
-from vipetsc.io.names import resolved_path
+from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
@@ -358,9 +357,3 @@ def _check_state(state: State, path: Path, initial: InitialTable, chain: Chain) 
     for key, value in (("time", initial.time), ("orbit", initial.orbit)):
         if value is not None and getattr(state, key) is None:
             raise CaseError([Problem(f"initial.{key}", value, f"{path.name} has no such sample or orbit")])
-
-
-def file_hash(path: str | Path) -> str:
-    """The SHA-256 of a file."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

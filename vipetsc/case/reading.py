@@ -32,10 +32,10 @@ from vipetsc.wording import nearest
 # both are ordinary numbers, while products of seven overflow or vanish.
 LARGEST = 1e50
 ITEM = re.compile(r"(.+)\[([1-9]\d*)\]")  # an entry of a list, as in masses[2]
-# Keys that name a file: `drive.samples.file` and `initial.path`, which sweeps and searches may vary, and the `file` of
-# `identify.records`.
-SECTIONS_WITH_FILES = "drive", "initial", "sweep", "optimise", "identify"
-KEYS_OF_FILES = "file", "path"
+# Keys that name a file: `lattice.cell.matrices`, `drive.samples.file` and `initial.path`, which sweeps and searches may
+# vary, and the `file` of `identify.records`.
+SECTIONS_WITH_FILES = "lattice", "drive", "initial", "sweep", "optimise", "identify"
+KEYS_OF_FILES = "matrices", "file", "path"
 MISSING = "no such file, neither in the folder of the case file nor in the current one"
 Table = dict[str, Any]  # a parsed TOML table
 AnySection = TypeVar("AnySection", bound=Section)

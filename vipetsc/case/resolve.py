@@ -26,6 +26,7 @@ from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.waveforms import DEFAULT, is_sine
 from vipetsc.lattice import Chain, UnitCell, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
+from vipetsc.lattice.chain import unstable_key
 
 # A key of a case file takes the place of these keys of the preset, which would contradict it.
 REPLACES = {
@@ -174,6 +175,9 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         return None, problems
 
     cell = lattice.unit_cell()
+    problems += _check_stability(lattice, cell)
+    if problems:
+        return None, problems
     # The section of contacts decides about cells that contacts join: see ``check_pairs``.
     if not cell.joins_cells:
         return cell, problems
@@ -190,6 +194,24 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         remedy = "add springs, or a spring with next_cell; a soft one leaves the flights nearly free"
         problems.append(Problem("lattice.cell.springs", None, f"{what} ({why}): {remedy}"))
     return cell, problems
+
+
+def _check_stability(lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
+    """Problems with negative springs and dashpots of a ``cell``, and with ends that its matrices do not have."""
+    of_matrices = lattice.cell is not None and lattice.cell.matrices is not None
+    if of_matrices and lattice.ends == "free" and cell.is_grounded:
+        # Cut springs leave the ground springs by which a bent or a turned structure is not strained.
+        remedy = 'the matrices pull to the ground, as those with rotations do: use "fixed" or "periodic"'
+        yield Problem("lattice.ends", "free", remedy)
+        return
+    key = unstable_key(cell, lattice.ends, lattice.cells)
+    if key is None:
+        return
+    remedy = "is negative, and other springs and dashpots do not outweigh it: the lattice is unstable at rest"
+    if of_matrices:
+        key = "matrices"
+        remedy = "K or C is not positive semidefinite in the lattice; write all digits, and check signs and boundary"
+    yield Problem(f"lattice.cell.{key}", None, remedy)
 
 
 def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:

@@ -7,11 +7,10 @@ import h5py
 import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
-from vipetsc.case.initial import file_hash
 from vipetsc.case.reading import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.case.section import described
-from vipetsc.io.names import resolved_path
+from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.tables import read_table
 from vipetsc.lattice.drive import Interpolation
 

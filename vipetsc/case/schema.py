@@ -125,14 +125,14 @@ PRESETS: dict[str, Preset] = {
 
 
 class SpringTable(Section):
-    """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``, and a dashpot.
+    """A spring from mass ``start`` (1-based; 0: ground) to ``end``, of the next cell if ``next_cell``, and a dashpot.
 
     Its force at the elongation z is ``stiffness`` z + ``quadratic`` z^2 + ``cubic`` z^3.
     """
 
-    start: int = described("mass at one end")
+    start: int = described("mass at one end; 0 is the ground")
     end: int = described("mass at the other end")
-    stiffness: Finite = described("stiffness", unit="N/m")
+    stiffness: Finite = described("stiffness; negative where the lattice stays stable", unit="N/m")
     next_cell: bool = described("whether `end` is in the next cell", False)
     damping: Finite | None = described("constant of a dashpot parallel to the spring", None, unit="N s/m")
     quadratic: Finite | None = described(
@@ -156,7 +156,10 @@ class SpringTable(Section):
 
 
 class CellTable(Section):
-    """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground."""
+    """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground.
+
+    Instead of masses, springs and dashpots, ``matrices`` names files that have them (``vipetsc.case.cell_matrices``).
+    """
 
     masses: list[Finite] = described("masses of the cell, numbered from 1", unit="kg", min_length=1)
     springs: list[SpringTable] = described("springs of the cell", [])
@@ -164,6 +167,16 @@ class CellTable(Section):
         "host and resonator, the two masses with stops between them", None, min_length=2, max_length=2
     )
     grounding: list[Finite] | None = described("dashpot from each mass to ground", None, unit="N s/m")
+    matrices: Annotated[str | list[str], BY_SHAPE] | None = described(
+        "NPZ file with the matrices M, K and perhaps C of the cell, or a list of MatrixMarket files of these; masses,"
+        " springs and grounding are filled in",
+        None,
+    )
+    boundary: list[list[int]] | None = described(
+        "rows of the matrices on the left boundary, and those on the right one, which is the left one of the next cell",
+        None,
+    )
+    sha256: list[str] | None = described("SHA-256 hashes of the files of matrices, filled in", None)
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""

@@ -112,6 +112,12 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
 
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
+        if spring.start < 0:
+            moved = y[spring.end * n + first :][: energies.size]
+            for i in range(energies.size):
+                energies[i] += 0.5 * spring.stiffness * moved[i] * moved[i]
+            continue
+
         # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
         leaves = spring.offset == 1 and first + energies.size == n
         inside = energies.size - leaves

@@ -9,9 +9,9 @@ import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
-from vipetsc.case.initial import file_hash
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
+from vipetsc.io.names import file_hash
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain
 from vipetsc.lattice.modes import mode_shape

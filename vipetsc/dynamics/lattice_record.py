@@ -12,6 +12,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import SITE_DOFS, create_site_dofs, site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
 from vipetsc.lattice import Chain
+from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.drive import PIECE
 from vipetsc.lattice.topology import NONE
 from vipetsc.records import Record, record_type
@@ -19,18 +20,19 @@ from vipetsc.records import Record, record_type
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
-"""A spring as one of its masses sees it: cells to the other mass, that mass, N/m, the spring's number."""
+"""A spring as one of its masses sees it: cells to the other mass, that mass (-1: ground), N/m, the spring's number."""
 NONLINEAR = np.dtype(
     [(name, np.int64) for name in ("mass", "offset", "other", "law", "stride")] + [("sign", np.float64)]
 )
 """A nonlinear spring as one of its masses sees it: ``mass``, and the ``other`` mass, which is ``offset`` cells further.
 
+``other`` is -1 for the ground.
 ``law`` is the number of its law in the rank's first cell, ``stride`` the step from a cell's law to the next cell's, 0
 if all have one. ``sign`` is 1 where ``mass`` is the spring's ``start`` and -1 where it is its ``end``: the elongation
 is ``sign`` times the displacement of the other mass less that of this one.
 """
 SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("offset", np.int64), ("stiffness", np.float64)])
-"""A spring of the cell: its masses, of which ``end`` is ``offset`` cells further, N/m."""
+"""A spring of the cell: its masses, ``end`` being ``offset`` cells further and ``start`` -1 for the ground; N/m."""
 
 
 class Shape(NamedTuple):
@@ -183,7 +185,8 @@ def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.n
     for row, number in enumerate(numbers.tolist()):
         spring = chain.cell.springs[number]
         own_law = row * per_spring + stride
-        couplings.append((spring.start, spring.offset, spring.end, own_law, stride, 1.0))
+        if spring.start != GROUND:
+            couplings.append((spring.start, spring.offset, spring.end, own_law, stride, 1.0))
         # The law of a spring from the cell before is stored with that cell.
         couplings.append((spring.end, -spring.offset, spring.start, own_law - stride * spring.offset, stride, -1.0))
     laws = np.zeros(len(numbers) * per_spring, SPRING_LAW)

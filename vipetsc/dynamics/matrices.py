@@ -58,12 +58,13 @@ class LatticeMatrices:
         first_row = self.start * chain.cell.dofs
         self.mass = self._matrix(diags([masses.ravel()], [first_row], (masses.size, self.rows), format="csr"))
 
-        # A row's circle reaches from 0 to twice the sum of the springs at its mass.
+        # A row's circle reaches from 0 to twice the sum of the springs at its mass, of which negative ones only make it
+        # smaller.
         owned = self.stop - self.start
         reaches = np.zeros_like(masses)
         for coupling in chain.cell.couplings():
             springs = coefficients.stiffness[1 + min(coupling.offset, 0) :][:owned, coupling.spring]
-            reaches[:, coupling.mass] += 2 * springs
+            reaches[:, coupling.mass] += 2 * np.maximum(springs, 0.0)
         reaches += 2 * joined.diagonal(first_row).reshape(masses.shape)
         self.largest = comm.allreduce(float(np.max(reaches / masses, initial=0.0)), MPI.MAX)
 

@@ -18,11 +18,12 @@ from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.lattice import Chain, Spring
+from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.chain import Pair
 
 
 class _SpringAtPoint(NamedTuple):
-    """A spring at a point: column and mass of its other end (column -1: a wall), N/m, N s/m, the spring.
+    """A spring at a point: column and mass of its other end (column -1: a wall or the ground), N/m, N s/m, the spring.
 
     ``direction`` is 1 where the point is the spring's start, -1 where it is its end.
     """
@@ -97,7 +98,7 @@ class PointMotion:
             if chain.ends == "free" and not is_inside:
                 continue
             column = -1
-            if is_inside:
+            if is_inside and coupling.other != GROUND:
                 column = int(np.searchsorted(self.cells, other))
 
             # A spring between cells belongs to the left one.

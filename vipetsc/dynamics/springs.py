@@ -45,6 +45,14 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
 
 
 @kernel
+def _far_end(y: np.ndarray, lattice: LatticeRecord, coupling: Any, cell: int, half: int) -> float:
+    """Displacement in m of the other end of a ``coupling`` of ``cell``, with ``half`` = dofs its velocity in m/s."""
+    if coupling.other < 0:
+        return 0.0
+    return displacement(y, lattice, cell + coupling.offset, half + coupling.other)
+
+
+@kernel
 def is_varied(lattice: LatticeRecord) -> bool:
     """Whether each cell has its own masses, springs and dashpots."""
     return lattice.inverse_masses.size > 0
@@ -90,10 +98,10 @@ def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass:
         if _is_beyond_free_end(lattice, other_cell):
             continue
         entry = _table_entry(lattice, coupling, cell)
-        difference = displacement(y, lattice, other_cell, coupling.other) - y[mass * n + cell]
+        difference = _far_end(y, lattice, coupling, cell, 0) - y[mass * n + cell]
         force += lattice.stiffness[entry] * difference
         if is_damped:
-            rate = displacement(y, lattice, other_cell, d + coupling.other) - y[(d + mass) * n + cell]
+            rate = _far_end(y, lattice, coupling, cell, d) - y[(d + mass) * n + cell]
             force += lattice.damping[entry] * rate
 
     if is_damped:
@@ -118,7 +126,7 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
         other_cell = cell + coupling.offset
         if _is_beyond_free_end(lattice, other_cell):
             continue
-        force += coupling.stiffness * (displacement(y, lattice, other_cell, coupling.other) - here)
+        force += coupling.stiffness * (_far_end(y, lattice, coupling, cell, 0) - here)
     return force * lattice.masses[mass].inverse_mass
 
 
@@ -134,6 +142,20 @@ def _add_varied_springs(forces: np.ndarray, other: np.ndarray, here: np.ndarray,
     """Add to the ``forces`` as ``_add_equal_springs``, with a factor of each cell: stiffness, or damping of rates."""
     for i in range(forces.size):
         forces[i] += factors[i] * (other[i] - here[i])
+
+
+@kernel
+def _add_equal_ground(forces: np.ndarray, here: np.ndarray, stiffness: float) -> None:
+    """Add to the ``forces`` in N those of one spring to the ground, -k u, in consecutive cells."""
+    for i in range(forces.size):
+        forces[i] -= stiffness * here[i]
+
+
+@kernel
+def _add_varied_ground(forces: np.ndarray, here: np.ndarray, factors: np.ndarray) -> None:
+    """Add to the ``forces`` as ``_add_equal_ground``, with a factor of each cell: stiffness, or damping of rates."""
+    for i in range(forces.size):
+        forces[i] -= factors[i] * here[i]
 
 
 @kernel
@@ -154,6 +176,11 @@ def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, firs
         coupling = lattice.couplings[s]
         other = coupling.other * n + coupling.offset + first
         entry = _table_entry(lattice, coupling, first)
+        if coupling.other < 0:
+            _add_varied_ground(out, here, lattice.stiffness[entry:])
+            if is_damped:
+                _add_varied_ground(out, rate, lattice.damping[entry:])
+            continue
         _add_varied_springs(out, y[other:][:count], here, lattice.stiffness[entry:])
         if is_damped:
             _add_varied_springs(out, y[velocities + other :][:count], rate, lattice.damping[entry:])
@@ -183,6 +210,9 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
         out[:] = 0.0
         for s in range(row.first, row.last):
             coupling = lattice.couplings[s]
+            if coupling.other < 0:
+                _add_equal_ground(out, here[first:stop], coupling.stiffness)
+                continue
             others = coupling.other * n + coupling.offset
             _add_equal_springs(out, y[others + first : others + stop], here[first:stop], coupling.stiffness)
         for i in range(out.size):
@@ -203,7 +233,7 @@ def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> flo
     if _is_beyond_free_end(lattice, other_cell):
         return 0.0
     here = y[coupling.mass * lattice.shape.cells + cell]
-    return coupling.sign * (displacement(y, lattice, other_cell, coupling.other) - here)
+    return coupling.sign * (_far_end(y, lattice, coupling, cell, 0) - here)
 
 
 @kernel
@@ -231,9 +261,9 @@ def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, en
         coupling = lattice.nonlinear[s]
         for i in range(energies.size):
             # ``nonlinear`` has a spring twice, once for each of its masses. It counts at its start (sign +), and if it
-            # starts in the wall on the left, where no cell is, at its end.
+            # starts in the wall on the left, where no cell is, or in the ground, at its end.
             at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
-            if coupling.sign > 0.0 or at_wall:
+            if coupling.sign > 0.0 or at_wall or coupling.other < 0:
                 law = lattice.spring_laws[coupling.law + coupling.stride * (first + i)]
                 energies[i] += nonlinear_energy(law, _elongation(y, lattice, s, first + i))
 
@@ -255,6 +285,12 @@ def add_squares(
         start = half + spring.start
         end = half + spring.end
         factors = values[s * (n + 1) + 1 + first :]
+        if spring.start < 0:
+            moved = y[end * n + first :][: sums.size]
+            for i in range(sums.size):
+                sums[i] += factors[i] * moved[i] * moved[i]
+            continue
+
         # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
         leaves = spring.offset == 1 and first + sums.size == n
         inside = sums.size - leaves

@@ -19,6 +19,7 @@ from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.spring_line import ROD, Point, draw_spring
 from vipetsc.figures.style import with_prefix
 from vipetsc.lattice import Spring, UnitCell
+from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.chain import Pair
 from vipetsc.wording import counted
 
@@ -29,6 +30,8 @@ WIDE = 1.0  # half the width of a host that holds its resonator
 TALL = 0.62  # half its height
 GAP = 0.17  # clearance as drawn
 NEXT = 0.9  # from the border of a cell to the first mass of the next one
+FOOT = 2.2 * HALF  # from the middle of a mass to the ground below it
+MOST_SPRINGS = 24  # of a cell that is drawn: a cell from matrices has more
 SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
@@ -38,6 +41,8 @@ LEGEND = "above: cell; below: clearance in mm; arrow: drive"
 def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the unit cell of the run's lattice and, below it, the lattice with ends, drive and contact sites."""
     model = Case.of(run).model()
+    if len(model.chain.cell.springs) > MOST_SPRINGS:
+        raise style.NoPicture(f"needs a cell of at most {MOST_SPRINGS} springs")
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
     draw_unit_cell(upper, model.chain.cell, tuple(dict.fromkeys(model.chain.pairs)))
@@ -196,6 +201,8 @@ def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> No
             _draw_pair(axes, layout, pair)
 
     low = min(y for _, y in layout.centre.values()) - TALL - 0.55
+    if cell.is_grounded:
+        low -= FOOT
     high = highest + 0.5
     borders = [layout.left, layout.right]
     axes.vlines(borders, low + 0.15, high - 0.1, color=style.GREY, lw=0.6, ls=style.DASHED)
@@ -242,8 +249,17 @@ def _draw_springs(axes: Axes, cell: UnitCell, layout: CellLayout, nested_pair: s
     for spring in cell.springs:
         if not spring.offset and {spring.start, spring.end} == nested_pair:
             continue
-        start = layout.end_at(spring.start)
         end = layout.end_at(spring.end)
+        if spring.start == GROUND:
+            # Beside the middle, where the spring to a mass that hangs below begins.
+            x = end.x - 0.6 * HALF
+            edge = end.y - (TALL if end.half == WIDE else HALF)
+            ground = edge - FOOT
+            draw_spring(axes, [(x, edge), (x, ground)], "")
+            axes.text(x - 0.18, ground, with_prefix(spring.stiffness, "N/m"), ha="right", va="bottom")
+            draw_wall(axes, (x - 0.3, ground - 0.2), 0.6, 0.2)
+            continue
+        start = layout.end_at(spring.start)
         text = with_prefix(spring.stiffness, "N/m")
         if spring.offset:
             # One zigzag up to the right border, and the end of that of the cell before.
@@ -291,7 +307,8 @@ def _layout(cell: UnitCell) -> CellLayout:
 
     joined = np.zeros((cell.dofs, cell.dofs), bool)
     for spring in cell.springs:
-        joined[spring.start, spring.end] |= not spring.offset
+        if spring.start != GROUND:
+            joined[spring.start, spring.end] |= not spring.offset
     through = next((s for s in cell.springs if s.offset), Spring(cell.dofs - 1, 0, 1.0, offset=1))
     # A wave comes into the cell at the end of the spring to the next cell, and leaves at its start. The numbers of
     # springs from the one and to the other have the least sum for masses on the shortest chain.

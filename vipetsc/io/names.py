@@ -1,6 +1,7 @@
 """Names of files that a case has."""
 
 import errno
+import hashlib
 from pathlib import Path
 
 
@@ -17,3 +18,9 @@ def resolved_path(text: str) -> Path:
     except (RuntimeError, ValueError) as error:
         raise OSError(errno.EINVAL, str(error)) from None
     return path
+
+
+def file_hash(path: str | Path) -> str:
+    """The SHA-256 of a file."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,8 +1,9 @@
-"""The unit cell: masses, springs within it and to the next cell, and the contact pair.
+"""The unit cell: masses, springs within it, to the next cell and to the ground, and the contact pair.
 
 A Bloch wave has u_n = U exp(i kappa n) in cell n. A spring k from mass i of cell n to mass j of cell n + o then pulls
 at i with k (U_i - U_j exp(i kappa o)), and such rows make up the Bloch stiffness K(kappa); dashpots make up C(kappa)
-likewise.
+likewise. A spring to the ground pulls with k U_i. Every symmetric matrix is one of such springs, of which some have a
+negative stiffness (``vipetsc.case.cell_matrices``).
 """
 
 from dataclasses import dataclass
@@ -15,15 +16,18 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 
 Reading = Literal["printed", "calibrated"]
+GROUND = -1
+"""The ``start`` of a spring to the ground, and the ``other`` mass of its coupling."""
 
 
 @dataclass(frozen=True)
 class Spring:
-    """A spring between two masses (0-based) of one cell, or from one cell to the next.
+    """A spring between two masses (0-based) of one cell, from one cell to the next, or from the ground to a mass.
 
     Its force at the elongation z is k z + q z^2 + c z^3: ``stiffness`` k in N/m, ``quadratic`` q in N/m^2 and ``cubic``
     c in N/m^3, which bands and modes leave out. ``damping`` in N s/m is that of a dashpot parallel to it. It runs from
-    mass ``start`` of a cell to mass ``end`` of the cell ``offset`` further, the same one (0) or the next one (1).
+    mass ``start`` of a cell, or from the ground (``GROUND``), to mass ``end`` of the cell ``offset`` further, the same
+    one (0) or the next one (1). A stiffness or a dashpot may be negative as long as the lattice is stable.
     """
 
     start: int
@@ -60,6 +64,7 @@ class Spring:
 class Coupling(NamedTuple):
     """A spring as one of its masses sees it: from ``mass`` of a cell to ``other``, which is ``offset`` cells further.
 
+    ``other`` is ``GROUND`` for a spring to the ground.
     ``stiffness`` in N/m and ``damping`` in N s/m are the spring's, ``spring`` is its number in the cell (from 0).
     """
 
@@ -109,6 +114,11 @@ class UnitCell:
         return any(spring.offset for spring in self.springs)
 
     @property
+    def is_grounded(self) -> bool:
+        """Whether a spring ties a mass to the ground."""
+        return any(spring.start == GROUND for spring in self.springs)
+
+    @property
     def is_damped(self) -> bool:
         """Whether there is a dashpot."""
         return any(self.grounding) or any(spring.damping for spring in self.springs)
@@ -119,13 +129,15 @@ class UnitCell:
         return all(spring.is_linear for spring in self.springs)
 
     def couplings(self) -> list[Coupling]:
-        """Every spring seen from both its ends.
+        """Every spring seen from both its ends; one to the ground has one.
 
         Sorted by mass and otherwise in the order of ``springs``, which fixes the order of every sum.
         """
         ends = []
         for i, s in enumerate(self.springs):
             for mass, offset, other in ((s.start, s.offset, s.end), (s.end, -s.offset, s.start)):
+                if mass == GROUND:
+                    continue
                 ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
         # Stable: couplings of one mass stay in the order of the springs.
         return sorted(ends, key=lambda c: c.mass)
@@ -153,6 +165,8 @@ class UnitCell:
         # exp(i kappa offset) times u of the same mass in this cell.
         for (mass, offset, other, *_), value in zip(self.couplings(), values, strict=True):
             k[mass, mass] += value
+            if other == GROUND:
+                continue
             if offset:
                 k[mass, other] -= value * np.exp(1j * kappa * offset)
             else:
@@ -189,15 +203,18 @@ def cell_problems(
 def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
     """All problems of a ``spring`` in a cell of ``n`` masses, as ``cell_problems``."""
     problems = []
-    if not 0 < spring.stiffness < np.inf:
-        problems.append((f"{key}.stiffness", f"stiffness {spring.stiffness!r} must be positive (N/m)"))
-    if not 0 <= spring.damping < np.inf:
-        problems.append((f"{key}.damping", f"damping {spring.damping!r} must not be negative (N s/m)"))
-    for end in (spring.start, spring.end):
-        if not 0 <= end < n:
-            problems.append((key, f"mass {end + 1} is not one of the cell's {n}"))
+    if not 0 < abs(spring.stiffness) < np.inf:
+        problems.append((f"{key}.stiffness", f"stiffness {spring.stiffness!r} must not be zero (N/m)"))
+    if not abs(spring.damping) < np.inf:
+        problems.append((f"{key}.damping", f"damping {spring.damping!r} must be a number (N s/m)"))
+    if not (0 <= spring.start < n or spring.start == GROUND):
+        problems.append((key, f"mass {spring.start + 1} is not one of the cell's {n}, nor 0, the ground"))
+    if not 0 <= spring.end < n:
+        problems.append((key, f"mass {spring.end + 1} is not one of the cell's {n}; the ground, 0, is a start"))
     if spring.offset not in (0, 1):
         problems.append((key, f"offset {spring.offset!r} must be 0 (the same cell) or 1 (the next one)"))
+    if spring.start == GROUND and spring.offset:
+        problems.append((f"{key}.next_cell", "the ground, start = 0, is in no cell; remove it"))
     if spring.start == spring.end and not spring.offset:
         problems.append((key, f"joins mass {spring.start + 1} to itself; did you mean next_cell = true?"))
     return problems
@@ -209,8 +226,8 @@ def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, s
     if len(grounding) not in (0, n):
         problems.append(("grounding", f"give one dashpot for each of the {n} masses, 0 for none"))
     for i, c in enumerate(grounding, 1):
-        if not 0 <= c < np.inf:
-            problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
+        if not abs(c) < np.inf:
+            problems.append((f"grounding[{i}]", f"damping {c!r} must be a number (N s/m)"))
     return problems
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 
-from vipetsc.lattice.cell import Spring, UnitCell
+from vipetsc.lattice.cell import GROUND, Spring, UnitCell
 from vipetsc.lattice.drive import Waveform
 from vipetsc.lattice.topology import NONE, WALL, Ends, Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
@@ -17,6 +17,11 @@ from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
 # Cells at most whose linear response is solved for, in 2 ms. With 200 or 800 in its place the scale of waves changes by
 # 5e-4 and 2.5e-4 for a burst whose frequency is almost 0, and by 1e-13 to 1e-4 for others.
 LONGEST = 400
+# Where springs are negative, stability is looked at: at so many wavenumbers; with free ends in so many cells.
+WAVENUMBERS = 65
+FEW = 8
+# An eigenvalue may be below zero by so many times the largest one, by rounding. A beam of 20 elements has -1e-14.
+ROUNDING = 1e-10
 
 
 class Pair(NamedTuple):
@@ -262,14 +267,20 @@ class Chain:
         entries = [np.zeros(0)]
         index = np.arange(start, stop, dtype=np.int64)
         for coupling in self.cell.couplings():
-            neighbour = self.topology.neighbour(index, coupling.offset)
-            inside = neighbour >= 0
-            held = neighbour != NONE  # a wall holds, and does not move
+            # The cell in which the spring begins, as a row of ``values``: this one's is 1.
             # The cell in which the spring begins, as a row of ``values``: this one's is 1.
             owner = 1 + min(coupling.offset, 0)
             value = values[owner : owner + stop - start, coupling.spring]
-
             here = index * d + coupling.mass
+            if coupling.other == GROUND:
+                rows.append(here - start * d)
+                columns.append(here)
+                entries.append(value)
+                continue
+
+            neighbour = self.topology.neighbour(index, coupling.offset)
+            inside = neighbour >= 0
+            held = neighbour != NONE  # a wall holds, and does not move
             rows += [here[held] - start * d, here[inside] - start * d]
             columns += [here[held], neighbour[inside] * d + coupling.other]
             entries += [value[held], -value[inside]]
@@ -332,3 +343,34 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
     # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow as they run along it.
     order = "MMD_AT_PLUS_A" if chain.topology.is_ring else "COLAMD"
     return float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
+
+
+@lru_cache(maxsize=64)
+def unstable_key(cell: UnitCell, ends: Ends, cells: int) -> str | None:
+    """The key of the first negative spring or dashpot of a ``cell`` that others do not outweigh; None if they do.
+
+    With walls and on a ring the motions are sums of Bloch waves, whose energy, by K(kappa), and loss, by C(kappa), must
+    not be negative. A free end has motions of its own, near it: a lattice of a few cells has them.
+    """
+    springs = list(enumerate(cell.springs, 1))
+    stiffness = {f"springs[{i}].stiffness": spring.stiffness for i, spring in springs}
+    damping = {f"springs[{i}].damping": spring.damping for i, spring in springs}
+    damping |= {f"grounding[{i}]": value for i, value in enumerate(cell.grounding, 1)}
+    free = Chain(cell, min(cells, FEW), "free")
+    n = free.cells
+
+    for values, waves, rows in (
+        (stiffness, cell.stiffness_matrix, free.stiffness_rows),
+        (damping, cell.damping_matrix, free.damping_rows),
+    ):
+        negative = [key for key, value in values.items() if value < 0]
+        if not negative:
+            continue
+        matrices = waves(np.linspace(0, np.pi, WAVENUMBERS))
+        if ends == "free":
+            matrices = rows(0, n).toarray()
+        root = 1 / np.sqrt(np.tile(cell.masses, matrices.shape[-1] // cell.dofs))
+        squared = np.linalg.eigvalsh(matrices * (root[:, None] * root))
+        if squared.min() < -ROUNDING * squared.max():
+            return negative[0]
+    return None

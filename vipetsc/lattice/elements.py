@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.lattice.cell import Spring
+from vipetsc.lattice.cell import GROUND, Spring
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.topology import NONE, WALL, Topology
 
@@ -76,7 +76,7 @@ def nonlinear_springs(chain: Chain) -> Elements:
     springs = Elements(
         cell=cells,
         number=numbers,
-        start=np.where(before >= 0, before * dofs + start, WALL),
+        start=np.where((before >= 0) & (start != GROUND), before * dofs + start, WALL),
         end=np.where(after >= 0, after * dofs + end, WALL),
     )
     return Elements(*(column[exists] for column in springs))

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.cell import GROUND, UnitCell
 
 # |log |lambda|| below which a wave's direction is that of its energy: the root of rounding, by which the double
 # |lambda| = 1 at a band's edge is off. 5e-8 to 1e-5 sort the waves of the four-band cell alike.
@@ -66,6 +66,8 @@ def coupling_blocks(cell: UnitCell) -> Blocks:
     right = np.zeros_like(inside)
     for mass, offset, other, stiffness, *_ in cell.couplings():
         inside[mass, mass] += stiffness
+        if other == GROUND:
+            continue
         if offset == 0:
             inside[mass, other] -= stiffness
         elif offset > 0:

@@ -9,12 +9,11 @@ import h5py
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Section
-from vipetsc.case.initial import file_hash
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.reading import MISSING
 from vipetsc.case.schema import Finite, Positive, Range
 from vipetsc.case.section import BY_SHAPE, described
-from vipetsc.io.names import resolved_path
+from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.tables import TableError, read_table
 from vipetsc.wording import counted
 

@@ -64,7 +64,7 @@ def check_ground(
         yield from check_apart(bodies_of(chain, gaps), contact_ends(chain))
         return
     to_ground = any(pair.host < 0 for pair in chain.contact_pairs)
-    if not to_ground or has_walls(nfrc, lattice):
+    if not to_ground or has_walls(nfrc, lattice) or chain.cell.is_grounded:
         return
     if nfrc.infinite:
         reason = "a mean force of the ground moves an infinite lattice without bound, since no wall holds it"

@@ -164,10 +164,10 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 
 def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
-    """Whether springs to the walls, or a contact that is pressed to the ground, hold a lattice at rest."""
+    """Whether springs to the walls or to the ground, or a contact pressed to the ground, hold a lattice at rest."""
     # Springs tie the ends to the walls: a lattice that contacts alone join has none.
     has_walls = lattice.ends == "fixed" and cell.joins_cells
-    return has_walls or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
+    return has_walls or cell.is_grounded or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
 
 
 def rigid_motions(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> int:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.topology import NONE
 from vipetsc.lattice.variation import Coefficients
@@ -126,8 +127,11 @@ def _multiply(
     if ground is not None:
         out = -ground * x
     for spring, value in zip(neighbours.chain.cell.springs, springs.swapaxes(0, 1)[:, :, None], strict=True):
-        start = x[:, :, spring.start]
         end = x[:, :, spring.end]
+        if spring.start == GROUND:
+            out[:, :, spring.end] -= end * value
+            continue
+        start = x[:, :, spring.start]
         if spring.offset:
             pull = (np.roll(end, -1, axis=-1) - start) * (value * neighbours.acts)
             out[:, :, spring.start] += pull
@@ -146,8 +150,7 @@ class Bounds(NamedTuple):
     ``frequency`` of a mode in rad/s and its ``damping``, a rate in 1/s, are by Gershgorin's circles of M^-1/2 K M^-1/2
     and of M^-1/2 C M^-1/2. ``by_stiffness`` and ``by_damping`` (3, dof, dof) are the largest magnitudes in any cell of
     the entries of K M^-1 and C M^-1, where the other mass is in the cell before, in the same one, in the next one.
-    These are the transposes of M^-1 K and M^-1 C, by which rows are multiplied as columns. Springs and dashpots must
-    not be negative.
+    These are the transposes of M^-1 K and M^-1 C, by which rows are multiplied as columns.
     """
 
     frequency: float
@@ -212,15 +215,19 @@ def _matrix_bounds(
     cells = len(masses) - 2
     inner = slice(1, cells + 1)
     root = 1 / np.sqrt(masses)
-    diagonal = ground[inner] / masses[inner]
+    # Magnitudes, since a spring or a dashpot may be negative.
+    diagonal = np.abs(ground[inner]) / masses[inner]
     circles = diagonal.copy()
     entries = np.zeros((3, chain.cell.dofs, chain.cell.dofs))
     for mass, offset, other, _, _, spring in chain.cell.couplings():
         near = slice(1 + offset, cells + 1 + offset)
         # A spring to the cell before is stored with that cell.
-        value = springs[1 + min(offset, 0) :][:cells, spring]
-        circles[:, mass] += value * root[inner, mass] * (root[inner, mass] + root[near, other])
+        value = np.abs(springs[1 + min(offset, 0) :][:cells, spring])
         diagonal[:, mass] += value / masses[inner, mass]
+        if other == GROUND:
+            circles[:, mass] += value / masses[inner, mass]
+            continue
+        circles[:, mass] += value * root[inner, mass] * (root[inner, mass] + root[near, other])
         entries[1 + offset, mass, other] += (value / masses[near, other]).max()
     entries[1] += np.diag(diagonal.max(axis=0))
     return float(circles.max()), entries
