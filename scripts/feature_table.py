@@ -308,6 +308,11 @@ FEATURES: tuple[Feature, ...] = (
         scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}, "predict": {"predict": {"amplitudes": [1e-4]}}},
     ),
     Feature(
+        "moved wall, dashpots",
+        {"lattice": {"damping": {"stiffness": 1e-7}}, "drive": {"end": "left", "cell": None, "amplitude": 1e-4}},
+        scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}, "predict": {"predict": {"amplitudes": [1e-4]}}},
+    ),
+    Feature(
         "several drives",
         {"drive": {"more": [SECOND_DRIVE]}},
         # All have the period of the steady state; against the first force, so that the range begins without contact.

@@ -30,4 +30,5 @@ def unrecorded_samples(lattice: LatticeRecord, goal: int) -> Samples:
         forces=np.zeros((0, 0)),
         motion=np.zeros((0, 0, 0)),
         watched=np.zeros(0, np.int64),
+        spent=np.zeros((0, 0)),
     )

@@ -34,6 +34,7 @@ CHANGES = {
     "initial motion": ({"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}}, "initial.kind"),
     "many drives": ({"drive": {"more": [{"frequency": 1000.0, "cell": 2}]}}, "drive.more"),
     "moved wall": ({"drive": {"end": "left"}}, "drive.end"),
+    "damped wall": ({"drive": {"end": "left"}, "lattice": {"damping": {"stiffness": 1e-7}}}, "drive.end"),
     # The chirp is narrow in frequency, since ``predict`` refuses other waves.
     "other waveforms": (
         {"drive": {"waveform": "chirp", "frequency": 1000.0, "bandwidth": 100.0, "duration": 0.2}},

@@ -12,7 +12,7 @@ import xarray as xr
 from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
 from vipetsc.case.identify import IdentifyCase, RecordTable, SensorTable, read_measured
-from vipetsc.case.identify import measured as measured_module
+from vipetsc.io import tables
 from vipetsc.studies.further_sensor import _further_sensor
 from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples, parameter_lines
 
@@ -395,7 +395,7 @@ def test_bad_data_sets_are_one_clear_error(tmp_path, column, changes, key, part)
 
 
 def test_the_size_of_a_data_set_is_checked_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(measured_module, "MOST_NUMBERS", 19)
+    monkeypatch.setattr(tables, "MOST_NUMBERS", 19)
     with h5py.File(tmp_path / "record.h5", "w") as file:
         file["v"] = np.arange(20.0)
     problems = problems_of({"file": str(tmp_path / "record.h5"), "rate": 1e3, "sensors": [SENSOR]})

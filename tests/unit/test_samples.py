@@ -37,10 +37,7 @@ def file(tmp_path: Path) -> Path:
 
 def test_the_size_of_a_data_set_is_checked_before_it_is_read(file):
     """Sixteen terabytes of samples are refused by their number, which no memory could hold."""
-    assert (
-        f"holds (1000000000000, 2) numbers; give time and value in two columns, with at most {MOST_SAMPLES} rows"
-        in refusal(file=str(file), dataset="endless")
-    )
+    assert "holds (1000000000000, 2) numbers" in refusal(file=str(file), dataset="endless")
 
 
 def test_what_is_no_table_of_two_columns_is_refused(file):

@@ -28,7 +28,9 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
         # The waves of springs at one wall interfere, so that their energies do not add: they are one source.
         load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
         # A wall's motion is a force of that motion times the spring's stiffness.
-        load[drive.mass] += drive.stiffness or 1.0
+        # That of a dashpot is out of phase, and is left out: it is small beside that of the spring.
+        if not drive.damping:
+            load[drive.mass] += drive.scale
     sources = []
     for (waveform, place), load in loads.items():
         sources.append(Source(cell, ends, cells=cells, place=place, load=load, waveform=waveform))

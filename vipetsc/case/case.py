@@ -187,9 +187,10 @@ class Case(CaseFile):
         """
         scale = 0.0
         for drive in drives:
-            # A wall's drive is a displacement: its force is that times the stiffness of the spring to it.
+            # A wall's drive is a displacement, by which springs and dashpots pull.
             if drive.waveform.amplitude:
-                scale += chain.wave_scale(drive.waveform, drive.cell, drive.mass) * (drive.stiffness or 1.0)
+                wave = chain.wave_scale(drive.waveform, drive.cell, drive.mass)
+                scale += wave * drive.force_per_amplitude
         if self.initial:
             scale = max(scale, self.initial.amplitude or 0.0)
         return scale

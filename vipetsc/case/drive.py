@@ -106,7 +106,10 @@ def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterato
         yield Problem(f"{path}.samples.time", None, "must increase from sample to sample and start at 0 s or later")
     elif not values.any():
         yield Problem(f"{path}.samples.value", None, "are all zero")
-    elif drive.end and values[0] != 0:
+    elif samples.derivative and drive.end is None:
+        remedy = "only a wall that moves is measured by it; give drive.end, or the force"
+        yield Problem(f"{path}.samples.quantity", samples.quantity, remedy)
+    elif drive.end and values[0] != 0 and not samples.derivative:
         yield Problem(f"{path}.samples.value", float(values[0]), "an end starts at rest: the first value must be 0")
 
 
@@ -129,10 +132,8 @@ def _check_place(
             "a wall moves all degrees of freedom of its cell alike, which rotations do not; give drive.cell and mass"
         )
         yield Problem(f"{path}.end", drive.end, remedy)
-    if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.offset):
-        yield Problem(
-            f"{path}.end", drive.end, "a wall can only move a linear spring: remove damping, quadratic and cubic"
-        )
+    if cell and not all(spring.is_linear for spring in cell.springs if spring.offset):
+        yield Problem(f"{path}.end", drive.end, "a wall can only move a linear spring: remove quadratic and cubic")
     if cell and not cell.joins_cells:
         remedy = "a wall moves the springs from cell to cell that end at it, but the cell has none"
         yield Problem(f"{path}.end", drive.end, remedy)
@@ -308,14 +309,13 @@ def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
     if drive.end is None:
         return [Drive(waveform, drive.cell - 1, drive.mass - 1)]
 
+    # The springs to the left wall belong to the cell before the first one, which does not vary; those to the right wall
+    # are the last cell's, which profiles and scatter may change.
+    cell, of_springs = {"left": (0, -1), "right": (chain.cells - 1, chain.cells - 1)}[drive.end]
     built: list[Drive] = []
-    last = chain.cells - 1
     for mass, number in _end_masses(chain.cell, drive.end):
-        if drive.end == "left":
-            # The spring to the left wall belongs to the cell before the first one, which does not vary.
-            built.append(Drive(waveform, 0, mass, float(chain.cell.springs[number].stiffness)))
-        else:
-            # The spring to the right wall is the last cell's, which profiles and scatter may change.
-            stiffness = chain.coefficients(last, last + 1).stiffness[0, number]
-            built.append(Drive(waveform, last, mass, float(stiffness)))
+        spring = chain.spring(of_springs, number)
+        built.append(Drive(waveform, cell, mass, stiffness=spring.stiffness))
+        if spring.damping:
+            built.append(Drive(waveform, cell, mass, damping=spring.damping))
     return built

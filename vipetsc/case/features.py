@@ -27,6 +27,7 @@ FEATURES = {
     "initial motion": "remove [initial]",
     "many drives": "remove [[drive.more]]",
     "moved wall": "remove drive.end",
+    "damped wall": "remove the dashpots of springs to the next cell, stiffness-proportional damping included",
     # Waveforms that the class does not list in ``waveforms``.
     "other waveforms": "`run` accepts every waveform",
     "disorder": "remove [disorder]",
@@ -56,7 +57,8 @@ def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) ->
     if "drive" in sections:
         yield from _other_drives(kind, sections["drive"])
     if "lattice" in sections and valid("lattice"):
-        yield from _other_lattices(kind, sections["lattice"])
+        moves_wall = "drive" in sections and any(one.end for _, one in sections["drive"].every)
+        yield from _other_lattices(kind, sections["lattice"], moves_wall)
 
 
 def _refusal(kind: type[CaseFile], feature: str, key: str, value: Any = None) -> Iterator[Problem]:
@@ -91,7 +93,7 @@ def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
             yield from _refusal(kind, "other waveforms", f"{path}.waveform", one.kind)
 
 
-def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Problem]:
+def _other_lattices(kind: type[CaseFile], lattice: LatticeTable, moves_wall: bool) -> Iterator[Problem]:
     """Problems of unlike cells, nonlinear springs, dashpots and rings."""
     for key, feature in UNLIKE_CELLS.items():
         if getattr(lattice, key):
@@ -104,5 +106,7 @@ def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Pro
             yield from _refusal(kind, "nonlinear springs", key)
         if cell.is_damped:
             yield from _refusal(kind, "damping", "lattice", "damped")
+        if moves_wall and any(spring.damping for spring in cell.springs if spring.offset):
+            yield from _refusal(kind, "damped wall", "drive.end")
     if lattice.ends == "periodic":
         yield from _refusal(kind, "rings", "lattice.ends", lattice.ends)

@@ -200,9 +200,9 @@ def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
     last = lattice.cells - 1
     chain = Chain(cell, lattice.cells, lattice.ends, variation=cell_variation(lattice))
     springs = [chain.spring(last, number) for number, spring in enumerate(cell.springs) if spring.offset]
-    if all(spring.is_linear and not spring.damping for spring in springs):
+    if all(spring.is_linear for spring in springs):
         return []
-    remedy = f"a wall can only move a linear spring: omit damping, quadratic and cubic in cell {lattice.cells}"
+    remedy = f"a wall can only move a linear spring: omit quadratic and cubic in cell {lattice.cells}"
     return [Problem(key, "right", remedy)]
 
 

@@ -1,25 +1,34 @@
 """Samples of a drive's waveform, from a case or from a file."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import h5py
 import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.reading import MISSING
-from vipetsc.case.schema import Finite
-from vipetsc.case.section import described
+from vipetsc.case.schema import Finite, Positive
+from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.io.names import file_hash, resolved_path
-from vipetsc.io.tables import read_table
-from vipetsc.lattice.drive import Interpolation
+from vipetsc.io.tables import ColumnError, read_columns, read_table
+from vipetsc.lattice.drive import Interpolation, Joined, joined
 
 # The resolved case holds the samples, and so does every result: so many are 5 MB of text and 0.6 s to read.
 MOST_SAMPLES = 100_000
+WALL_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
+"""Units of the quantities by which the motion of a wall is measured, in the order of its derivatives."""
+
+Place = Annotated[int | str, BY_SHAPE]
+"""Of a column (``io.tables``): its number from 1, or its name."""
 
 
 class SamplesTable(Section):
-    """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``."""
+    """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``.
+
+    Other files have them in the ``columns`` of time and value, or of value alone at a ``rate``. The values of a wall
+    that moves may be its velocity or acceleration, the ``quantity``.
+    """
 
     file: str | None = described(
         "CSV or text file with columns of time and value, or an HDF5 file; a relative path: in the folder"
@@ -27,6 +36,15 @@ class SamplesTable(Section):
         None,
     )
     dataset: str | None = described("dataset of shape (sample, 2) in an HDF5 file", None)
+    columns: list[Place] | None = described(
+        "columns of time and value, or of the value alone with a `rate`: names or numbers from 1; of HDF5 datasets,"
+        " with [3] behind a name its third column",
+        None,
+        min_length=1,
+        max_length=2,
+    )
+    rate: Positive | None = described("sample rate, instead of a column of times", None, unit="Hz")
+    time_factor: Positive | None = described("factor that makes the times of the file seconds", None)
     sha256: str | None = described("SHA-256 hash of the file, filled in", None)
     time: list[Finite] = described("times of the samples, instead of a file", [], unit="s", max_length=MOST_SAMPLES)
     value: list[Finite] = described(
@@ -37,6 +55,42 @@ class SamplesTable(Section):
         " cubic spline, for smooth and evenly sampled waveforms",
         "monotone",
     )
+    quantity: Literal["displacement", "velocity", "acceleration"] | None = described(
+        "what the values are of a wall that moves; velocity and acceleration are integrated (default: displacement)",
+        None,
+    )
+    drift: Literal["remove", "keep"] | None = described(
+        "of a velocity or an acceleration: whether an offset, of an acceleration also a drift in proportion to time, is"
+        " removed, so that the wall ends at rest where it began (default: remove)",
+        None,
+    )
+
+    @property
+    def derivative(self) -> int:
+        """How often the wall's displacement is differentiated for the values."""
+        return list(WALL_UNITS).index(self.quantity or "displacement")
+
+    @property
+    def unit(self) -> str:
+        """The unit of the values of a wall."""
+        return WALL_UNITS[self.quantity or "displacement"]
+
+    def motion(self) -> Joined:
+        """The curve through the samples, of a wall its displacement."""
+        return joined(
+            self.time, self.value, self.interpolation, derivative=self.derivative, removes=self.drift != "keep"
+        )
+
+    def describe_removed(self, amplitude: float) -> str:
+        """A clause on the offset and the drift that are removed, in the unit of the ``amplitude``; "" if none are."""
+        names = "offset", "drift"
+        # An acceleration alone has a drift.
+        units = self.unit, "m/s^3"
+        removed = (amplitude * self.motion().removed).tolist()
+        parts = [f"{name} {value:.4g} {of}" for name, value, of in zip(names, removed, units, strict=False)]
+        if not parts:
+            return ""
+        return f"{' and '.join(parts)} removed, so that the wall ends at rest where it began"
 
 
 def with_samples(table: Table) -> tuple[Table, list[Problem]]:
@@ -72,10 +126,13 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     try:
         # The absolute path is recorded, since the resolved case is stored in a folder of results.
         file = resolved_path(samples["file"])
-        rows = _read(file, samples.get("dataset"))
+        rows = _read(file, samples)
         digest = file_hash(file)
     except FileNotFoundError:
         return drive, [Problem(key, samples["file"], MISSING)]
+    except ColumnError as error:
+        given = samples.get("columns") if error.key else samples["file"]
+        return drive, [Problem(f"{path}.samples.columns" if error.key else key, given, error.remedy)]
     # TypeError: a dataset of a type that numpy does not have.
     except (OSError, ValueError, KeyError, TypeError) as error:
         return drive, [Problem(key, samples["file"], str(error))]
@@ -86,8 +143,31 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     return drive | {"samples": samples | filled}, []
 
 
-def _read(path: Path, dataset: Any) -> np.ndarray:
+def _read(path: Path, samples: Table) -> np.ndarray:
     """Rows (sample, 2) of time in s and value; raises OSError, ValueError, KeyError or TypeError."""
+    rows = _rows(path, samples)
+    factor = samples.get("time_factor")
+    # Types are not checked yet.
+    if isinstance(factor, int | float) and rows.ndim == 2:
+        rows[:, :1] *= factor
+    _check_shape(rows.shape)
+    return rows
+
+
+def _rows(path: Path, samples: Table) -> np.ndarray:
+    """Rows (sample, 2) of time and value as the file has them, and as ``_read`` raises."""
+    dataset = samples.get("dataset")
+    columns = samples.get("columns")
+    rate = samples.get("rate")
+    if columns is not None or rate is not None:
+        places = columns if isinstance(columns, list) else [1]
+        if dataset is not None or len(places) != 1 + (rate is None):
+            raise ValueError("give samples.columns of time and value, or of the value alone with samples.rate")
+        read = read_columns(path, {f"columns[{i}]": place for i, place in enumerate(places, 1)}, MOST_SAMPLES)
+        series = list(read.values())
+        if rate is not None:
+            series.insert(0, np.arange(len(series[0])) / float(rate))
+        return np.stack(series, axis=1)
     if dataset is not None:
         with h5py.File(path, "r") as file:
             values = file[str(dataset)]
@@ -95,16 +175,14 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
                 raise ValueError(f"{dataset} is not a dataset of numbers")
             # The shape is checked before the data are read: a file may hold more than the memory.
             _check_shape(values.shape)
-            rows = np.asarray(values, float)
-    elif h5py.is_hdf5(path):
-        raise ValueError("is an HDF5 file; give samples.dataset")
-    else:
-        rows = read_table(path, MOST_SAMPLES).values
-    _check_shape(rows.shape)
-    return rows
+            return np.asarray(values, float)
+    if h5py.is_hdf5(path):
+        raise ValueError("is an HDF5 file; give samples.dataset or samples.columns")
+    return read_table(path, MOST_SAMPLES).values
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:
     """Raise ValueError for numbers of another ``shape`` than two columns of samples, no more than are allowed."""
     if len(shape) != 2 or shape[1] != 2 or shape[0] > MOST_SAMPLES:
-        raise ValueError(f"holds {shape} numbers; give time and value in two columns, with at most {MOST_SAMPLES} rows")
+        remedy = f"give the columns of time and value (samples.columns), with at most {MOST_SAMPLES} rows"
+        raise ValueError(f"holds {shape} numbers; {remedy}")

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
-from vipetsc.case.samples import SamplesTable
+from vipetsc.case.samples import WALL_UNITS, SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.case.section import described
 from vipetsc.lattice import ToneBurst, Waveform
@@ -96,15 +96,7 @@ def _build_samples(drive: "OneDrive") -> Waveform:
     assert drive.samples
     # After the last sample a wall stays where it is, and a force is 0.
     hold = drive.end is not None
-    samples = drive.samples
-    return sampled(
-        drive.amplitude,
-        samples.time,
-        samples.value,
-        frequency=_given(drive.frequency),
-        interpolation=samples.interpolation,
-        hold=hold,
-    )
+    return sampled(drive.amplitude, drive.samples.motion(), frequency=_given(drive.frequency), hold=hold)
 
 
 def _given(value: float | None) -> float:
@@ -152,7 +144,13 @@ def _describe_samples(drive: "OneDrive") -> str:
     # A spline may lie far beyond the samples: the largest value shows it.
     largest = waveform_of(drive).peak
     unit = "m" if drive.end else "N"
-    return f"{len(samples.time)} samples ({samples.interpolation}), at most {largest:.6g} {unit}"
+    text = f"{len(samples.time)} samples ({samples.interpolation}), at most {largest:.6g} {unit}"
+    if samples.derivative:
+        text += f" by the {samples.quantity}"
+        removed = samples.describe_removed(drive.amplitude)
+        if removed:
+            text += f", {removed}"
+    return text
 
 
 WAVEFORMS = {
@@ -252,7 +250,10 @@ class OneDrive(Section):
         "waveform (default: tone burst); the chapter on drives lists the keys of each", None
     )
     amplitude: Finite = described(
-        "amplitude of the force; of an impulse, its time integral; of a moving end, in m", 1.0, unit="N, N s or m"
+        "amplitude of the force; of an impulse, its time integral; of a moving end, its displacement, or factor of"
+        " the samples of its velocity or acceleration",
+        1.0,
+        unit="N, N s or m",
     )
     cycles: int = described("number of cycles of the burst", CYCLES, ge=1)
     envelope: Literal["paper", "hann"] = described("the paper's Hann window, or one of half its amplitude", "paper")
@@ -300,7 +301,14 @@ class OneDrive(Section):
         if key != "amplitude":
             return super().unit_of(key, table)
         if "end" in table:
-            return "m"
+            samples = table.get("samples")
+            quantity = None
+            # The table may have sections that are read already, and others.
+            if isinstance(samples, SamplesTable):
+                quantity = samples.quantity
+            elif isinstance(samples, dict):
+                quantity = samples.get("quantity")
+            return WALL_UNITS.get(str(quantity), "m")
         name = table.get("waveform") or DEFAULT
         # A module that registers the waveform may not be imported.
         if name in WAVEFORMS or name in PARTS[WAVEFORM]:
@@ -337,7 +345,10 @@ class OneDrive(Section):
         """A description of the resolved drive: amplitude, waveform and place."""
         about = self.record.describe(self)
         if self.end:
-            return f"{self.amplitude:g} m, {about}; {self.kind} of the {self.end} wall"
+            unit = "m"
+            if self.samples:
+                unit = self.samples.unit
+            return f"{self.amplitude:g} {unit}, {about}; {self.kind} of the {self.end} wall"
 
         size = f"{self.amplitude:g} {self.record.unit}, {about}"
         # The name and the place of the default drive are left out.

@@ -15,16 +15,17 @@ from vipetsc.lattice.drive import PIECE, Drive, Pieces
 # Fraction of a time, and of a step, within which a piece that begins has begun.
 ROUNDED = 1e-14
 
+NUMBERS = "amplitude", "frequency", "cycles", "duration", "highest", "stiffness", "damping", "inverse"
 DRIVE = np.dtype(
-    [(name, np.int64) for name in ("number", "target", "first", "last", "piece")]
-    + [(name, float) for name in ("amplitude", "frequency", "cycles", "duration", "highest", "stiffness", "inverse")]
+    [(name, np.int64) for name in ("number", "target", "first", "last", "piece")] + [(name, float) for name in NUMBERS]
 )
 """A drive: its ``number`` in the model; ``target``, the component of the state that it acts on, and ``inverse``, 1/mass
 there in 1/kg; its ``duration`` in s and its ``highest`` frequency in rad/s.
 
 A tone burst has its ``amplitude`` in N, the factor before 1 - cos, its ``frequency`` in rad/s and its ``cycles``. Other
 waveforms have the pieces ``first`` to ``last``, half open, of which ``piece`` is on, -1 if none is. ``stiffness`` in
-N/m is that of the spring to a moving wall, 0 where the drive is a force.
+N/m is that of the spring to a moving wall, 0 where the drive is a force, and ``damping`` in N s/m that of the dashpot
+to one: its force is the derivative of the waveform.
 """
 
 
@@ -49,11 +50,13 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
 
         drive = drives[number]
         wave = drive.waveform
-        # A moving wall at the end of a spring acts as a force: its displacement times the spring's stiffness.
-        factor = drive.stiffness or 1.0
+        # A moving wall at the end of a spring acts as a force: its displacement times the spring's stiffness; at the
+        # end of a dashpot its velocity times the constant, for which the kernel differentiates.
+        factor = drive.scale
         row["duration"] = wave.duration
         row["highest"] = wave.highest
         row["stiffness"] = drive.stiffness
+        row["damping"] = drive.damping
         if isinstance(wave, Pieces):
             tables.append(Pieces.of(factor, 1.0, np.inf, wave.table).table)
             row["last"] = row["first"] + len(wave.table)
@@ -68,6 +71,8 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
 def drive_force(drives: Drives, i: int, t: float) -> float:
     """Force in N of drive ``i`` at time t in s: a burst's by the paper's Eq. (3), else that of the piece that is on."""
     drive = drives.rows[i]
+    if drive.damping != 0.0:
+        return _waveform_rate(drives, i, t)
     if drive.first >= drive.last:
         if t <= 0.0 or t >= drive.duration:
             return 0.0
@@ -79,6 +84,27 @@ def drive_force(drives: Drives, i: int, t: float) -> float:
     x = t - piece.start
     value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
     return value * np.sin(piece.phase + x * (piece.frequency + 0.5 * piece.rate * x))
+
+
+@kernel
+def _waveform_rate(drives: Drives, i: int, t: float) -> float:
+    """Derivative of what ``drive_force`` returns for a drive without dashpot."""
+    drive = drives.rows[i]
+    if drive.first >= drive.last:
+        if t <= 0.0 or t >= drive.duration:
+            return 0.0
+        phase = drive.frequency * t
+        slow = phase / drive.cycles
+        rate = np.sin(slow) / drive.cycles * np.sin(phase) + (1.0 - np.cos(slow)) * np.cos(phase)
+        return drive.amplitude * drive.frequency * rate
+    if drive.piece < 0:
+        return 0.0
+    piece = drives.pieces[drive.piece]
+    x = t - piece.start
+    value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
+    slope = (((5 * piece.c5 * x + 4 * piece.c4) * x + 3 * piece.c3) * x + 2 * piece.c2) * x + piece.c1
+    phase = piece.phase + x * (piece.frequency + 0.5 * piece.rate * x)
+    return slope * np.sin(phase) + value * np.cos(phase) * (piece.frequency + piece.rate * x)
 
 
 @kernel
@@ -150,6 +176,20 @@ def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
     select_piece(drives, i, t)
     force = drive_force(drives, i, t)
     return 0.5 * force * force / stiffness - force * u
+
+
+@kernel
+def dashpot_power(drives: Drives, i: int, t: float, v: float) -> float:
+    """Power in W of a moving wall's dashpot at time t in s, its mass at v in m/s, beyond that of one to a wall at rest.
+
+    It is c (U' - v)^2 - c v^2, and 0 where drive ``i`` is no dashpot.
+    """
+    damping = drives.rows[i].damping
+    if damping == 0.0:
+        return 0.0
+    select_piece(drives, i, t)
+    force = drive_force(drives, i, t)
+    return force * (force / damping - 2.0 * v)
 
 
 @kernel

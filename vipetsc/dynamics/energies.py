@@ -201,6 +201,15 @@ def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
     _add_one(sums, _DISSIPATED, energy, unit)
 
 
+@kernel
+def add_damping(sums: np.ndarray, energy: float, unit: float) -> None:
+    """Add an ``energy`` in J to what dashpots have dissipated.
+
+    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
+    """
+    _add_one(sums, _DAMPING, energy, unit)
+
+
 @dataclass(frozen=True)
 class Energies:
     """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, losses.

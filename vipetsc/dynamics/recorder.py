@@ -19,6 +19,7 @@ from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.recorded_sizes import CHUNK_SAMPLES, chunk_samples, recorded_cells
 from vipetsc.dynamics.samples import Block, Samples
+from vipetsc.dynamics.wall_dashpots import WallDashpots
 from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording
 
 # Samples of all cells, each as large as a state, after which a checkpoint follows: it adds a quarter to the bytes.
@@ -74,6 +75,7 @@ class Recorder(Observer):
         self._shape = len(output.fields), self._length, layout.dofs, local.size
         # 1 for each field of velocities, which engines take from the second half of the state.
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
+        self._dashpots = WallDashpots(setup.model)
         self._first = 0
         if local.size:
             self._first = int(local[0])
@@ -127,6 +129,7 @@ class Recorder(Observer):
             forces=self._forces[here],
             motion=self._motion[here],
             watched=self._watched,
+            spent=self._dashpots.spent(number, len(self._work[here])),
         )
 
     def observe(self, block: Block) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
-from vipetsc.dynamics.drives import wall_energy
-from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, add_loss, add_powers, measure
+from vipetsc.dynamics.drives import dashpot_power, wall_energy
+from vipetsc.dynamics.energies import LARGEST, Energies, add_damping, add_energy, add_loss, add_powers, measure
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
 
@@ -23,7 +23,7 @@ class Samples(NamedTuple):
     numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
     ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples. ``forces`` (sample, owned site) in N are
     those of the contacts, and ``motion`` (sample, 2 dof, cell) displacements before velocities of the owned cells
-    ``watched``.
+    ``watched``. ``spent`` (sample, drive) in J is the time integral of c U'^2 of the dashpots to moving walls.
     """
 
     number: int
@@ -41,6 +41,7 @@ class Samples(NamedTuple):
     forces: np.ndarray
     motion: np.ndarray
     watched: np.ndarray
+    spent: np.ndarray
 
     def rows(self, samples: int) -> int:
         """How many of the first ``samples`` samples have recorded fields."""
@@ -67,10 +68,18 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
         drive = drives.rows[i]
         samples.work[k, drive.number] = y[shape.work + i]
         # The state's work is that of the force k U; the further work of a moving wall is stored in its spring.
-        if drive.stiffness > 0.0:
-            energy = wall_energy(drives, i, number * samples.interval, y[drive.target - shape.dofs * shape.cells])
+        time = number * samples.interval
+        if drive.stiffness != 0.0:
+            energy = wall_energy(drives, i, time, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy
             add_energy(samples.sums[k], energy, samples.unit)
+        # That of the force c U' on the mass v; the further work is lost in the dashpot: c U'^2 - 2 c U' v.
+        if drive.damping != 0.0:
+            lost = samples.spent[k, drive.number] - 2.0 * y[shape.work + i]
+            samples.work[k, drive.number] += lost
+            if shape.damping < 0:
+                lost = samples.interval * dashpot_power(drives, i, time, y[drive.target])
+            add_damping(samples.sums[k], lost, samples.unit)
     for i in range(samples.losses.shape[1]):
         samples.losses[k, i] = y[shape.dissipated + i]
     _take_clipped(y, k, samples, contacts, rows)

@@ -13,7 +13,8 @@ import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, Self
+from math import factorial
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -102,6 +103,14 @@ class ToneBurst:
         phase = self.frequency * t
         burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
         return np.where((t > 0) & (t < self.duration), burst, 0.0)
+
+    def rate(self, t: ArrayLike) -> np.ndarray:
+        """Derivative (...) of the force in N/s at times ``t`` (...) in s."""
+        t = np.asarray(t, float)
+        phase = self.frequency * t
+        slow = phase / self.cycles
+        rate = np.sin(slow) / self.cycles * np.sin(phase) + (1 - np.cos(slow)) * np.cos(phase)
+        return np.where((t > 0) & (t < self.duration), self.window_amplitude * self.frequency * rate, 0.0)
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
         """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
@@ -217,6 +226,20 @@ class Pieces:
         value = value * np.sin(self.phase(t))
         return np.where((t >= self.table["start"][0]) & (t < self.duration), value, 0.0)
 
+    def rate(self, t: ArrayLike) -> np.ndarray:
+        """Derivative (...) of the force in N/s at times ``t`` (...) in s."""
+        t = np.asarray(t, float)
+        piece = self._piece(t)
+        x = t - piece["start"]
+        value = np.zeros_like(t)
+        slope = np.zeros_like(t)
+        for name in reversed(COEFFICIENTS):
+            slope = slope * x + value
+            value = value * x + piece[name]
+        phase = self.phase(t)
+        rate = slope * np.sin(phase) + value * np.cos(phase) * (piece["frequency"] + piece["rate"] * x)
+        return np.where((t >= self.table["start"][0]) & (t < self.duration), rate, 0.0)
+
     def phase(self, t: ArrayLike) -> np.ndarray:
         """Phase (...) in rad of the sine at times ``t`` (...) in s."""
         t = np.asarray(t, float)
@@ -287,13 +310,36 @@ class Drive:
     """A ``waveform`` that acts on a ``mass`` of a ``cell`` (0-based): a force in N.
 
     With a ``stiffness`` k in N/m, not 0, the waveform is the motion U of a wall to which a spring k ties that mass, and
-    the force is k U.
+    the force is k U. With a ``damping`` c in N s/m, not 0, a dashpot ties it to the wall, and the force is c U'. A
+    spring with a dashpot makes two drives.
     """
 
     waveform: Waveform
     cell: int
     mass: int
     stiffness: float = 0.0
+    damping: float = 0.0
+
+    @property
+    def scale(self) -> float:
+        """What the waveform is multiplied by: 1 of a force, N/m of a spring, N s/m of a dashpot."""
+        return self.damping or self.stiffness or 1.0
+
+    @property
+    def force_per_amplitude(self) -> float:
+        """The force in N by a waveform of 1 at its main frequency."""
+        if self.damping:
+            return abs(self.damping) * self.waveform.frequency
+        return abs(self.scale)
+
+    def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
+        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s)/``scale`` ds, at each w (w,)."""
+        response = self.waveform.response(frequency, start, stop)
+        if self.damping:
+            # By parts, since only the waveform's own integral is at hand.
+            at_start, at_stop = self.waveform.force([start, stop])
+            response = at_stop - np.exp(1j * frequency * (stop - start)) * at_start + 1j * frequency * response
+        return np.asarray(response)
 
 
 def _table(starts: ArrayLike) -> np.ndarray:
@@ -350,24 +396,66 @@ def impulse(amplitude: float, duration: float) -> Pieces:
     return Pieces.of(amplitude, frequency, duration, table)
 
 
-def sampled(
-    amplitude: float,
+class Joined(NamedTuple):
+    """The ``curve`` through samples or its integral, and what was ``removed`` from the samples before: offset, drift.
+
+    The drift is in the unit of the samples a second; both are () where nothing is integrated.
+    """
+
+    curve: "scipy.interpolate.PPoly"
+    removed: np.ndarray
+
+    @property
+    def last(self) -> float:
+        """The value at the end, 0 where that was removed."""
+        return 0.0 if len(self.removed) else float(self.curve(self.curve.x[-1]))
+
+
+def joined(
     times: ArrayLike,
     values: ArrayLike,
-    frequency: float,
     interpolation: Interpolation = "monotone",
-    hold: bool = False,
-) -> Pieces:
-    """Return ``amplitude`` times the curve through ``values`` (sample,) at ``times`` (sample,), two or more.
+    derivative: int = 0,
+    removes: bool = True,
+) -> Joined:
+    """Join ``values`` (sample,) at ``times`` (sample,); those of a ``derivative``, 1 or 2, are integrated, exactly.
 
-    ``times`` in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
-    waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps the last sample's value after
-    that, unless this is 0.
+    The integrals begin at 0. ``removes`` takes a polynomial of one degree less from the values first, so that all
+    integrals also end at 0: an offset of a velocity, an offset and a drift of an acceleration.
     """
     times = np.asarray(times, float)
-    values = np.asarray(values, float)
+    curve = _joined(times, np.asarray(values, float), interpolation)
+    removed = np.zeros(0)
+    if not derivative:
+        return Joined(curve, removed)
+
+    if removes:
+        # The n-fold integral of x^m over the length L is m!/(m+n)! L^(m+n).
+        length = times[-1] - times[0]
+        ends = [float(curve.antiderivative(n)(times[-1])) for n in range(1, derivative + 1)]
+        powers = [
+            [factorial(m) / factorial(m + n) * length ** (m + n) for m in range(derivative)]
+            for n in range(1, derivative + 1)
+        ]
+        removed = np.linalg.solve(powers, ends)
+        # SciPy has the highest power first. Pieces of the curve are linear at least.
+        coefficients = curve.c.copy()
+        coefficients[-1] -= np.polynomial.polynomial.polyval(times[:-1] - times[0], removed)
+        coefficients[-2] -= np.append(removed, 0.0)[1]
+        curve = scipy.interpolate.PPoly(coefficients, times)
+    return Joined(curve.antiderivative(derivative), removed)
+
+
+def sampled(amplitude: float, motion: Joined, frequency: float, hold: bool = False) -> Pieces:
+    """Return ``amplitude`` times the curve of ``motion`` over its samples, two or more.
+
+    Their times in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
+    waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps its last value after that,
+    unless this is 0.
+    """
+    times = motion.curve.x
     # What is held at zero has ended, and has a duration.
-    hold &= bool(values[-1] != 0)
+    hold &= motion.last != 0
     starts = times[:-1]
     duration = float(times[-1])
     if hold:
@@ -375,10 +463,10 @@ def sampled(
         duration = np.inf
     table = _table(starts)
     # SciPy has the highest power first.
-    for k, column in enumerate(_joined(times, values, interpolation).c[::-1]):
+    for k, column in enumerate(motion.curve.c[::-1]):
         table[COEFFICIENTS[k]][: len(times) - 1] = column
     if hold:
-        table["c0"][-1] = values[-1]
+        table["c0"][-1] = motion.last
     return Pieces.of(amplitude, frequency, duration, table)
 
 

@@ -21,7 +21,7 @@ from scipy.sparse import csc_matrix, diags
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.drive import Waveform
+from vipetsc.lattice.drive import Drive
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size has 128 MB
 # Modes nearer than this fraction of the largest Om^2 are orthogonalised one by one. Of 300 four-band cells the norm of
@@ -94,8 +94,8 @@ class Modes:
         """Free ``amplitudes`` (mode) after an ``interval`` in s."""
         return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
 
-    def driven(self, drive: Waveform, start: float, stop: float) -> np.ndarray:
-        """Change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for ``force`` 1."""
+    def driven(self, drive: Drive, start: float, stop: float) -> np.ndarray:
+        """Change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for a ``force`` of 1."""
         return drive.response(self.frequency, start, stop)
 
 

@@ -78,9 +78,8 @@ class ModalParts:
         begin, end = span
         later = self.modes.later(state, end - begin)
         for drive in drives:
-            # The force of a moved wall is its displacement times the stiffness of its spring; a force has no spring.
-            force = self.modes.force(drive.cell, drive.mass) * (drive.stiffness or 1.0)
-            later += force * self.modes.driven(drive.waveform, begin, end)
+            force = self.modes.force(drive.cell, drive.mass) * drive.scale
+            later += force * self.modes.driven(drive, begin, end)
         change = 0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)
         return np.asarray(self.sums(change[None]).sum(axis=(1, 2)))
 

@@ -1,33 +1,25 @@
 """Measured records of the verb ``identify``: their sections, and the reading of their files."""
 
-import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-import h5py
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.reading import MISSING
+from vipetsc.case.samples import WALL_UNITS, Place
 from vipetsc.case.schema import Finite, Positive, Range
 from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.io.names import file_hash, resolved_path
-from vipetsc.io.tables import TableError, read_table
+from vipetsc.io.tables import ColumnError, read_columns
 from vipetsc.wording import counted
 
-# Lines of a table of text. Fields are split in Python: a million lines of two columns take 1.6 s and 300 MB.
-MOST_ROWS = 1_000_000
-MOST_NUMBERS = 100_000_000  # of a dataset: 0.8 GB
 LEAST_SAMPLES = 8  # of a record: two windows of the least length in ``identification.growing_windows``
 # Times may differ from even ones by this fraction of their interval, as those printed with few digits do. With ten
 # samples a period, .05 of a sample is a phase of .03, which moves a value by 3 % of its amplitude.
 UNEVEN = 0.05
-HDF5 = (".h5", ".hdf5", ".nc")
-SENSOR_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
-
-Place = Annotated[int | str, BY_SHAPE]  # of a column: its number from 1, or its name
+SENSOR_UNITS = WALL_UNITS | {"force": "N"}
 
 
 class SensorTable(Section):
@@ -113,10 +105,12 @@ def read_measured(record: RecordTable) -> Measured:
     except OSError as error:
         raise MeasuredError("file", record.file, str(error.strerror or error)) from None
 
-    read = _text_columns
-    if path.suffix.lower() in HDF5 or h5py.is_hdf5(path):
-        read = _hdf5_columns
-    columns = read(path, record)
+    try:
+        columns = read_columns(path, dict(_wanted(record)))
+    except ColumnError as error:
+        if error.key:
+            raise MeasuredError(error.key, error.place, error.remedy) from None
+        raise MeasuredError("file", record.file, error.remedy) from None
 
     lengths = {key: len(values) for key, values in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -184,74 +178,6 @@ def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
         yield "time", record.time
     for number, sensor in enumerate(record.sensors, 1):
         yield f"sensors[{number}].column", sensor.column
-
-
-def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
-    """Return the columns of a ``record`` from a table of text, by their keys."""
-    try:
-        table = read_table(path, MOST_ROWS)
-    except (OSError, TableError) as error:
-        raise MeasuredError("file", record.file, str(error)) from None
-
-    columns = {}
-    for key, place in _wanted(record):
-        index = _index_of(place, table.names, key)
-        if not 0 <= index < table.values.shape[1]:
-            raise MeasuredError(key, place, f"the table has the columns 1 to {table.values.shape[1]}")
-        columns[key] = table.values[:, index]
-    return columns
-
-
-def _index_of(place: Place, names: list[str], key: str) -> int:
-    """The column, from 0, of a ``place`` in a table with those ``names``; raises MeasuredError for an unused name."""
-    if isinstance(place, int):
-        return place - 1
-    if place in names:
-        return names.index(place)
-    remedy = f"there are {', '.join(names)}"
-    if not names:
-        remedy = "the table has no line of names; give a number from 1"
-    raise MeasuredError(key, place, f"no column of that name; {remedy}")
-
-
-def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
-    """The columns of a ``record`` from datasets of an HDF5 file, by their keys."""
-    columns = {}
-    try:
-        with h5py.File(path) as file:
-            for key, place in _wanted(record):
-                columns[key] = _hdf5_column(file, key, place)
-    except (OSError, TypeError) as error:
-        raise MeasuredError("file", record.file, f"is not an HDF5 file of numbers ({error})") from None
-    return columns
-
-
-def _hdf5_column(file: h5py.File, key: str, place: Place) -> np.ndarray:
-    """The numbers at a ``place``: a dataset of one dimension, or with "[3]" behind its name the third column of two."""
-    name = str(place)
-    column: int | None = None
-    match = re.fullmatch(r"(.+?)\[(\d+)\]", name)
-    if match:
-        name = match[1]
-        column = int(match[2])
-    dimensions = 1 + (column is not None)
-
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset):
-        raise MeasuredError(key, place, f"the file has no dataset {name}")
-    if dataset.dtype.kind not in "biuf":
-        raise MeasuredError(key, place, f"the dataset {name} is not one of real numbers")
-    if dataset.size > MOST_NUMBERS:
-        raise MeasuredError(key, place, f"the dataset has {dataset.size} numbers; at most {MOST_NUMBERS} are possible")
-    if dataset.ndim != dimensions:
-        shape = " x ".join(map(str, dataset.shape))
-        remedy = f'is an array of {shape}; write "{name}[1]" for the first column of two dimensions'
-        raise MeasuredError(key, place, remedy)
-    if column is None:
-        return np.asarray(dataset[:], float)
-    if not 1 <= column <= dataset.shape[1]:
-        raise MeasuredError(key, place, f"the dataset has the columns 1 to {dataset.shape[1]}")
-    return np.asarray(dataset[:, column - 1], float)
 
 
 def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives: int) -> Iterator[Problem]:
