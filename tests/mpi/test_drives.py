@@ -31,6 +31,25 @@ def test_same_bits_under_several_drives(folder, engine):
     runs_alike(folder, small_case(drive={"more": DRIVES}, time={"end": 0.022, "engine": engine}))
 
 
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize(("engine", "looks"), [("ts", (31, 36)), ("propagator", (2, 1))])
+def test_a_damped_wall_has_the_same_bits_and_goes_on(folder, engine, looks):
+    """The work and the losses of a wall's dashpots do not depend on the ranks, on stops, or on a later end."""
+    lattice = {"damping": {"stiffness": 1e-5}}
+    case = small_case(drive={"more": DRIVES}, lattice=lattice, time={"end": 0.012, "engine": engine})
+    simulate(case, folder / "whole", observers=[InParts])
+    for number in looks:
+        assert simulate(case, folder / "parts", stop=StopAt(number), observers=[InParts]).resumable
+    simulate(case, folder / "parts", observers=[InParts])
+    assert_same_bits(datasets(folder / "whole/run.h5"), datasets(folder / "parts/run.h5"))
+
+    longer = small_case(drive={"more": DRIVES}, lattice=lattice, time={"end": 0.024, "engine": engine})
+    simulate(longer, folder / "parts", extend=True)
+    simulate(longer, folder / "long")
+    assert_same_bits(datasets(folder / "long/run.h5"), datasets(folder / "parts/run.h5"))
+    runs_alike(folder, longer)
+
+
 @pytest.mark.parallel([1, 2, 3])
 # The time stepper looks for a request to stop after every step, the propagator after every ten samples: both runs stop
 # while the drives act, and a second time during a contact.
