@@ -370,3 +370,46 @@ def test_a_movie_and_tables(typed, put, tmp_path):
     rows = table(tmp_path / "runs/mine/curves/run-time.csv")
     with vipetsc.open(tmp_path / "runs/mine") as run:
         assert [float(row["energy/work (J)"]) for row in rows] == run["energy/work"].values.tolist()
+
+
+IMPACTING = (
+    "--set output.lyapunov=true --set time.end=150.0 --set sweep.drive.frequency=[2.5,2.88] --set output.figures=false"
+)
+
+
+def test_bifurcations_sections_and_exponents(typed, tmp_path):
+    """The impact oscillator upwards and downwards on one page, its exponents, and a section of one member."""
+    typed(
+        "examples impact-oscillator\n"
+        f"sweep impact-oscillator.toml --out up {IMPACTING}\n"
+        f"sweep impact-oscillator.toml --out down {IMPACTING} --set sweep.follow=down\n"
+        "plot down up --fig bifurcation\nrun up --member 0 --out one\nplot one --fig poincare"
+    )
+    data = ensemble(tmp_path / "up")
+    calm, chaotic = data["lyapunov"].values
+    # One impact a period: both multipliers have the size of the restitution, 0.8.
+    assert calm == pytest.approx(np.log(0.8) * 2.5 / (2 * np.pi), abs=0.02)
+    assert chaotic > 0.03
+    assert "bifurcation" in pages(tmp_path / "down")
+    assert "poincare" in pages(tmp_path / "one")
+
+    figure = vipetsc.plot(tmp_path / "one", "poincare")
+    section = figure.axes[0].lines[0].get_xydata()
+    assert len(section) >= 28
+    # The motion repeats after each period.
+    assert np.ptp(section, axis=0).max() < 1e-3
+
+
+def test_impacts_as_a_table_and_points_of_two_runs(typed, put, tmp_path):
+    """A row for each impact, whose losses sum to that of the run; a named point of two runs on a page."""
+    put("mine.toml", my_lattice(), PLAIN, '[[output.points]]\nname = "tip"\ncell = 40\n')
+    typed(
+        "run mine.toml --out loud --set time.end=0.06\nrun mine.toml --out soft --set time.end=0.06"
+        " --set drive.amplitude=1.0\nexport loud\n"
+        "plot loud soft --fig points --db --unit Hz --width 86mm --no-title --label tip=Sensor"
+    )
+    impacts = vipetsc.impacts(tmp_path / "loud")
+    with vipetsc.open(tmp_path / "loud") as run:
+        assert impacts["loss"].sum() == pytest.approx(float(run["energy/dissipated"][-1]), rel=1e-6)
+    assert len(table(tmp_path / "loud/curves/run-impacts.csv")) == len(impacts) > 0
+    assert any(name.startswith("points") for name in pages(tmp_path / "loud"))
