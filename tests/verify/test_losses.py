@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
@@ -17,10 +19,11 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.losses import with_loss
+from vipetsc.modes.branches.losses import with_orbits_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.flow import MAPS
+from vipetsc.modes.point import Point
 from vipetsc.modes.problem import unit
 from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.steady import SteadyStates
@@ -132,7 +135,7 @@ def test_harmonics_of_all_orders_count_in_the_loss():
     frame = shooting.frame_at("relative", u, motion.period)
     row = np.append(u / np.linalg.norm(u), 0.0)
     orbit = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
-    orbit = with_loss(shooting, method.dissipation, orbit)
+    orbit = with_orbits_loss(shooting, method.dissipation, orbit)
 
     assert motion.loss == pytest.approx(orbit.loss, rel=1e-4)
     assert motion.force == pytest.approx(orbit.force, rel=1e-4)
@@ -233,3 +236,64 @@ def test_the_force_holds_a_steady_state_in_quadrature(damping):
 
     # The branch's force is of first order in the damping, so that its error is proportional to the damping.
     assert xi[-1] * states.parameter.scale == pytest.approx(motion.force, rel=damping)
+
+
+def loss_by_scipy(method: ShootingMethod, point: Point) -> float:
+    """The loss in J of an orbit by its integral over all episodes that begin within a period, for the reduced model."""
+    system = method.system
+    rows = system.contact_rows
+    law = method.dissipation.laws[0]
+    clearance = system.contacts[0].stops.plus
+    n = system.dofs
+
+    def rates(_: float, state: np.ndarray) -> np.ndarray:
+        u, v, _actions = np.split(state, [n, 2 * n])
+        w = rows @ u
+        force = np.sign(w) * law.elastic_force(np.maximum(np.abs(w) - clearance, 0.0))
+        acceleration = (-system.stiffness @ u - rows.T @ force) / system.masses
+        return np.concatenate([v, acceleration, np.abs(force) * (rows @ v) ** 2])
+
+    def changes(row: np.ndarray, direction: int) -> Callable[[float, np.ndarray], float]:
+        def above(_: float, state: np.ndarray) -> float:
+            return abs(float(row @ state[:n])) - clearance
+
+        vars(above)["direction"] = direction
+        return above
+
+    start = np.append(method.shooting.arc(point.x, point.period).start, np.zeros(len(rows)))
+    # Episodes that begin near the period's end are followed to theirs.
+    whole = (0.0, 1.5 * point.period)
+    events = [changes(row, direction) for row in rows for direction in (1, -1)]
+    tolerances = {"rtol": 1e-11, "atol": 1e-15 * np.abs(start).max(), "max_step": point.period / 4000}
+    solution = solve_ivp(rates, whole, start, "DOP853", events=events, dense_output=True, **tolerances)
+
+    loss = 0.0
+    for j, row in enumerate(rows):
+        begins, ends = solution.t_events[2 * j : 2 * j + 2]
+        for begin in begins[begins < point.period]:
+            end = ends[ends > begin][0]
+            approach = abs(float(row @ solution.sol(begin)[n : 2 * n]))
+            action = solution.sol(end)[2 * n + j] - solution.sol(begin)[2 * n + j]
+            loss += law.damping * float(action) / approach
+    return loss
+
+
+# Points of the paper's in-phase branch with the bilinear law. Contacts of the first have just begun; the second has
+# episodes of very different lengths.
+BARELY = ([0.0006330335292987458, 0.002410564972379855], 0.006734917800219066)
+UNLIKE = ([-2.1834937624515054, -2.190807429909221], 0.003143918091158219)
+
+
+@pytest.mark.parametrize(("x", "period", "episodes"), [(*BARELY, 4), (*UNLIKE, 2)])
+def test_the_loss_of_an_orbit_is_its_integral(x, period, episodes):
+    """Losses of the paper's model are the integral that SciPy finds, also where a contact all but grazes."""
+    contacts = {"law": "bilinear", "modulus": 1e8, "restitution": 0.9}
+    lattice = {"preset": "four-band", "reading": "printed"}
+    method = ShootingMethod(NnmCase.from_table({"lattice": lattice, "contacts": contacts, "nnm": {"modes": [1]}}))
+    frame = method.shooting.relative_frame(np.array(x), period)
+    row = np.append(frame.xi[:-1], 0.0)
+    point = method.assess(method.shooting, frame.measures(frame.solve(frame.xi, row, row @ frame.xi)))
+
+    assert point.residual < 1e-11
+    assert point.episodes == episodes
+    assert point.loss == pytest.approx(loss_by_scipy(method, point), rel=2e-4)

@@ -172,6 +172,9 @@ DENSITY = 24
 # The error is 5e-16 at s = 64, 2e-11 at 90 and 2e-4 at 110: s = 64 leaves room for the variation of the force itself.
 NODES = 64
 SPAN = 64.0
+# Orders for which a loss has nodes. It needs f z' alone, over pieces that are cut at every minimum of the indentation:
+# with 8 orders or 256 losses along the paper's in-phase branch are the same to 5e-12.
+LOSS_ORDERS = 32
 
 
 class Episode(NamedTuple):
@@ -275,6 +278,27 @@ def nodes(pieces: Sequence[tuple[float, float]], orders: int) -> tuple[np.ndarra
     return np.concatenate(theta), np.concatenate(weights)
 
 
+class _ArcForce(NamedTuple):
+    """The force of a pair at the nodes of a quadrature over one arc of contact, the ``episode``.
+
+    ``theta`` (nodes,) in rad have ``weights`` in the integral over the period; ``values`` (4, nodes) are f, df/dz,
+    df/dz' and the potential there, ``rate`` (nodes,) is z'. ``onset`` says how f depends on the slope with which the
+    arc begins, None where it does not.
+    """
+
+    episode: Episode
+    theta: np.ndarray
+    weights: np.ndarray
+    values: np.ndarray
+    rate: np.ndarray
+    onset: _Onset | None
+
+    @property
+    def loss(self) -> float:
+        """The energy in J that the contact takes in this episode."""
+        return float((self.values[0] * self.rate) @ self.weights)
+
+
 class ForceSeries:
     """Harmonics of the forces in one motion (module docstring), with K the ``order`` of the highest harmonic of z.
 
@@ -295,17 +319,20 @@ class ForceSeries:
         self._rates = np.zeros((pairs, 2 * order + 1), complex)  # those of df/dz'
         self._onsets: list[_Onset] = []
 
-    def add(self, pair: int, theta: np.ndarray, weights: np.ndarray, values: np.ndarray, rate: np.ndarray) -> None:
-        """Add the nodes ``theta`` of a pair, with their weights in the integral over the period.
-
-        ``values`` (4, nodes) are f, df/dz, df/dz' and the potential there, ``rate`` (nodes,) is z'.
-        """
+    def add(self, arc: _ArcForce) -> None:
+        """Add the force in one arc of contact."""
+        pair = arc.episode.pair
         out = np.zeros((3, 2 * self.order + 1), complex)
-        _transform(theta, np.ascontiguousarray(values[:3] * weights / (2 * np.pi)), out)
+        _transform(arc.theta, np.ascontiguousarray(arc.values[:3] * arc.weights / (2 * np.pi)), out)
         self._include(pair, out)
         self._rates[pair] += out[2]
-        self.potential[pair] += values[3] @ weights / (2 * np.pi)
-        self.loss[pair] += (values[0] * rate) @ weights
+        self.potential[pair] += arc.values[3] @ arc.weights / (2 * np.pi)
+        self.loss[pair] += arc.loss
+        # An onset that moves changes z'_minus, and with it the force of the whole arc; at the floor it does not.
+        if arc.onset is not None:
+            self._onsets.append(arc.onset)
+        self.closed[pair] += arc.episode.length / (2 * np.pi)
+        self.episodes.append(arc.episode)
 
     def add_spring(self, pair: int, values: np.ndarray) -> None:
         """Add a spring whose f, df/dz and potential are ``values`` (3, samples) at uniform phases of the period."""
@@ -319,10 +346,6 @@ class ForceSeries:
         self.forces[pair] += 2 * means[0]
         self.forces[pair, 0] -= means[0, 0]
         self.slopes[pair] += means[1]
-
-    def add_onset(self, onset: _Onset) -> None:
-        """Add how the force of an arc depends on the approach velocity at its onset."""
-        self._onsets.append(onset)
 
     @property
     def acting(self) -> np.ndarray:
@@ -438,11 +461,9 @@ class SiteForces:
         Raises NoMotionError where a dissipative contact never separates: it has no onset.
         """
         series = ForceSeries(self.pairs, z.shape[1] - 1)
-        # No motion is larger than the sum of its harmonics: a contact within its clearances needs no samples.
-        largest = np.abs(z).sum(axis=1).tolist()
         for pair, stops in enumerate(self.contacts):
-            if stops.clearance < largest[pair]:
-                self._add_contact(series, pair, z, omega)
+            for arc in self._arcs(pair, z[pair], omega, 2 * series.order):
+                series.add(arc)
             if stops.is_pressed:
                 series.add_load(pair, stops, z[pair])
             if stops.drag:
@@ -457,23 +478,35 @@ class SiteForces:
         series.episodes.sort(key=lambda e: (e.pair, e.onset))
         return series
 
-    def _add_contact(self, series: ForceSeries, pair: int, z: np.ndarray, omega: float) -> None:
-        """Add the arcs of contact of a ``pair`` to the ``series``; ``z`` (pairs, K + 1) are the harmonics."""
-        motion = _sampled(z[pair], derivatives=3).T
+    def losses(self, z: np.ndarray, omega: float) -> np.ndarray:
+        """The energies (contacts,) in J that the contacts take in a period, as the ``loss`` of ``series``.
+
+        Raises NoMotionError where a dissipative contact never separates.
+        """
+        taken = [self._arcs(pair, z[pair], omega, LOSS_ORDERS) for pair in range(len(self.contacts))]
+        return np.array([sum(arc.loss for arc in of_pair) for of_pair in taken])
+
+    def _arcs(self, pair: int, z: np.ndarray, omega: float, orders: int) -> Iterator[_ArcForce]:
+        """The force of a contact, number ``pair``, in each arc of contact, with nodes for so many ``orders``.
+
+        ``z`` (K + 1,) are the harmonics of its elongation.
+        """
         stops = self.contacts[pair]
+        # No motion is larger than the sum of its harmonics: a contact within its clearances needs no samples.
+        if stops.clearance >= np.abs(z).sum():
+            return
+        motion = _sampled(z, derivatives=3).T
         for side, clearance in ((1, stops.plus), (-1, stops.minus)):
             for begin, end in arcs(np.ascontiguousarray(side * motion[:, :3]), clearance):
-                arc = Episode(pair, side, begin, end - begin, approach=0.0)
-                self._add_arc(series, arc, motion, z, omega)
+                yield self._force(Episode(pair, side, begin, end - begin, approach=0.0), motion, z, omega, orders)
 
-    def _add_arc(self, series: ForceSeries, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float) -> None:
-        """Add one ``arc`` of contact, whose approach velocity is found here, to the ``series``.
+    def _force(self, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float, orders: int) -> _ArcForce:
+        """The force in one ``arc`` of contact, whose approach velocity is found here.
 
-        ``motion`` (samples, 4) is that of the pair and its derivatives, ``z`` (pairs, K + 1) are the harmonics.
+        ``motion`` (samples, 4) is that of the pair and its derivatives, ``z`` (K + 1,) are its harmonics.
         """
-        pair = arc.pair
         side = arc.side
-        stops = self.contacts[pair]
+        stops = self.contacts[arc.pair]
         law = stops.law
         c = law.damping
         if c and arc.length >= 2 * np.pi:
@@ -481,7 +514,7 @@ class SiteForces:
 
         # The slope z'_minus in m/rad with which the arc begins, and z''/z' there, 0 where the motion only touches.
         at_onset = np.empty((1, 3))
-        _evaluate(z[pair], np.array([arc.onset]), at_onset)
+        _evaluate(z, np.array([arc.onset]), at_onset)
         approach = at_onset[0, 1]
         bend = 0.0
         if approach:
@@ -497,9 +530,9 @@ class SiteForces:
             pushing = arcs(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
             pieces = list(common(pieces, pushing))
 
-        theta, weights = nodes(pieces, 2 * series.order)
+        theta, weights = nodes(pieces, orders)
         at_nodes = np.empty((len(theta), 3))
-        _evaluate(z[pair], theta, at_nodes)
+        _evaluate(z, theta, at_nodes)
         # An end that is found to rounding may leave its first node outside the contact.
         x = np.maximum(side * at_nodes[:, 0] - stops.clearance_on(side), 0.0)
         rate = at_nodes[:, 1]
@@ -513,11 +546,9 @@ class SiteForces:
             g = 1 + c * rate / approach
             per_rate = side * elastic * c / approach
         values = np.array([side * elastic * g, slope * g, per_rate, stops.weight * law.elastic_energy(x)])
-        series.add(pair, theta, weights, values, rate)
 
-        # An onset that moves changes z'_minus, and with it the force of the whole arc; at the floor it does not.
+        onset = None
         if c and not floored:
             weighted = -per_rate * rate / approach * weights / (2 * np.pi)
-            series.add_onset(_Onset(pair, arc.onset, bend, theta, weighted))
-        series.closed[pair] += arc.length / (2 * np.pi)
-        series.episodes.append(arc._replace(approach=abs(approach) * omega))
+            onset = _Onset(arc.pair, arc.onset, bend, theta, weighted)
+        return _ArcForce(arc._replace(approach=abs(approach) * omega), theta, weights, values, rate, onset)

@@ -1,7 +1,6 @@
 """Branches of conservative motions by harmonic balance, and the states of the lattice that belong to them."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -19,12 +18,12 @@ from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import stored_states
-from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
+from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import FlowError, NoMotionError, PeriodicProblem, StartError
+from vipetsc.modes.problem import FlowError, PeriodicProblem, StartError
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.stability import Hill
@@ -150,8 +149,18 @@ class CondensedMethod(NnmMethod):
         """The point with its largest multiplier, and its loss if anything dissipates."""
         largest = self._largest_multiplier(point)
         if self.dissipation.acts:
-            point = with_condensed_loss(self.motions, self.dissipation, point, self.dofs)
+            point = self._with_loss(point)
         return replace(point, multiplier=largest)
+
+    def _with_loss(self, point: Point) -> Point:
+        """The point with its loss and the force that makes up for it."""
+        motions = self.motions
+        dissipation = self.dissipation
+        balance = motions.balance(point.order)
+        contacts = motions.forces.contacts
+        count = max(dissipation.damping.shape[0], (dissipation.forced or 0) + 1)
+        masses = zip(balance.orders.tolist(), _all_masses(motions, point, self.dofs, count), strict=True)
+        return with_loss(point, dissipation, contacts, balance.unpack(point.x)[: len(contacts)], masses)
 
     def _largest_multiplier(self, point: Point) -> float:
         """The largest multiplier by Hill's method, or by the orbit's sensitivities; NaN where it is not found."""
@@ -224,30 +233,6 @@ def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np
     forces = balance.series(point.x, omega).forces.real
     for k in balance.orders:
         yield _field(motions.compliance.compliance, k * omega, forces[:, k])
-
-
-def with_condensed_loss(motions: ConservativeMotions, dissipation: Dissipation, point: Point, dofs: int) -> Point:
-    """The ``point`` with its loss in J a period, and the force in N at the forced mass that makes up for it."""
-    omega = 2 * np.pi / point.period
-    balance = motions.balance(point.order)
-    contacts = zip(motions.forces.contacts, dissipation.laws, strict=True)
-    lossy = SiteForces([stops._replace(law=law) for stops, law in contacts])
-    loss = np.nan
-    # A dissipative contact that never separates has no approach velocity, by which its damping divides.
-    with suppress(NoMotionError):
-        loss = float(lossy.series(balance.unpack(point.x)[: lossy.pairs], omega).loss.sum())
-
-    count = max(dissipation.damping.shape[0], (dissipation.forced or 0) + 1)
-    first = 0.0
-    for k, u in zip(balance.orders.tolist(), _all_masses(motions, point, dofs, count), strict=True):
-        if dissipation.damping.nnz:
-            loss += np.pi * k**2 * omega * float(u @ (dissipation.damping @ u))
-        if k == 1 and dissipation.forced is not None:
-            first = float(u[dissipation.forced])
-    force = np.nan
-    if dissipation.forced is not None:
-        force = force_for(loss, first)
-    return replace(point, loss=loss, force=force)
 
 
 def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: int) -> Iterator[np.ndarray]:

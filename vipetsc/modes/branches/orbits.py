@@ -14,7 +14,7 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, sampled
-from vipetsc.modes.branches.losses import dissipation_of, with_loss
+from vipetsc.modes.branches.losses import dissipation_of, with_orbits_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor, value_kind
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, StepRule, at_energy
@@ -168,7 +168,7 @@ class ShootingMethod(NnmMethod):
             return point
         # A branch that crosses another one may have another map, and with it other initial values.
         assert isinstance(problem, Shooting)
-        return with_loss(problem, self.dissipation, point)
+        return with_orbits_loss(problem, self.dissipation, point)
 
     def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""
