@@ -58,7 +58,7 @@ def compute(
 ) -> Outcome:
     """Compute the study called ``name`` into ``folder`` as its verb does; raises as the verb does."""
     scenario = STUDIES[name]
-    options = argparse.Namespace(force=force, resume=resume, member=None, case=None)
+    options = argparse.Namespace(force=force, resume=resume, extend=False, member=None, case=None)
     work = Work(options, folder, comm, stop or StopRequest())
     outcome = scenario.verb.study(case_of(scenario, *changes), work)
     work.stop.check(comm)

@@ -402,8 +402,9 @@ def test_bad_input_names_its_key(nfrc, key):
     assert [problem.key for problem in error.value.problems] == [key]
 
 
-def test_a_site_is_needed_and_validate_reads_the_section(tmp_path):
-    with pytest.raises(CaseError, match=r"contacts\.sites"):
+def test_a_lattice_without_sites_needs_points_and_validate_reads_the_section(tmp_path):
+    """A linear lattice has no incident wave to scatter, and its response is that of named masses."""
+    with pytest.raises(CaseError, match=r"(?s)nfrc\.source.*output\.points"):
         nfrc_case(contacts={"sites": 0, "clearance": None})
 
     path = tmp_path / "x.toml"

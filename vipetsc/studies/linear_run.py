@@ -285,10 +285,8 @@ def _linear_table(case: Case) -> dict[str, Any]:
 def first_site_cell(case: Case) -> int:
     """Cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
-    if not cells.size:
-        return 0
-    distance = Topology(case.lattice.cells, case.lattice.ends).distance(cells, case.drive.cell)
-    return int(cells[np.argmin(distance)])
+    first = Topology(case.lattice.cells, case.lattice.ends).nearest(cells, case.drive.cell)
+    return 0 if first is None else int(cells[first])
 
 
 def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
