@@ -86,6 +86,18 @@ def wall(drive):
         slope = motion.derivative()
         inside = lambda f: lambda t: 2.0 * float(f(t)) * (t < TIMES[-1])  # noqa: E731
         return inside(motion), inside(slope), TIMES
+    if drive["waveform"] == "chirp":
+
+        def chirp(t):
+            s = np.clip(min(t, 0.2 - t) / 0.05, 0.0, 1.0)
+            return 2.0 * (10 * s**3 - 15 * s**4 + 6 * s**5) * np.sin(t * 30.0 + 100.0 * t**2)
+
+        def slope(t):
+            # Differences of the fourth order.
+            h = 1e-4
+            return (8 * (chirp(t + h) - chirp(t - h)) - chirp(t + 2 * h) + chirp(t - 2 * h)) / (12 * h)
+
+        return chirp, slope, [0.05, 0.15, 0.2]
     omega, cycles = 50.0, 3
     end = 2 * np.pi * cycles / omega
 
@@ -107,6 +119,7 @@ def wall(drive):
         {"waveform": "samples", "samples": SAMPLES | {"quantity": "velocity"}},
         {"waveform": "samples", "samples": SAMPLES | {"quantity": "acceleration"}},
         {"waveform": "burst", "frequency": 50.0, "cycles": 3},
+        {"waveform": "chirp", "frequency": 50.0, "bandwidth": 40.0, "duration": 0.2, "ramp": 0.05},
     ],
 )
 def test_a_damped_wall_agrees_with_dop853(engine, drive):
