@@ -47,6 +47,7 @@ NOT_TYPED = {
     "measurements": "a quarter of an hour; tests/cli/test_bench.py runs the bench in small",
     "trust": "hours; tests/faults meets every phase once",
     "sweeps": "half a minute of CPU; tests/verify/test_sections.py has such sweeps in small",
+    "recipes": "tests/cli/test_tasks.py types such commands in small; test_python.py runs its block",
     "read-pictures": "tests/cli/test_laboratory.py draws with these options",
     "extend": "tests/cli/test_plugins.py runs its modules; its verb is called below",
 }
@@ -200,7 +201,7 @@ def test_every_command_of_the_manual_is_understood(words, monkeypatch):
 
     # The names that are left out are placeholders, or files that the session writes.
     case = getattr(calls[0], "case", None)
-    if case and case.endswith(".toml") and case not in ("CASE", "my-lattice.toml", "case.toml"):
+    if case and case.endswith(".toml") and case not in ("CASE", "my-lattice.toml", "my-beam.toml", "case.toml"):
         assert (ROOT / case).exists()
 
 

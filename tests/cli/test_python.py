@@ -15,7 +15,8 @@ import vipetsc as package
 
 ROOT = Path(package.__file__).parents[1]
 CHAPTER = (ROOT / "vipetsc/manual/python.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```python\n(.*?)^```$", CHAPTER, flags=re.M | re.S)
+RECIPES = (ROOT / "vipetsc/manual/recipes.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", CHAPTER + RECIPES, flags=re.M | re.S)
 FRONT = {"Case", "CaseError", "Sweep", "analyse", "follow", "impacts", "open", "plot", "simulate", "sweep"}
 pytestmark = pytest.mark.parallel(1)
 
