@@ -89,12 +89,18 @@ def test_results_are_resumed_only_where_there_are_some(name, tmp_path):
 
 
 def test_a_stop_at_any_look_is_gone_on_with(name, whole, tmp_path):
-    """A request is granted at the first look, or at one in the middle; the next call leaves the same files."""
+    """A request is granted at the first look, or at one in the middle; the next call leaves the same files.
+
+    Both calls together write as many records as one undisturbed call: what is recorded is not computed again.
+    """
     for looks in some(range(whole.looks), 3)[:2]:
         out = tmp_path / str(looks)
-        with pytest.raises(StoppedError):
-            compute(name, out, stop=StopAt(looks))
-        compute(name, out)
+        passed: list[str] = []
+        with phases().watched(passed.append):
+            with pytest.raises(StoppedError):
+                compute(name, out, stop=StopAt(looks))
+            compute(name, out)
+        assert passed.count("append") == whole.passed.count("append")
         assert difference(whole.folder, out) == ""
 
 
