@@ -148,17 +148,19 @@ class RunFolder:
             for number in range(count):
                 save_arrays(aside / self._chunk(number).name, chunks.part_of(file, number, count))
         for state in self._end.glob("state-*.h5"):
-            _, _, rank, size = state.stem.split("-")
+            _, rank, size = state.stem.split("-")
             shutil.copy(state, aside / self._state(count - 1, int(rank), int(size)).name)
         shutil.copy(self._end / "source", aside)
         aside.replace(self._parts)
 
     def _keep_end(self) -> None:
         """Keep the last checkpoint, that of the run's end, from which a longer run goes on."""
-        number, _ = self._last_complete_state()
+        number, size = self._last_complete_state()
         self._end.mkdir()
-        for state in self._parts.glob(f"state-{number:06d}-*.h5"):
-            state.replace(self._end / state.name)
+        for rank in range(size):
+            # A copy: after a kill here the run is put together from its parts again. The number of chunks, which depends
+            # on where the run was stopped, is not in the name.
+            shutil.copy(self._state(number, rank, size), self._end / f"state-{rank}-{size}.h5")
         # Last, as it says that all is there.
         write_text(self._end / "source", source_key())
 
