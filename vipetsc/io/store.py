@@ -158,8 +158,8 @@ class RunFolder:
         number, size = self._last_complete_state()
         self._end.mkdir()
         for rank in range(size):
-            # A copy: after a kill here the run is put together from its parts again. The number of chunks, which depends
-            # on where the run was stopped, is not in the name.
+            # A copy: after a kill here the run is put together from its parts again. Its name does not have the number
+            # of chunks, which depends on where the run was stopped.
             shutil.copy(self._state(number, rank, size), self._end / f"state-{rank}-{size}.h5")
         # Last, as it says that all is there.
         write_text(self._end / "source", source_key())
