@@ -140,7 +140,11 @@ class RunFolder:
             return
         aside = self.folder / ".parts.part"
         discard(aside)
-        with h5py.File(path) as file:
+        try:
+            opened = h5py.File(path)
+        except OSError as error:
+            raise FolderError(f"{path}: {error}; --force repeats the run") from error
+        with opened as file:
             if not tomllib.loads(file.attrs["case"])["time"]["end"] < end:
                 return
             aside.mkdir()
