@@ -101,3 +101,15 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
         assert "in s? In ms, their spectrum would be largest at 10" in printed
         assert printed.splitlines()[-2] == "[]"
         assert names["result"].statistics["episodes"] > 0
+
+
+@pytest.mark.slow
+def test_a_kernel_executes_one(tmp_path):
+    """The shortest notebook ends in a kernel of its own, with the display of its case."""
+    pytest.importorskip("ipykernel")
+    client = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(FOLDER / "own-lattice.ipynb", as_version=4)
+    client.NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    kinds = {kind for cell in notebook.cells for out in cell.get("outputs", []) for kind in out.get("data", {})}
+    assert "text/html" in kinds
