@@ -40,6 +40,8 @@ def starting_gap(mantissas: tuple[float, ...], exponents: tuple[float, ...], sta
     start=st.sampled_from(["below", "landed", "extremum"]),
 )
 @example((0.0, 0.0, 0.5, -1.0, 0.0, 1.0), (0.0, 0.0, -3.0, -2.25, 0.0, -1.0), "below")
+# The slope falls through zero in the quarter in which it also rises from zero.
+@example((-8e-75, 0.0, 2e-190, 1.0, 0.0, -1.0), (0.0, 0.0, 0.0, -2.0, 0.0, -1.0), "below")
 @settings(max_examples=400)
 def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
     """No sampled gap above the interpolant's error is missed, and none comes before the change that is found."""

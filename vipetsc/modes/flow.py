@@ -241,12 +241,11 @@ def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
 
 
 @kernel
-def _extremum(c: Coefficients, position: float) -> float:
-    """The zero of the slope near ``position``, in its quarter of the step."""
+def _extremum(c: Coefficients, position: float, sign: float) -> float:
+    """Return the extremum near ``position``, in its quarter: a maximum for the ``sign`` 1, a minimum for -1."""
     low = 0.25 * min(np.floor(4.0 * position), 3.0)
-    sign = _slope(c, low)
-    # Two zeros in one quarter leave no change of sign to bisect.
-    if sign * _slope(c, low + 0.25) >= 0.0:
+    # Two extrema in one quarter leave no change of sign to bisect, or that of the other one.
+    if sign * _slope(c, low) <= 0.0 or sign * _slope(c, low + 0.25) >= 0.0:
         return position
     return _bisect(c, low, low + 0.25, sign)
 
@@ -293,10 +292,10 @@ def first_rise(c: Coefficients) -> tuple[float, int]:
         high = _next_turn(slope, low, -1.0)
         left = 0.0
         if low > 0.0:
-            left = _extremum(c, low)
+            left = _extremum(c, low, -1.0)
         top = 1.0
         if high <= 1.0:
-            top = _extremum(c, high)
+            top = _extremum(c, high, 1.0)
 
         # The root is in the first quarter of the step that ends above zero.
         for part in range(1, 5):
