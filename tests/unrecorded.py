@@ -29,6 +29,7 @@ def unrecorded_samples(lattice: LatticeRecord, goal: int) -> Samples:
         interval=1.0,
         forces=np.zeros((0, 0)),
         motion=np.zeros((0, 0, 0)),
-        watched=np.zeros(0, np.int64),
+        watched=np.zeros((0, 2), np.int64),
+        pushes=np.zeros((0, 3), np.int64),
         spent=np.zeros((0, 0)),
     )

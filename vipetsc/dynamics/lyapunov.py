@@ -223,5 +223,6 @@ def _nothing_of(samples: Samples, count: int) -> Samples:
         moving=np.zeros(0, samples.moving.dtype),
         forces=np.zeros((0, samples.forces.shape[1])),
         motion=np.zeros((count, samples.motion.shape[1], 0)),
-        watched=np.zeros(0, samples.watched.dtype),
+        watched=samples.watched[:0],
+        pushes=samples.pushes[:0],
     )

@@ -53,8 +53,12 @@ class Recorder(Observer):
         sampled = ["time", "field_time", *(ENERGIES[energy] for energy in self._energies)]
         points = output.points or []
         self._points: PointMotion | None = None
+        self._watched = np.zeros((0, 2), np.int64)
+        self._pushes = np.zeros((0, 3), np.int64)
         if points:
-            self._points = PointMotion(points, setup.model, layout)
+            self._points = PointMotion(points, setup.model.chain, layout)
+            self._watched = self._points.watched
+            self._pushes = self._points.pushes
             sampled += MOTION
         setup.output.recording = Recording(
             given=_coordinates(setup.model, recorded) | _places(points),
@@ -94,16 +98,11 @@ class Recorder(Observer):
         sites = len(self.setup.layout.sites)
         self._losses = np.zeros((n, sites))
 
-        takes_forces = FORCES in self._of_sites
-        self._watched = np.zeros(0, np.int64)
-        if self._points:
-            takes_forces = takes_forces or self._points.sites.size > 0
-            self._watched = self._points.own_cells
         # Engines do not fill empty arrays.
         self._forces = np.zeros((0, sites))
-        if takes_forces:
+        if FORCES in self._of_sites:
             self._forces = np.zeros((n, sites))
-        self._motion = np.zeros((n, 2 * self.setup.layout.dofs, self._watched.size))
+        self._motion = np.zeros((n, 3, len(self._watched)))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[energy] for energy in self._energies))}
         self._fields = self.setup.output.room(self._shape)
 
@@ -129,6 +128,7 @@ class Recorder(Observer):
             forces=self._forces[here],
             motion=self._motion[here],
             watched=self._watched,
+            pushes=self._pushes,
             spent=self._dashpots.spent(number, len(self._work[here])),
         )
 
@@ -173,8 +173,7 @@ class Recorder(Observer):
 
         chunk = self._gather(episodes)
         if self._points:
-            held = slice(self._held)
-            chunk |= self._points.gather(self._kept["time"][held], self._motion[held], self._forces[held])
+            chunk |= self._points.gather(self._motion[: self._held])
         if comm.rank == 0:
             chunk |= {name: values[: self._held] for name, values in self._kept.items()}
             # Rows of fields are the samples whose number in the run is a multiple of the stride.

@@ -9,8 +9,9 @@ import numpy as np
 
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
-from vipetsc.dynamics.drives import dashpot_power, wall_energy
+from vipetsc.dynamics.drives import dashpot_power, select_piece, wall_energy
 from vipetsc.dynamics.energies import LARGEST, Energies, add_damping, add_energy, add_loss, add_powers, measure
+from vipetsc.dynamics.equation import acceleration
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
 
@@ -22,8 +23,10 @@ class Samples(NamedTuple):
     ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
     numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
     ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples. ``forces`` (sample, owned site) in N are
-    those of the contacts, and ``motion`` (sample, 2 dof, cell) displacements before velocities of the owned cells
-    ``watched``. ``spent`` (sample, drive) in J is the time integral of c U'^2 of the dashpots to moving walls.
+    those of the contacts, and ``motion`` (sample, 3, point) displacement, velocity and acceleration of the masses
+    ``watched`` (point, 2), an owned cell and a mass of it, on which the contacts ``pushes`` (push, 3) act
+    (``points.PointMotion``). ``spent`` (sample, drive) in J is the time integral of c U'^2 of the dashpots to moving
+    walls.
     """
 
     number: int
@@ -41,6 +44,7 @@ class Samples(NamedTuple):
     forces: np.ndarray
     motion: np.ndarray
     watched: np.ndarray
+    pushes: np.ndarray
     spent: np.ndarray
 
     def rows(self, samples: int) -> int:
@@ -53,8 +57,7 @@ class Samples(NamedTuple):
 def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
     """Store the rank's part ``y`` (component,) of the state, ghosts up to date, as sample ``k``; whether it is finite.
 
-    ``contacts`` (site,) of dtype ``SITE`` have the modes of the sites; ``rows`` (owned site,) are those of the sites
-    that the rank owns.
+    ``contacts`` of dtype ``SITE`` have the modes of the sites; ``rows`` (site,) are those of ``Layout.contacts``.
     """
     shape = samples.lattice.shape
     drives = samples.lattice.drives
@@ -89,9 +92,8 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
         _record_fields(y, number, samples)
     if samples.forces.shape[0] > 0:
         _record_forces(y, k, samples, contacts, rows)
-    for i in range(samples.watched.size):
-        for row in range(2 * shape.dofs):
-            samples.motion[k, row, i] = y[row * shape.cells + samples.watched[i]]
+    if samples.watched.shape[0] > 0:
+        _record_points(y, k, samples, contacts, rows)
     return _is_finite(samples, k)
 
 
@@ -104,9 +106,9 @@ def _take_clipped(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray,
     lattice = samples.lattice
     for i in range(lattice.site_dofs.size):
         column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
-        if column >= 0 and abs(contacts[rows[column]].mode) == CLIPPED:
+        if column >= 0 and abs(contacts[rows[i]].mode) == CLIPPED:
             w, _ = relative_motion(y, lattice.site_dofs, i)
-            energy = clipped_energy(contacts[rows[column]], w)
+            energy = clipped_energy(contacts[rows[i]], w)
             samples.losses[k, column] -= energy
             add_loss(samples.sums[k], -energy, samples.unit)
 
@@ -143,7 +145,31 @@ def _record_forces(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray
         column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
         if column >= 0:
             w, rate = relative_motion(y, lattice.site_dofs, i)
-            samples.forces[k, column] = contact_force(contacts, rows[column], w, rate)[0]
+            samples.forces[k, column] = contact_force(contacts, rows[i], w, rate)[0]
+
+
+@kernel
+def _record_points(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
+    """Record the motion of the watched masses at sample ``k``; ``contacts`` and ``rows`` are as in ``take_sample``."""
+    lattice = samples.lattice
+    n = lattice.shape.cells
+    t = (samples.number + k) * samples.interval
+    for i in range(lattice.drives.rows.size):
+        select_piece(lattice.drives, i, t)
+    # The contacts' forces beyond those of the static state come first: there are few, and each is at a known point.
+    samples.motion[k] = 0.0
+    for j in range(samples.pushes.shape[0]):
+        site = samples.pushes[j, 1]
+        w, rate = relative_motion(y, lattice.site_dofs, site)
+        force = contact_force(contacts, rows[site], w, rate)[0] - contacts[rows[site]].preload
+        samples.motion[k, 2, samples.pushes[j, 0]] += samples.pushes[j, 2] * force
+
+    for i in range(samples.watched.shape[0]):
+        cell = samples.watched[i, 0]
+        mass = samples.watched[i, 1]
+        samples.motion[k, 0, i] = y[mass * n + cell]
+        samples.motion[k, 1, i] = y[(lattice.shape.dofs + mass) * n + cell]
+        samples.motion[k, 2, i] = acceleration(t, y, lattice, cell, mass, samples.motion[k, 2, i])
 
 
 @dataclass(frozen=True)

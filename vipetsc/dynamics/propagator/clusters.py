@@ -73,7 +73,7 @@ class DofTables(NamedTuple):
     then those of Q_k, and ``factors`` 1/k! and then H/k!.
 
     ``ledger`` lists the DoFs whose energies the rank's part of the state contains, in the order in which it does: the
-    works of the rank's drives, then what its sites have dissipated.
+    works of the rank's drives, then what its sites have dissipated. ``acting`` lists those of ``Layout.contacts``.
     """
 
     column: np.ndarray
@@ -87,6 +87,7 @@ class DofTables(NamedTuple):
     springs: np.ndarray
     first: np.ndarray
     ledger: np.ndarray
+    acting: np.ndarray
 
 
 def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
@@ -149,6 +150,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
         springs=groups.counts(numbers >= len(model.chain.sites)),
         first=groups.first,
         ledger=ledger,
+        acting=places[list(layout.contacts)],
     )
     return Record(tables)
 

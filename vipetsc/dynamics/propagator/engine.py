@@ -120,9 +120,7 @@ def take_steps(
         if is_sample or steps == progress.last:
             _complete(state, states, dofs.ledger, clusters.energy, halo.columns)
         if is_sample:
-            # Behind the drives' works the ledger has the losses of the owned sites.
-            own_sites = dofs.ledger[samples.lattice.drives.rows.size :]
-            is_finite = take_sample(state, k, samples, clusters.contacts, own_sites)
+            is_finite = take_sample(state, k, samples, clusters.contacts, dofs.acting)
             if not is_finite and progress.failed == NEVER:
                 progress.failed = 2 * steps
         failed = progress.failed < NEVER

@@ -85,7 +85,7 @@ class Integrator(Engine):
         self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "missed", "switches"), 0)
         self._logged = np.isin(layout.contacts, layout.sites)  # other ranks log the others
-        self._own_rows = np.flatnonzero(self._logged)
+        self._rows = np.arange(len(layout.contacts))
         self._stop = stop or StopRequest()
         self._any_open = False
         # Whether the next step begins at an onset, after which a force is not smooth in time.
@@ -149,7 +149,7 @@ class Integrator(Engine):
                 return FillResult(k, stalled=str(error))
             if not goes_on:
                 return FillResult(k, stopped=True)
-            take_sample(self._components, k, record, self.lattice.contacts, self._own_rows)
+            take_sample(self._components, k, record, self.lattice.contacts, self._rows)
         return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:

@@ -18,31 +18,13 @@ from vipetsc.contact.changes import first_change
 from vipetsc.contact.law import FREE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import drive_force
+from vipetsc.dynamics.equation import acceleration
 from vipetsc.dynamics.lattice_record import LATTICE, LatticeRecord
 from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import relative_motion
-from vipetsc.dynamics.springs import (
-    damping_powers,
-    inverse_mass,
-    nonlinear_force_on,
-    spring_acceleration,
-    spring_accelerations,
-)
+from vipetsc.dynamics.springs import damping_powers, inverse_mass, nonlinear_force_on, spring_accelerations
 from vipetsc.records import Record, record_at
-
-
-@kernel
-def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
-    """Acceleration of one mass by its springs, a contact ``force`` and the drives."""
-    per_mass = inverse_mass(lattice, cell, mass)
-    acceleration = spring_acceleration(y, lattice, cell, mass) + force * per_mass
-    if lattice.nonlinear.size > 0:
-        acceleration += nonlinear_force_on(y, lattice, cell, mass) * per_mass
-    for i in range(lattice.drives.rows.size):
-        if lattice.drives.rows[i].target == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
-            acceleration += drive_force(lattice.drives, i, t) * per_mass
-    return acceleration
 
 
 @kernel
@@ -54,8 +36,8 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
         force -= lattice.contacts[i].preload
         host = lattice.site_dofs[i].host
         resonator = lattice.site_dofs[i].resonator
-        at_host = _acceleration(t, y, lattice, host.cell, host.mass, force)
-        at_resonator = _acceleration(t, y, lattice, resonator.cell, resonator.mass, -force)
+        at_host = acceleration(t, y, lattice, host.cell, host.mass, force)
+        at_resonator = acceleration(t, y, lattice, resonator.cell, resonator.mass, -force)
         motion[i, 0] = w
         motion[i, 1] = rate
         motion[i, 2] = at_resonator - at_host
