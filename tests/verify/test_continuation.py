@@ -10,7 +10,9 @@ import pytest
 
 from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
 from tests.verify.conftest import follow
+from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
+from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation, Segment, locate
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.flow import MAPS, Dop853Flow
@@ -172,3 +174,31 @@ def test_a_crossing_at_a_regular_point_is_found(nudge):
     second = locate(problem, on_it, replace(right, step=segment.length - known.step), before=left)
     (found,) = [p for p in [*first, *second] if p.kind == "symmetry-breaking"]
     assert found.energy == pytest.approx(known.energy, rel=1e-8)
+
+
+def test_three_branch_points_about_one_change_of_contact_are_found():
+    """Where a contact ends within a step, branch points on both sides are found: the half-trace bends up to 1 there."""
+    contacts = {"law": "bilinear", "modulus": 1e8, "restitution": 1.0}
+    lattice = {"preset": "four-band", "reading": "printed"}
+    method = ShootingMethod(NnmCase.from_table({"lattice": lattice, "contacts": contacts, "nnm": {"modes": [1]}}))
+    problem = method.shooting
+    # The step of the in-phase branch from 633 kJ down to 620 kJ, with a contact less from 625.8 kJ on.
+    x = np.array([7.959026812140146, 7.96178915057509])
+    frame = problem.relative_frame(x, 0.003143283122999154)
+    row = np.append(frame.xi[:-1], 0.0)
+    left = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
+    left = replace(left, tangent=np.array([-0.7446639488, -0.7421625468, 4.172e-8]))
+    frame = problem.frame(left, "relative")
+    left = frame.measures(frame.correct(frame.xi, 0.0), frame.tangent_at(frame.xi))
+    frame = problem.frame(left, "relative")
+    attempt = frame.correct(frame.xi + 0.1 * frame.tangent, 0.1)
+    right = frame.measures(attempt, frame.tangent_at(attempt.xi))
+    right = replace(right, index=left.index + 1, step=0.1)
+
+    special = locate(problem, left, right, grazing=True)
+
+    assert [p.kind for p in special] == ["branch-point", "branch-point", "grazing", "branch-point"]
+    assert [p.energy for p in special] == pytest.approx([626351.3, 625914.8, 625837.1, 625656.3], rel=1e-6)
+    for point in special:
+        if point.kind == "branch-point":
+            assert point.half_traces[0] == pytest.approx(1.0, abs=1e-9)

@@ -30,6 +30,7 @@ t . (xi - xi_left) = s, with the left point's unknowns and unit tangent t. The f
 neighbouring points (``Segment``).
 """
 
+import itertools
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -470,6 +471,8 @@ MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
 # the estimate is beyond zero or below this fraction of the smaller value at the ends: the parabola may be wrong by as
 # much.
 NEAR = 0.5
+# Zeros of one test that are nearer to one another than this fraction of the segment's length are one zero.
+APART = 1e-6
 # A special point is sought to this fraction of the segment's length: values of its test have errors of 1e-11.
 EXACT = 1e-10
 
@@ -539,14 +542,17 @@ class Segment(Generic[S]):
         self._add_knot(arclength, attempt.xi, direction)
         return replace(point, index=self.right.index, step=arclength)
 
-    def roots(self, kind: SpecialKind[S], before: S | None) -> list[S]:
+    def roots(self, kind: SpecialKind[S], before: S | None, bends: Sequence[float] = ()) -> list[S]:
         """Points of a kind, where its test vanishes and that the kind accepts.
 
         There is one if the test has two signs at the ends. If it has one sign but turns back between them, as the point
-        ``before`` the left one shows, there may be two, one on each side of the turn. Raises NoMotionError where a
-        zero between two signs is not found.
+        ``before`` the left one shows, there may be two, one on each side of the turn. At the arclengths ``bends``,
+        where contacts begin or end, tests bend sharply, so that there may be more on both sides. Raises NoMotionError
+        where a zero between two signs is not found.
         """
         points = self._zeros(kind, before)
+        if bends:
+            points += self._further_zeros(kind, points, bends)
         if kind.accept is None:
             return points
         return [point for point in points if kind.accept(point)]
@@ -575,6 +581,29 @@ class Segment(Generic[S]):
         with suppress(NoMotionError):
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
+
+    def _further_zeros(self, kind: SpecialKind[S], points: list[S], bends: Sequence[float]) -> list[S]:
+        """The zeros of the kind's test, besides ``points``, that its values at and between the ``bends`` show."""
+        places = [point.step for point in points]
+        ends = sorted({0.0, *bends, *places, self.length})
+        middles = [(a + b) / 2 for a, b in itertools.pairwise(ends)]
+        samples = [(0.0, self.left)]
+        for arclength in sorted([*bends, *middles]):
+            # A sample only suggests further zeros. Where there is no point, none need be missed.
+            with suppress(NoMotionError):
+                samples.append((arclength, self.at(arclength)))
+        samples.append((self.length, self.right))
+
+        further = []
+        certain = [(arclength, point) for arclength, point in samples if abs(kind.test(point)) > kind.floor]
+        for (low, a), (high, b) in itertools.pairwise(certain):
+            if kind.test(a) * kind.test(b) > 0 or any(low < place < high for place in places):
+                continue
+            zero = self.between(a, b, low).root(kind)
+            # Where a point lies on a bend itself, the sign there is that of rounding.
+            if all(abs(zero.step - place) > APART * self.length for place in places):
+                further.append(zero)
+        return further
 
     def _zero_beside_left(self, kind: SpecialKind[S], before: S | None) -> list[S]:
         """The zero next to the left point, whose value is within the floor, if those on its two sides differ in sign.
@@ -680,7 +709,8 @@ def locate(
     Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``, and those
     ``chosen``. ``chart`` is as for ``Continuation``. With ``grazing`` every change of the number of contacts is located
     as well, which takes about 40 corrections where it must be bracketed. With the point ``before`` the left one, two
-    special points of one kind within the step are found as well. For each special point that cannot be located a
+    special points of one kind within the step are found as well, and with ``grazing`` those on both sides of a change
+    of contact. For each special point that cannot be located a
     sentence is appended to ``missed``.
 
     An energy fold has a half-trace of 1, as a branch point has. In a step with an energy fold no branch point is
@@ -688,13 +718,19 @@ def locate(
     """
     points: list[S] = []
     segment = Segment(problem, chart, left, right)
-    for kind in [*problem.special_kinds(left, right), *chosen]:
-        if kind.name == "grazing" and not grazing:
-            continue
+    kinds = [*problem.special_kinds(left, right), *chosen]
+    if not grazing:
+        kinds = [kind for kind in kinds if kind.name != "grazing"]
+    # Where contacts begin or end is found first: there the tests of the other kinds bend.
+    kinds.sort(key=lambda kind: kind.name != "grazing")
+    for kind in kinds:
         if kind.name == "branch-point" and any(p.kind == "fold-energy" for p in points):
             continue
         try:
-            roots = segment.roots(kind, before)
+            bends = [p.step for p in points if p.kind == "grazing"]
+            if kind.name == "grazing":
+                bends = []
+            roots = segment.roots(kind, before, bends)
             # Contacts that begin at one point, by a symmetry, make one special point.
             points += [p for p in roots if not _is_among(p, kind.name, points, segment.length)]
         except NoMotionError as error:
