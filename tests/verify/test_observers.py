@@ -149,7 +149,8 @@ class Watch(Observer):
 def test_an_observer_is_given_and_goes_on_with_the_run(folder):
     case = small_case(time={"end": 0.04})
     straight = simulate(case, folder / "straight", observers=[Watch])
-    assert Watch.calls == ["begin", "finish"]
+    # A run in a folder keeps its end, from which it can be extended.
+    assert Watch.calls == ["begin", "flush", "checkpoint", "finish"]
 
     run = datasets(folder / "straight" / "run.h5")
     assert straight.statistics["fastest"] == np.abs(run["velocity"]).max()
@@ -159,7 +160,7 @@ def test_an_observer_is_given_and_goes_on_with_the_run(folder):
     assert Watch.calls == ["begin", "flush", "checkpoint", "stopped"]
 
     resumed = simulate(case, folder / "stopped", resume=True, observers=[Watch])
-    assert Watch.calls == ["begin", "restore", "finish"]
+    assert Watch.calls == ["begin", "restore", "flush", "checkpoint", "finish"]
     assert stopped.statistics["watched"] + resumed.statistics["watched"] == straight.statistics["watched"]
     for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples", "steps", "switches", "grazes"):
         assert resumed.statistics[name] == straight.statistics[name], name

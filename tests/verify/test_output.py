@@ -112,7 +112,7 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
     for resume in (True, False):
         assert simulate(case, folder / "run", resume=resume).complete
     assert_same_bits(run, datasets(folder / "run" / "run.h5"))
-    assert {p.name for p in (folder / "run").iterdir()} == {"run.h5", "case.toml", "summary.json"}
+    assert {p.name for p in (folder / "run").iterdir()} == {"run.h5", "case.toml", "summary.json", "end-state"}
 
 
 def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
