@@ -132,12 +132,13 @@ def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any
 
     # Within the cell each pair once, to the next cell all.
     springs: list[dict[str, Any]] = []
-    for values, dashpots, next_cell in (
+    for stiffnesses, dampings, next_cell in (
         (np.triu(stiffness.inside, 1), np.triu(damping.inside, 1), False),
         (stiffness.next, damping.next, True),
     ):
-        coupled = _significant(values, stiffness) | _significant(dashpots, damping)
-        for i, j in np.argwhere(coupled).tolist():
+        values = np.where(_significant(stiffnesses, stiffness), stiffnesses, 0.0)
+        dashpots = np.where(_significant(dampings, damping), dampings, 0.0)
+        for i, j in np.argwhere((values != 0) | (dashpots != 0)).tolist():
             spring = {"start": i + 1, "end": j + 1, "stiffness": -float(values[i, j]), "next_cell": next_cell}
             if dashpots[i, j]:
                 spring["damping"] = -float(dashpots[i, j])

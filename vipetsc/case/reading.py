@@ -276,7 +276,10 @@ def _put_item(entries: list[Any], index: int, path: str, value: Any) -> list[Pro
 
 
 def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:
-    """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
+    """Return the section ``name`` and its problems; with problems, the section holds the valid keys and defaults.
+
+    All keys of the ``kind`` have defaults: a required key belongs to a table within a section.
+    """
     if not isinstance(table, dict):
         return kind(), [Problem(name, table, f"must be a section [{name}]")]
 

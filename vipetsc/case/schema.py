@@ -306,8 +306,8 @@ class TimeTable(Section):
         unit="s",
     )
     engine: Literal["ts", "propagator", "auto"] = described(
-        "Runge-Kutta steps (ts), exact linear steps (propagator), or the propagator where it applies,"
-        " otherwise ts (auto)",
+        "Runge-Kutta steps (ts), or exact linear steps (propagator, auto): where these do not apply, ts is"
+        " taken, and the summary says why",
         "auto",
     )
     method: Method = described("PETSc's Runge-Kutta method for ts", "8vr")

@@ -268,7 +268,6 @@ class Chain:
         index = np.arange(start, stop, dtype=np.int64)
         for coupling in self.cell.couplings():
             # The cell in which the spring begins, as a row of ``values``: this one's is 1.
-            # The cell in which the spring begins, as a row of ``values``: this one's is 1.
             owner = 1 + min(coupling.offset, 0)
             value = values[owner : owner + stop - start, coupling.spring]
             here = index * d + coupling.mass

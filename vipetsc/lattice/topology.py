@@ -1,4 +1,4 @@
-"""How the cells of a lattice follow each other, and what lies beyond its ends: no other module decides that.
+"""How the cells of a lattice follow each other, and what lies beyond its ends.
 
 A cell has the number of its place, from 0. What lies at another number is the other end of a ring, a wall that holds
 springs and does not move, or nothing.
