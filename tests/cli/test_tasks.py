@@ -1,4 +1,4 @@
-"""Thirteen questions that a user may have, each answered by the commands of the manual, without a script."""
+"""Questions of a day in a laboratory, each answered by the commands of the manual, without a script."""
 
 from __future__ import annotations
 
@@ -413,3 +413,38 @@ def test_impacts_as_a_table_and_points_of_two_runs(typed, put, tmp_path):
         assert impacts["loss"].sum() == pytest.approx(float(run["energy/dissipated"][-1]), rel=1e-6)
     assert len(table(tmp_path / "loud/curves/run-impacts.csv")) == len(impacts) > 0
     assert any(name.startswith("points") for name in pages(tmp_path / "loud"))
+
+
+def test_a_measured_acceleration_shakes_a_lattice(typed, tmp_path):
+    """The table's motion is integrated from a record in g and ms, with an offset of 0.195 m/s^2 that is removed."""
+    typed("examples accelerogram")
+    printed = typed("run accelerogram.toml --set output.figures=false --set time.end=0.2")
+    assert "offset 0.1946 m/s^2" in " ".join(printed.split())
+    with vipetsc.open(tmp_path / "runs/accelerogram") as run:
+        first, last = np.abs(run["points/displacement"]).max("time").values
+    # A stop 2e-4 m from the last mass holds it on one side.
+    assert first > last > 2e-4
+
+
+def test_a_linear_frequency_response(typed, tmp_path):
+    """Four masses between frames resonate at 2 sqrt(k/m) sin(n pi/10); in dB and Hz, as wide as a column."""
+    typed("examples linear-response\nnfrc linear-response.toml --out response")
+    typed("plot response --db --unit Hz --width 86mm --no-title")
+    rows = table(next((tmp_path / "response").glob("branch-*.csv")))
+    frequency = np.array([float(row["frequency"]) for row in rows])
+    size = np.array([float(row["peak_displacement/first"]) for row in rows])
+    peaks = frequency[1:-1][(size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])]
+    assert peaks == pytest.approx(2 * 400.0 * np.sin(np.arange(1, 5) * np.pi / 10), abs=1.0)
+    assert any(name.startswith("outputs") for name in pages(tmp_path / "response"))
+
+
+def test_a_run_goes_on(typed, put, tmp_path):
+    """A run that is extended has the bits of a longer one."""
+    put("mine.toml", my_lattice(), PLAIN)
+    typed(
+        "run mine.toml --out short --set time.end=0.04\nrun mine.toml --out short --set time.end=0.06 --extend\n"
+        "run mine.toml --out long --set time.end=0.06"
+    )
+    with vipetsc.open(tmp_path / "short") as short, vipetsc.open(tmp_path / "long") as whole:
+        assert len(short["impacts/onset"]) > 0
+        assert short.equals(whole)

@@ -84,7 +84,10 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     result = simulate(case, work.folder, work.comm, extend=work.options.extend, **work.keywords)
     work.warn(result.warnings)
     faster = on_root(work.comm, lambda: estimate(RunPlan.of(case), work.comm.size).faster)
-    work.report(run_table(result, faster))
+    measured_drives = [
+        drive.describe() for _, drive in case.drive.every if drive.amplitude and drive.samples is not None
+    ]
+    work.report(run_table(result, faster, measured_drives))
     if work.comm.rank == 0:
         logger.debug("statistics %s", json.dumps(result.statistics))
     # After a request to stop: the run is saved, and the next command measures it.
@@ -218,8 +221,11 @@ def _drive_rows(case: Case) -> Rows:
     return [*rows, (f"{noun}, end", f"{drive_end}, {run_end}")]
 
 
-def run_table(result: "Result", faster: str = "") -> str:
-    """Ending and statistics of a run as text; ``faster`` names a faster alternative, if there is one."""
+def run_table(result: "Result", faster: str = "", drives: Sequence[str] = ()) -> str:
+    """Return the ending and the statistics of a run as text, with descriptions of its measured ``drives``.
+
+    ``faster`` names a faster alternative, if there is one.
+    """
     numbers = result.statistics
     if numbers["engine"] == "propagator":
         method = f"{numbers['method']}, {numbers['bandwidth']} cells to each side, exact to {numbers['truncation']:.1g}"
@@ -251,6 +257,7 @@ def run_table(result: "Result", faster: str = "") -> str:
     time = f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"
 
     rows = [
+        *[("drive", text) for text in drives],
         ("energy", energy),
         ("impacts", f"{numbers['episodes']} episodes, {numbers['landings']} landings"),
         ("restitution", restitution),
