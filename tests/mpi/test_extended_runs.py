@@ -57,7 +57,8 @@ def test_what_cannot_go_on_is_refused(folder):
     for case in (case_until(0.01, "ts"), case_until(0.03, "ts", drive={"amplitude": 7.0})):
         with pytest.raises(FolderError, match="another run") as refused:
             simulate(case, path, extend=True)
-        assert "--extend" not in str(refused.value)
+        assert "changes nothing else" in str(refused.value)
+        assert "--force" not in str(refused.value)
 
     (path / "end-state" / "source").unlink()
     with pytest.raises(FolderError, match="end-state"):

@@ -7,12 +7,12 @@ import pytest
 import scipy
 from scipy.integrate import solve_ivp
 
-from vipetsc.case import Case
+from vipetsc.case import Case, Sweep
 from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.dynamics import simulate
-from vipetsc.lattice import bloch
+from vipetsc.lattice import bloch, pass_bands
 
 ELEMENTS = 20
 LENGTH = 0.4  # m, of a cell
@@ -219,3 +219,23 @@ def test_the_coupling_to_the_next_cell_may_be_given(tmp_path):
             blocks[f"{name}_next"][:, :2] = matrix[:40, 40:]
     np.savez(tmp_path / "blocks.npz", **blocks)
     assert Case.from_table(table({"matrices": str(tmp_path / "blocks.npz")})).lattice.unit_cell() == cell
+
+
+def test_members_of_a_sweep_have_their_own_matrices(tmp_path):
+    """Names of matrices that a sweep varies replace those of the case, whose springs were filled in before."""
+    blocks = {"M": np.eye(2), "K": np.array([[3.0, -1.0], [-1.0, 3.0]]), "K_next": np.array([[0.0, 0.0], [-1.0, 0.0]])}
+    for name, size in (("soft", 1.0), ("stiff", 4.0)):
+        np.savez(tmp_path / f"{name}.npz", **{key: size * value for key, value in blocks.items()} | {"M": np.eye(2)})
+    case = {
+        "lattice": {"cells": 8, "cell": {"matrices": str(tmp_path / "soft.npz")}},
+        "contacts": {"sites": []},
+        "drive": {"waveform": "harmonic", "frequency": 1.5, "amplitude": 1.0},
+        "time": {"end": 10.0},
+    }
+    names = [str(tmp_path / "stiff.npz"), str(tmp_path / "soft.npz")]
+    plan = Sweep.from_table(case | {"sweep": {"lattice": {"cell": {"matrices": names}}}})
+    tops = [pass_bands(plan.case(number).lattice.unit_cell())[-1].high for number in range(2)]
+    assert tops[0] == pytest.approx(2 * tops[1])
+
+    with pytest.raises(CaseError, match="boundary"):
+        Case.from_table(case).varied(lattice={"cell": {"boundary": [[1], [2]]}})

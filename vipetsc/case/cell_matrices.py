@@ -10,6 +10,7 @@ which the acceleration is a force over a mass. Coordinates in which a full matri
 also of other cells where it couples these.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
@@ -28,6 +29,7 @@ MOST_SPRINGS = 20_000
 SYMMETRIC = 1e-6
 ROUNDING = 1e-12
 NAMES = ("M", "K", "C", "K_next", "C_next")
+FILLED = {"masses", "springs", "grounding", "from_matrices"}  # keys of a cell that matrices fill in
 
 
 class MatrixError(ValueError):
@@ -45,20 +47,28 @@ class _Assembled(NamedTuple):
 
 
 def with_matrices(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
-    """``table`` with the masses, springs and dashpots of the cell whose matrices it names, and what is wrong there."""
+    """Return ``table`` with the masses, springs and dashpots of the cell whose matrices it names, and problems with it.
+
+    ``from_matrices`` takes the place of the names: results are read where the files are gone. Names that are given for
+    such a cell, by a sweep for instance, replace the matrices that it was made of.
+    """
     lattice = table.get("lattice")
     # Types are not checked yet.
     cell = lattice.get("cell") if isinstance(lattice, dict) else None
     if not isinstance(cell, dict) or not isinstance(lattice, dict):
         return table, []
+    if "boundary" in cell and "matrices" not in cell:
+        return table, [Problem("lattice.cell.boundary", cell["boundary"], "belongs to matrices; give these, too")]
     names = cell.get("matrices")
     if isinstance(names, str):
         names = [names]
-    # With a hash the cell is a resolved one: results are read where the files are gone.
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or "sha256" in cell:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return table, []
 
-    if {"masses", "springs", "grounding"} & cell.keys():
+    earlier = cell.get("from_matrices")
+    if isinstance(earlier, dict):
+        cell = {"boundary": earlier.get("boundary")} | {k: v for k, v in cell.items() if k not in FILLED}
+    if FILLED & cell.keys():
         return table, [Problem(KEY, cell["matrices"], "give it or masses, springs and grounding, not both")]
     try:
         files = [resolved_path(name) for name in names]
@@ -70,19 +80,22 @@ def with_matrices(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         return table, [Problem(KEY, cell["matrices"], f"{error}; give an NPZ file, or a list of MatrixMarket files")]
 
-    absolute: Any = [str(file) for file in files]
-    if len(files) == 1:
-        absolute = absolute[0]
-    cell = cell | filled | {"matrices": absolute, "sha256": digests}
-    return table | {"lattice": lattice | {"cell": cell}}, []
+    made: dict[str, Any] = {"files": [str(file) for file in files], "sha256": digests}
+    if cell.get("boundary") is not None:
+        made["boundary"] = cell["boundary"]
+    cell = {key: value for key, value in cell.items() if key not in ("matrices", "boundary")}
+    return table | {"lattice": lattice | {"cell": cell | filled | {"from_matrices": made}}}, []
 
 
 def _read(files: list[Path]) -> dict[str, np.ndarray]:
     """The matrices in one NPZ file by their names, or M, K and perhaps C in MatrixMarket files of one each."""
     if len(files) == 1:
         # Arrays outside an archive have no names, and text is no archive: NumPy says so.
-        with np.load(files[0], allow_pickle=False) as archive:
-            arrays: dict[str, Any] = dict(archive)
+        archive = np.load(files[0], allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise MatrixError("is one array, and no archive of M and K by their names")
+        with archive:
+            arrays: dict[str, Any] = {name: _array(archive, name) for name in archive.files}
         if not {"M", "K"} <= arrays.keys() <= {*NAMES}:
             raise MatrixError(f"has {', '.join(arrays)}; it needs M and K, and may have {', '.join(NAMES[2:])}")
     elif len(files) in (2, 3):
@@ -94,7 +107,8 @@ def _read(files: list[Path]) -> dict[str, np.ndarray]:
     for name, matrix in arrays.items():
         if scipy.sparse.issparse(matrix):
             matrix = matrix.toarray()
-        if np.iscomplexobj(matrix) or np.ndim(matrix) != 2 or np.shape(matrix) != arrays["M"].shape[::-1]:
+        is_real = np.asarray(matrix).dtype.kind in "biuf"
+        if not is_real or np.ndim(matrix) != 2 or np.shape(matrix) != arrays["M"].shape[::-1]:
             raise MatrixError(f"{name} is {matrix.dtype}, {np.shape(matrix)}; all must be real, square and of one size")
         matrices[name] = np.asarray(matrix, float)
         if not np.all(np.isfinite(matrices[name])):
@@ -103,6 +117,14 @@ def _read(files: list[Path]) -> dict[str, np.ndarray]:
         if name in matrices:
             matrices[name] = _symmetric(name, matrices[name])
     return matrices
+
+
+def _array(archive: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return the array ``name`` of an archive; raises MatrixError for one of objects, as sparse matrices are."""
+    try:
+        return np.asarray(archive[name])
+    except ValueError as error:
+        raise MatrixError(f"{name} is stored as an object: store its full matrix, as {name}.toarray() is") from error
 
 
 def _symmetric(name: str, matrix: np.ndarray) -> np.ndarray:
@@ -169,7 +191,7 @@ def _boundaries(boundary: Any, size: int) -> tuple[list[int], list[int]]:
     rows = [row for side in boundary for row in side]
     if not all(type(row) is int and 1 <= row <= size for row in rows):
         raise MatrixError(remedy)
-    if len(boundary[0]) != len(boundary[1]) or len({*rows}) != len(rows):
+    if not boundary[0] or len(boundary[0]) != len(boundary[1]) or len({*rows}) != len(rows):
         raise MatrixError(remedy)
     left, right = ([row - 1 for row in side] for side in boundary)
     return left, right

@@ -127,7 +127,7 @@ def _check_place(
     if lattice.ends != "fixed":
         remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
-    if lattice.cell and lattice.cell.matrices:
+    if lattice.cell and lattice.cell.from_matrices:
         remedy = (
             "a wall moves all degrees of freedom of its cell alike, which rotations do not; give drive.cell and mass"
         )

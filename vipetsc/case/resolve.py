@@ -198,7 +198,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 def _check_stability(lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
     """Problems with negative springs and dashpots of a ``cell``, and with ends that its matrices do not have."""
-    of_matrices = lattice.cell is not None and lattice.cell.matrices is not None
+    of_matrices = lattice.cell is not None and lattice.cell.from_matrices is not None
     if of_matrices and lattice.ends == "free" and cell.is_grounded:
         # Cut springs leave the ground springs by which a bent or a turned structure is not strained.
         remedy = 'the matrices pull to the ground, as those with rotations do: use "fixed" or "periodic"'

@@ -155,6 +155,14 @@ class SpringTable(Section):
         )
 
 
+class MatricesTable(Section):
+    """Files of matrices from which a cell was made, as the resolved case records them."""
+
+    files: list[str] = described("the files, by their absolute names")
+    sha256: list[str] = described("their SHA-256 hashes")
+    boundary: list[list[int]] | None = described("rows of the matrices on both boundaries", None)
+
+
 class CellTable(Section):
     """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground.
 
@@ -176,7 +184,7 @@ class CellTable(Section):
         "rows of the matrices on the left boundary, and those on the right one, which is the left one of the next cell",
         None,
     )
-    sha256: list[str] | None = described("SHA-256 hashes of the files of matrices, filled in", None)
+    from_matrices: MatricesTable | None = described("files of the matrices that the cell was made of, filled in", None)
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""

@@ -225,6 +225,8 @@ def _problem(
         if extend:
             return extend()
         remedy = f"go on from its end with --extend, {remedy}"
+    elif extend:
+        remedy = f"--extend takes a later {kind.grows} and changes nothing else; choose another folder with --out"
 
     differing = []
     for key in keys:

@@ -250,6 +250,9 @@ def run_table(result: "Result", faster: str = "", drives: Sequence[str] = ()) ->
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
     if rebounds:
         restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)"
+    exponent = ""
+    if (largest := numbers.get("lyapunov")) is not None:
+        exponent = f"{largest:.4g} +- {numbers['lyapunov_error']:.2g} 1/s, the largest exponent"
     limits = [f"{counted(numbers[name], 'contact')} {text}" for name, text in LIMITS.items() if numbers.get(name)]
     engine = ""
     if note := numbers.get("engine_note"):
@@ -261,6 +264,7 @@ def run_table(result: "Result", faster: str = "", drives: Sequence[str] = ()) ->
         ("energy", energy),
         ("impacts", f"{numbers['episodes']} episodes, {numbers['landings']} landings"),
         ("restitution", restitution),
+        ("lyapunov", exponent),
         ("limits", ", ".join(limits)),
         ("steps", steps),
         ("time", time),
