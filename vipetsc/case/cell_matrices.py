@@ -80,11 +80,11 @@ def with_matrices(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         return table, [Problem(KEY, cell["matrices"], f"{error}; give an NPZ file, or a list of MatrixMarket files")]
 
-    made: dict[str, Any] = {"files": [str(file) for file in files], "sha256": digests}
+    source: dict[str, Any] = {"files": [str(file) for file in files], "sha256": digests}
     if cell.get("boundary") is not None:
-        made["boundary"] = cell["boundary"]
+        source["boundary"] = cell["boundary"]
     cell = {key: value for key, value in cell.items() if key not in ("matrices", "boundary")}
-    return table | {"lattice": lattice | {"cell": cell | filled | {"from_matrices": made}}}, []
+    return table | {"lattice": lattice | {"cell": cell | filled | {"from_matrices": source}}}, []
 
 
 def _read(files: list[Path]) -> dict[str, np.ndarray]:
