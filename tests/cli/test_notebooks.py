@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,9 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_kernel_executes_one(tmp_path):
     """The shortest notebook ends in a kernel of its own, with the display of its case."""
-    pytest.importorskip("ipykernel")
+    # To import it here would make a notebook of this process: progress would have bars.
+    if find_spec("ipykernel") is None:
+        pytest.skip("ipykernel is not installed")
     client = pytest.importorskip("nbclient")
     nbformat = pytest.importorskip("nbformat")
     notebook = nbformat.read(FOLDER / "own-lattice.ipynb", as_version=4)

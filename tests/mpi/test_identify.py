@@ -24,7 +24,7 @@ def test_ranks_divide_a_single_start_to_the_same_bits(folder):
         table = lattice_table(time={"end": 0.007})
         record = measured_table(folder, table, noise=0.01) | {"begin": 0.004, "initial": "estimate"}
         unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [2e-4, 8e-4], "start": 6e-4}]
-        plan = IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, steps=2))
+        plan = IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, steps=1))
         run_identification(plan, folder / "alone", MPI.COMM_SELF)
         return plan.to_toml()
 

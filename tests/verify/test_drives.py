@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from tests.conftest import run_of
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.waveforms import waveform_of
-from vipetsc.lattice.drive import joined, sampled
+from vipetsc.lattice.drive import sampled
 
 ENGINES = ("ts", "propagator")
 BURST = {"amplitude": 3.0, "cycles": 3, "frequency": 900.0, "mass": 2, "cell": 4}
@@ -151,7 +151,7 @@ def test_between_samples_a_force_stays_between_their_values(interpolation):
     random = np.random.default_rng(5)
     times = np.cumsum(10 ** random.uniform(-6, 0, 60))
     values = random.choice([-1.0, 0.0, 1.0, 5.0], 60)
-    wave = sampled(2.0, joined(times, values, interpolation), frequency=1.0)
+    wave = sampled(2.0, times, values, 1.0, interpolation)
     for i in range(59):
         between = wave.force(np.linspace(times[i], times[i + 1], 50)[:-1])
         assert between.min() >= 2 * values[i : i + 2].min() - 1e-9

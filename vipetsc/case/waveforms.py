@@ -17,7 +17,7 @@ from vipetsc.case.samples import WALL_UNITS, SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.case.section import described
 from vipetsc.lattice import ToneBurst, Waveform
-from vipetsc.lattice.drive import impulse, main_frequency, ramped, sampled
+from vipetsc.lattice.drive import along, impulse, main_frequency, ramped
 from vipetsc.plugins import call, number_of
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 from vipetsc.wording import counted
@@ -96,7 +96,7 @@ def _build_samples(drive: "OneDrive") -> Waveform:
     assert drive.samples
     # After the last sample a wall stays where it is, and a force is 0.
     hold = drive.end is not None
-    return sampled(drive.amplitude, drive.samples.motion(), frequency=_given(drive.frequency), hold=hold)
+    return along(drive.amplitude, drive.samples.motion(), frequency=_given(drive.frequency), hold=hold)
 
 
 def _given(value: float | None) -> float:
@@ -311,7 +311,7 @@ class OneDrive(Section):
             return WALL_UNITS.get(str(quantity), "m")
         name = table.get("waveform") or DEFAULT
         # A module that registers the waveform may not be imported.
-        if name in WAVEFORMS or name in PARTS[WAVEFORM]:
+        if isinstance(name, str) and (name in WAVEFORMS or name in PARTS[WAVEFORM]):
             return waveform_record(name).unit
         return "N"
 

@@ -446,13 +446,25 @@ def joined(
     return Joined(curve.antiderivative(derivative), removed)
 
 
-def sampled(amplitude: float, motion: Joined, frequency: float, hold: bool = False) -> Pieces:
-    """Return ``amplitude`` times the curve of ``motion`` over its samples, two or more.
+def sampled(
+    amplitude: float,
+    times: ArrayLike,
+    values: ArrayLike,
+    frequency: float,
+    interpolation: Interpolation = "monotone",
+    hold: bool = False,
+) -> Pieces:
+    """Return ``amplitude`` times the curve through ``values`` (sample,) at ``times`` (sample,), two or more.
 
-    Their times in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
-    waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps its last value after that,
-    unless this is 0.
+    ``times`` in s since the drive's beginning rise from 0 or later; ``frequency`` in rad/s is the main one. The
+    waveform is 0 before the first sample and from the last one on. With ``hold`` it keeps the last sample's value after
+    that, unless this is 0.
     """
+    return along(amplitude, joined(times, values, interpolation), frequency, hold)
+
+
+def along(amplitude: float, motion: Joined, frequency: float, hold: bool = False) -> Pieces:
+    """Return ``amplitude`` times the curve of a ``motion``, as ``sampled`` does with that through samples."""
     times = motion.curve.x
     # What is held at zero has ended, and has a duration.
     hold &= motion.last != 0
