@@ -12,8 +12,8 @@ import pytest
 
 from tests.conftest import put_members, small_case
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.disorder import Deviation, DisorderTable, with_cell
-from vipetsc.case.schema import SpringTable
+from vipetsc.case.disorder import SCATTERED, Deviation, DisorderTable, values_of
+from vipetsc.case.quantities import table_of
 from vipetsc.case.verb_cases import disorder_of
 from vipetsc.cli.verbs.validate_verb import disorder_rows
 from vipetsc.figures.sweep_members import Files, Sweeps
@@ -202,33 +202,47 @@ def test_a_restitution_is_drawn_for_every_site():
 
 
 def test_a_cell_with_scattered_springs_keeps_their_nonlinear_parts_and_dashpots():
-    springs = [
-        {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True, "quadratic": -2e6, "cubic": 3e9, "damping": 0.5},
-        {"start": 1, "end": 2, "stiffness": 2e3},
-    ]
-    lattice = {"cell": {"masses": [0.01, 0.02], "springs": springs, "grounding": [0.0, 0.1]}, "cells": 40}
-    table = {"lattice": lattice, "contacts": {"sites": []}, "drive": {"frequency": 300.0, "cycles": 4}}
+    table = EVERYTHING
     nominal = Case.from_table(table).lattice.unit_cell()
     cell = Case.from_table(table | {"disorder": {"seed": 1, "springs": {"relative": 0.02}}}).lattice.unit_cell()
 
     assert [s.stiffness for s in cell.springs] != [s.stiffness for s in nominal.springs]
     for before, after in zip(nominal.springs, cell.springs, strict=True):
         assert replace(after, stiffness=before.stiffness) == before
-    assert cell.grounding == (0.0, 0.1)
+    assert cell.grounding == (0.2, 0.1)
     assert (cell.springs[0].cubic, cell.springs[0].quadratic) == (3e9, -2e6)
 
 
-def test_a_cell_with_scattered_masses_keeps_all_that_its_springs_have():
+def test_a_cell_that_is_written_out_keeps_all_that_its_springs_have():
     # Every optional number of a spring, coefficients of its force among them.
     numbers = {field.name: 0.5 + i for i, field in enumerate(fields(Spring)) if isinstance(field.default, float)}
     assert {"damping", "quadratic", "cubic"} <= numbers.keys()
-    springs = (Spring(0, 0, 3.0, offset=1, **numbers), Spring(0, 1, 4.0))
-    cell = UnitCell(masses=(1.0, 2.0), springs=springs, host=0, resonator=1)
+    springs = (Spring(0, 0, 3.0, offset=1, **numbers), Spring(0, 1, 4.0), Spring(-1, 1, 5.0))
+    cell = UnitCell(masses=(1.0, 2.0), springs=springs, host=0, resonator=1, grounding=(0.0, 0.1))
+    assert UnitCell(*table_of(cell).arguments()) == cell
 
-    table = with_cell({"cells": 5}, cell, {"masses": [1.1, 2.2]})["cell"]
 
-    assert table["masses"] == [1.1, 2.2]
-    assert tuple(SpringTable(**spring).spring() for spring in table["springs"]) == springs
+SPRINGS = [
+    {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True, "quadratic": -2e6, "cubic": 3e9, "damping": 0.5},
+    {"start": 1, "end": 2, "stiffness": 2e3, "damping": 0.1},
+]
+EVERYTHING: dict[str, Any] = {
+    "lattice": {"cell": {"masses": [0.01, 0.02], "springs": SPRINGS, "grounding": [0.2, 0.1]}, "cells": 40},
+    "contacts": {"law": "power", "exponent": 1.4, "stiffness": 1e5, "sites": [9, 20], "clearance": 1e-3},
+    "drive": {"frequency": 300.0, "cycles": 4},
+}
+
+
+@pytest.mark.parametrize("key", SCATTERED)
+def test_each_quantity_scatters_alone_about_its_values(key):
+    """Every quantity of the table has other numbers of the right size, and all others keep theirs to the bit."""
+    nominal = values_of(dict(Case.from_table(EVERYTHING)))
+    drawn = values_of(dict(Case.from_table(EVERYTHING | {"disorder": {"seed": 2, key: {"relative": 0.01}}})))
+
+    ratio = np.divide(drawn[key], nominal[key], out=np.ones(len(nominal[key])), where=np.not_equal(nominal[key], 0))
+    assert 1e-5 < np.abs(ratio - 1).max() < 0.05
+    others = set(nominal) - {key, "modulus", "stiffness" if key == "modulus" else ""}
+    assert {name: drawn[name] for name in others} == {name: nominal[name] for name in others}
 
 
 def test_a_quantity_that_the_case_lacks_is_refused():

@@ -6,42 +6,61 @@ number of ranks, on the order of the draws or on the other quantities.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
-from typing import Annotated, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, create_model
 
 from vipetsc.case.case_file import Problem, Section, Table
-from vipetsc.case.contacts import lists_of, values_of_sites
-from vipetsc.case.inhomogeneity_sections import Deviation
-from vipetsc.case.schema import CONTACTS, LatticeTable
+from vipetsc.case.contacts import lists_of
+from vipetsc.case.inhomogeneity_sections import Deviation, ScatterTable
+from vipetsc.case.quantities import QUANTITIES, Quantity, Sections, differs_by_side
 from vipetsc.case.section import described
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Spring, UnitCell
 
 SEED = "disorder.seed"
-# The numbers of a spring besides its stiffness: its dashpot and the terms of its nonlinear force.
-SPRING_PARAMETERS = tuple(field.name for field in fields(Spring) if isinstance(field.default, float))
+# The amplitude is that of one experiment, and the clearance of each side scatters with ``clearance``.
+SCATTERED: Mapping[str, Quantity] = {
+    quantity.scattered_as or name: quantity
+    for name, quantity in QUANTITIES.items()
+    if name not in ("amplitude", "clearance_minus")
+}
+"""Quantities of ``QUANTITIES`` that scatter, by their keys."""
+OF_SITES = {
+    "sites": "scatter of each site's cell, rounded to a cell",
+    "modulus": "scatter of Young's modulus of all contacts",
+}
+"""What scatters besides: choices from which the numbers of a resolved case follow."""
+
+if TYPE_CHECKING:
+    # For the type checker, which does not see keys that are created at run time.
+    class ScatteredQuantities(Section):
+        """The deviation of each quantity that scatters."""
+
+else:
+    ScatteredQuantities = create_model(
+        "ScatteredQuantities",
+        __base__=Section,
+        **{
+            key: (Deviation | None, described(text, None))
+            for key, text in {
+                **{key: f"scatter of {quantity.text}" for key, quantity in SCATTERED.items()},
+                **OF_SITES,
+            }.items()
+        },
+    )
 
 
-class DisorderTable(Section):
+class DisorderTable(ScatteredQuantities):
     """Quantities that scatter about the values of the case, and the ``seed`` of the random numbers.
 
-    For each site: ``clearance`` (m), that of each side by itself if there is a ``clearance_minus``, ``restitution``,
-    ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a list; otherwise it is common to all sites, as
-    ``modulus`` (Pa) is. The same in all cells: ``masses`` (kg), ``springs`` (N/m).
-    For each cell: ``cells``, by quantity; the resolved case contains the request instead of the values.
+    A clearance scatters on each side by itself if there is a ``clearance_minus``; a ``stiffness`` that all sites have
+    in common scatters as one number, as the ``modulus`` does. Masses and springs are the same in all cells; those that
+    differ from cell to cell are in ``cells``, of which the resolved case contains the request instead of the values.
     """
 
     seed: Annotated[int, Field(ge=0)] = described("seed of the random numbers", 0)
-    clearance: Deviation | None = described("scatter of each site's clearance", None)
-    sites: Deviation | None = described("scatter of each site's cell, rounded to a cell", None)
-    restitution: Deviation | None = described("scatter of each site's restitution", None)
-    stiffness: Deviation | None = described("scatter of the contact stiffness of all sites", None)
-    modulus: Deviation | None = described("scatter of Young's modulus of all contacts", None)
-    masses: Deviation | None = described("scatter of the cell's masses, the same in all cells", None)
-    springs: Deviation | None = described("scatter of the cell's springs, the same in all cells", None)
     cells: dict[str, Deviation] | None = described(
         'scatter that differs from cell to cell, by quantity, as "masses[2]" = { relative = 0.01 }', None
     )
@@ -56,52 +75,36 @@ class DisorderTable(Section):
         return deviations
 
 
-def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Sequence[float]]:
-    """The values of each quantity of a resolved case, by its name; empty if the case has none.
+def values_of(sections: Sections) -> dict[str, Sequence[float]]:
+    """Return the values of each quantity of a resolved case, by its key in ``[disorder]``; none where it has none.
 
     Those of ``modulus`` are the stiffnesses of the contacts, which are proportional to it.
     """
-    cell = lattice.unit_cell()
-    sites = contacts.sites
-    clearance = contacts.clearance
-    assert isinstance(sites, list) and isinstance(clearance, list)
-    stiffness = lists_of(contacts).get("stiffness", [])
-    if not stiffness and contacts.stiffness:
-        stiffness = [contacts.stiffness]
-
-    clearance_minus = lists_of(contacts).get("clearance_minus", [])
-    if not clearance_minus and contacts.clearance_minus is not None:
-        clearance_minus = [contacts.clearance_minus] * len(sites)
-
-    return {
-        "clearance": clearance,
-        "clearance_minus": clearance_minus,
-        "sites": sites,
-        "restitution": values_of_sites(contacts, "restitution", len(sites)),
-        "stiffness": stiffness,
-        "modulus": stiffness,
-        "masses": cell.masses,
-        "springs": [spring.stiffness for spring in cell.springs],
-    }
+    contacts = sections["contacts"]
+    values: dict[str, Sequence[float]] = {"sites": contacts.sites, "clearance_minus": []}
+    for key, quantity in SCATTERED.items():
+        values[key] = [number for number in quantity.numbers(sections) if number is not None]
+    if differs_by_side(contacts):
+        values["clearance_minus"] = QUANTITIES["clearance_minus"].numbers(sections)
+    # One material for all sites scatters as one number.
+    if "stiffness" not in lists_of(contacts):
+        values["stiffness"] = [contacts.stiffness] if contacts.stiffness else []
+    return values | {"modulus": values["stiffness"]}
 
 
-def scatter(
-    sections: Mapping[str, Any], disorder: DisorderTable, given: ContactsTable
-) -> tuple[dict[str, Table], list[Problem]]:
-    """The tables of the resolved ``sections`` of a run that change by what ``disorder`` draws, and its problems.
+def scatter(sections: Sections, disorder: DisorderTable, given: ContactsTable) -> tuple[dict[str, Any], list[Problem]]:
+    """Return the resolved ``sections`` of a run with what ``disorder`` draws, and its problems.
 
     ``given`` are the contacts before they were resolved. A drive and times that follow from the cell are those of the
     case without scatter.
     """
-    lattice = sections["lattice"]
-    contacts = sections["contacts"]
     if not (disorder.quantities() or disorder.cells):
         remedy = "contains no quantity that scatters; give one, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]
 
     # A resolved case has no modulus: one that is drawn scales the stiffnesses, which are proportional to it. Where each
     # site has a modulus of its own, none holds for all sites.
-    values = values_of(lattice, contacts)
+    values = values_of(sections)
     values["modulus"] = []
     if given.modulus and values["stiffness"] and "modulus" not in lists_of(given):
         values["modulus"] = [given.modulus]
@@ -109,22 +112,36 @@ def scatter(
     if problems:
         return {}, problems
 
-    changed: dict[str, Table] = {}
-    table: Table = lattice.model_dump(by_alias=True, exclude_none=True)
+    changed = dict(sections)
     # Cells are drawn when the lattice is built, so that the text of a case need not have a million numbers.
     if disorder.cells:
-        quantities = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
-        table["scatter"] = {"seed": disorder.seed, "quantities": quantities}
-        changed["lattice"] = table
-    if drawn:
-        changed["contacts"] = _drawn_contacts(contacts, drawn, given.modulus)
-    if drawn.keys() & {"masses", "springs"}:
-        # The undamped cell: [lattice.damping] stays in the table and is added to the drawn cell.
-        changed["lattice"] = with_cell(table, lattice.undamped_cell(), drawn)
-        # A cell that is written out has no preset, from which the radius would follow.
-        if lattice.preset and "stiffness" in changed["contacts"]:
-            changed["contacts"].setdefault("radius", CONTACTS["radius"])
+        request = ScatterTable(seed=disorder.seed, quantities=disorder.cells)
+        changed["lattice"] = changed["lattice"].model_copy(update={"scatter": request})
+    for key, numbers in drawn.items():
+        changed = _put(changed, key, numbers, values[key])
     return changed, []
+
+
+def _put(sections: dict[str, Any], key: str, drawn: list[float], values: Sequence[float]) -> dict[str, Any]:
+    """Return ``sections`` with the numbers ``drawn`` about the ``values`` of the quantity with that ``key``."""
+    contacts: ContactsTable = sections["contacts"]
+    if key == "sites":
+        cells = np.rint(drawn).astype(int).tolist()
+        return sections | {"contacts": contacts.model_copy(update={"sites": cells})}
+    if key == "clearance_minus":
+        return QUANTITIES[key].put(sections, drawn)
+    if key != "modulus":
+        return SCATTERED[key].put(sections, drawn)
+
+    # Sites with radii or Poisson ratios of their own have a list of stiffnesses, beside the one of all.
+    ratio = drawn[0] / values[0]
+    update: dict[str, Any] = {}
+    if contacts.stiffness is not None:
+        update["stiffness"] = contacts.stiffness * ratio
+    if contacts.each is not None and contacts.each.stiffness:
+        stiffness = [ratio * number for number in contacts.each.stiffness]
+        update["each"] = contacts.each.model_copy(update={"stiffness": stiffness})
+    return sections | {"contacts": contacts.model_copy(update=update)}
 
 
 def with_drawn(
@@ -138,12 +155,12 @@ def with_drawn(
     ``given`` are the contacts before they were resolved.
     """
     drawn, problems = scatter(resolved, disorder, given)
-    if problems or not drawn:
+    if problems or drawn == resolved:
         return resolved, problems
 
     # Drawn values may be out of bounds: they are checked as those of a file are.
-    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
-    sections, problems = read(tables | drawn)
+    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in drawn.items()}
+    sections, problems = read(tables)
     # The file does not have these values: the message names the seed that drew them.
     return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
 
@@ -176,51 +193,3 @@ def _draw(
                 problems.append(Problem(key, numbers, f"drawn with seed {disorder.seed}, {remedy}"))
             drawn[name] = new.tolist()
     return drawn, problems
-
-
-def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], modulus: float | None) -> Table:
-    """The table of resolved ``contacts`` with the ``drawn`` numbers; a modulus in Pa is drawn about ``modulus``."""
-    table: Table = contacts.model_dump(by_alias=True, exclude_none=True)
-    if "clearance" in drawn:
-        table["clearance"] = drawn["clearance"]
-
-    # Numbers that differ from site to site are lists; one number stays that of all.
-    for name in ("clearance_minus", "restitution", "stiffness"):
-        if name not in drawn:
-            continue
-        if name in table.get("each", {}) or len(drawn[name]) > 1:
-            table["each"] = table.get("each", {}) | {name: drawn[name]}
-        else:
-            table[name] = drawn[name][0]
-
-    if "sites" in drawn:
-        table["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
-    if "modulus" in drawn and modulus:
-        ratio = drawn["modulus"][0] / modulus
-        # Sites with radii or Poisson ratios of their own have a list of stiffnesses, beside the one of all.
-        if "stiffness" in table:
-            table["stiffness"] *= ratio
-        if "stiffness" in table.get("each", {}):
-            table["each"]["stiffness"] = [ratio * stiffness for stiffness in table["each"]["stiffness"]]
-    return table
-
-
-def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) -> Table:
-    """The table ``lattice`` with a cell of its own: ``cell`` with the masses (kg) and springs (N/m) ``drawn``."""
-    stiffness = drawn.get("springs", [spring.stiffness for spring in cell.springs])
-    springs: list[Table] = []
-    for spring, value in zip(cell.springs, stiffness, strict=True):
-        table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.offset > 0}
-        # All other parameters of the spring too: a spring without one of them would be another.
-        for key in SPRING_PARAMETERS:
-            if parameter := getattr(spring, key):
-                table[key] = parameter
-        springs.append(table)
-
-    cell_table: Table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
-    if cell.grounding:
-        cell_table["grounding"] = list(cell.grounding)
-    cell_table["contact"] = [cell.host + 1, cell.resonator + 1]
-    # Without the preset and its parameters, which would contradict the cell.
-    kept_keys = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
-    return kept_keys | {"cell": cell_table}

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import CaseError
-from vipetsc.case.identify import IdentifyCase, SoughtParameter, differs_by_side
+from vipetsc.case.identify import IdentifyCase, SoughtParameter
+from vipetsc.case.quantities import differs_by_side
 from vipetsc.identification.least_squares import CLOSE, FINAL, GROWING, Minimum, Precision, least_residuals
 from vipetsc.identification.misfit import NARROW, WIDTH, Misfit
 from vipetsc.identification.motion import MotionError
@@ -64,7 +65,7 @@ def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.
     base = plan.base
     gaps = np.array(base.model().gaps)
     sides = SIDES[parameter.quantity]
-    if parameter.quantity == "clearance" and not differs_by_side(base):
+    if parameter.quantity == "clearance" and not differs_by_side(base.contacts):
         sides = [0, 1]  # one clearance for both
 
     # A site with a stop on one side has an infinite gap on the other. The largest of values with a NaN is NaN: one stop

@@ -13,5 +13,5 @@ from vipetsc.case.identify.measured import (
     SensorTable,
     read_measured,
 )
-from vipetsc.case.identify.sought import SoughtParameter, UnknownTable, differs_by_side, parameters_of, values_of
+from vipetsc.case.identify.sought import SoughtParameter, UnknownTable, parameters_of, values_of
 from vipetsc.case.identify.trial import TrialCases

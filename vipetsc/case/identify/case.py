@@ -15,18 +15,15 @@ from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table,
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.identify.measured import MeasuredError, RecordTable, read_measured, sensor_problems
 from vipetsc.case.identify.sought import (
-    OF_CELL,
-    OF_EITHER_SIGN,
-    OF_SITES,
     SoughtParameter,
     UnknownTable,
     changed_case,
-    differs_by_side,
     groups_of,
     parameters_of,
     values_of,
 )
 from vipetsc.case.identify.trial import TrialCases
+from vipetsc.case.quantities import QUANTITIES, differs_by_side
 from vipetsc.case.section import described
 from vipetsc.case.study import StudyCase
 from vipetsc.case.warnings import loss_warnings, unit_warnings
@@ -200,7 +197,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         yield from _bounds_problems(unknown, at)
 
         # The quantity is one that the case has.
-        if quantity == "clearance_minus" and not differs_by_side(base):
+        if quantity == "clearance_minus" and not differs_by_side(base.contacts):
             remedy = "the case has no other clearance on the side w < 0; set contacts.clearance_minus"
             yield Problem(f"{at}.quantity", quantity, remedy)
             continue
@@ -216,7 +213,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.quantity", quantity, remedy)
         if quantity == "amplitude" and all("amplitude" in record.drive for record in options.records):
             yield Problem(f"{at}.quantity", quantity, "every record gives its amplitude; none is left to be sought")
-        if quantity in OF_CELL and (base.lattice.profiles or base.lattice.absorbing):
+        if QUANTITIES[quantity].of in ("mass", "spring") and (base.lattice.profiles or base.lattice.absorbing):
             remedy = (
                 "masses, springs and dashpots are sought in lattices of equal cells only; omit profiles and absorbing"
             )
@@ -249,7 +246,7 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
     low, high = unknown.bounds
     quantity = unknown.quantity
     # On a linear scale a quantity of either sign may have any bounds.
-    if quantity in OF_EITHER_SIGN and unknown.scale != "logarithmic":
+    if QUANTITIES[quantity].may_be_negative and unknown.scale != "logarithmic":
         return
     if quantity == "restitution" and not 0 <= low < high <= 1:
         yield Problem(f"{at}.bounds", unknown.bounds, "a restitution is between 0 and 1")
@@ -298,7 +295,7 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     # Without contact the misfit does not depend on quantities of sites, and the fit would be singular.
     if not any(record.contact for record in options.records):
         for index, unknown in enumerate(options.unknowns, 1):
-            if unknown.quantity in OF_SITES:
+            if QUANTITIES[unknown.quantity].of == "site":
                 remedy = "no record has contact: a lattice that does not touch says nothing about its contacts"
                 yield Problem(f"identify.unknowns[{index}].quantity", unknown.quantity, remedy)
 

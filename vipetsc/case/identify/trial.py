@@ -8,15 +8,15 @@ case that was read, with other numbers in their places. Tests compare the copies
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, Problem, Table
+from vipetsc.case.case_file import CaseError, Problem
 from vipetsc.case.drive import check_drives
-from vipetsc.case.identify.sought import OF_CELL, OF_SPRINGS, SoughtParameter, changed_case, numbers_of
+from vipetsc.case.identify.sought import SoughtParameter, changed_case, numbers_of
+from vipetsc.case.quantities import QUANTITIES
 from vipetsc.case.resolve import check_cell, check_contacts
-from vipetsc.case.schema import LatticeTable
 
 FOLLOWING = ("kind", "energy", "near")
 """Keys of ``[initial]`` from which, together with the lattice, other numbers of the motion follow."""
@@ -39,14 +39,14 @@ class TrialCases:
         self._follows = bool(set(FOLLOWING) & set(changes.get("initial", {})))
         # The amplitude of a record's own drive is known, and is not the one that is sought.
         self._has_amplitude = "amplitude" in changes.get("drive", {})
-        self._read: dict[tuple[str, ...], Case] = {}
+        self._first: Case | None = None
         self._case = lru_cache(maxsize=KEPT)(self._new_case)
 
     def case(self, values: Iterable[float]) -> Case:
         """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
         return self._case(tuple(float(value) for value in values))
 
-    @property
+    @cached_property
     def base(self) -> Case:
         """The case without trial values."""
         return self._with_changes(self._base)
@@ -63,62 +63,25 @@ class TrialCases:
         return case.varied(**copy.deepcopy(dict(self._changes)))
 
     def _new_case(self, values: tuple[float, ...]) -> Case:
-        """The case with the ``values`` (parameter,), which is read once for each form of its table."""
+        """Return the case with the ``values`` (parameter,), of which the first one alone is read."""
         if self._follows:
             return self.read(values)
 
-        numbers = numbers_of(self._base, self._parameters, values)
-        # The form: a number that all sites have in common stands in another place of the table than a list.
-        form = tuple(quantity for quantity, several in numbers.items() if len(set(several)) == 1)
-        if form not in self._read:
-            self._read[form] = self.read(values)
-        return self._with_numbers(self._read[form], numbers)
+        if self._first is None:
+            self._first = self.read(values)
+        base = self.base
+        sections: dict[str, Any] = dict(base)
+        for quantity, numbers in numbers_of(self._base, self._parameters, values).items():
+            if quantity != "amplitude" or not self._has_amplitude:
+                sections = QUANTITIES[quantity].put(sections, numbers)
 
-    def _with_numbers(self, case: Case, numbers: dict[str, list[float]]) -> Case:
-        """The ``case`` with other ``numbers`` by quantity; raises CaseError."""
-        contacts = case.contacts
-        lattice = case.lattice
-        drive = case.drive
-        for quantity, several in numbers.items():
-            if quantity in OF_CELL:
-                lattice = _with_cell_numbers(lattice, quantity, several)
-            elif quantity == "amplitude":
-                if not self._has_amplitude:
-                    drive = drive.model_copy(update={"amplitude": several[0]})
-            elif quantity == "clearance":
-                contacts = contacts.model_copy(update={"clearance": several})
-            elif contacts.each and getattr(contacts.each, quantity):
-                each = contacts.each.model_copy(update={quantity: several})
-                contacts = contacts.model_copy(update={"each": each})
-            else:
-                contacts = contacts.model_copy(update={quantity: several[0]})
-
-        trial = case.model_copy(update={"contacts": contacts, "lattice": lattice, "drive": drive})
-        problems = _problems(trial, case)
+        # The first case has the times of the new cell, and its name.
+        update = {key: sections[key] for key in ("contacts", "lattice", "drive")}
+        trial = self._first.model_copy(update=update)
+        problems = _problems(trial, base)
         if problems:
             raise CaseError(problems, trial.name)
         return trial
-
-
-def _with_cell_numbers(lattice: LatticeTable, quantity: str, numbers: list[float]) -> LatticeTable:
-    """The ``lattice`` with other ``numbers`` of a ``quantity`` of its cell's masses or springs."""
-    cell = lattice.cell
-    assert cell is not None  # changed_case writes a preset's cell out
-    if quantity == "mass":
-        update: Table = {"masses": numbers}
-    elif quantity == "grounding":
-        update = {"grounding": numbers}
-    else:
-        key = OF_SPRINGS[quantity]
-        springs = []
-        for spring, number in zip(cell.springs, numbers, strict=True):
-            # A parameter that is 0 is left out, as ``with_cell`` does it.
-            value: float | None = number
-            if number == 0 and key != "stiffness":
-                value = None
-            springs.append(spring.model_copy(update={key: value}))
-        update = {"springs": springs}
-    return lattice.model_copy(update={"cell": cell.model_copy(update=update)})
 
 
 def _problems(trial: Case, case: Case) -> list[Problem]:

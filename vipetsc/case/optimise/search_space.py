@@ -11,8 +11,8 @@ import numpy as np
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import LARGEST, Table, put
 from vipetsc.case.contacts import values_of_sites
-from vipetsc.case.disorder import with_cell
 from vipetsc.case.optimise.variables import Kind, Variable, VariablesTable
+from vipetsc.case.quantities import OF_PRESET, table_of
 from vipetsc.case.reading import value_at
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import number
@@ -151,7 +151,9 @@ def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
     table = copy.deepcopy(table)
     if any(path.startswith("lattice.cell.") for path in paths) and "cell" not in table.get("lattice", {}):
         table = with_preset(table)
-        table["lattice"] = with_cell(table["lattice"], base.lattice.undamped_cell(), {})
+        cell = table_of(base.lattice.undamped_cell())
+        others = {key: value for key, value in table["lattice"].items() if key not in OF_PRESET}
+        table["lattice"] = others | {"cell": cell.model_dump(exclude_none=True)}
 
     chain = base.model().chain
     contacts = dict(table.get("contacts", {}))

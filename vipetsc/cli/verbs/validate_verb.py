@@ -63,8 +63,8 @@ def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
 
     The values are ratios to those of the ``nominal`` case; those of sites are cells.
     """
-    before = values_of(nominal.lattice, nominal.contacts)
-    after = values_of(drawn.lattice, drawn.contacts)
+    before = values_of(dict(nominal))
+    after = values_of(dict(drawn))
     rows = []
     for name, deviation in disorder.quantities().items():
         # Sites move by whole cells. Other quantities scatter about a value, to which the ratio shows the distance.
