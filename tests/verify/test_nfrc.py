@@ -343,6 +343,18 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     assert picture.name == f"{name}.png"
 
 
+def test_sites_may_have_a_restitution_of_their_own(tmp_path):
+    """Equal restitutions in a list over sites give the curve of one for all, in a file that can be read and drawn."""
+    options = {"harmonics": 5, "range": [0.999, 1.0005], "first_step": 2e-4, "largest_step": 3e-4, "points": 3}
+    common = curve_of(nfrc_case(restitutions=[0.7], **options), tmp_path / "common")
+    each = nfrc_case(contacts={"each": {"restitution": [0.7]}}, **options)
+    curve = curve_of(each, tmp_path / "each")
+
+    assert np.array_equal([point.xi for point in curve.points], [point.xi for point in common.points])
+    assert read_branch(tmp_path / f"each/branch-{curve.name}.h5").case == each.to_toml()
+    assert draw("branches", [tmp_path / "each"])
+
+
 def test_a_resumed_curve_finds_two_folds_in_its_first_step(tmp_path):
     """Two folds in one step are found, to the same bits, also by a command that goes on from the beginning of it.
 

@@ -136,7 +136,9 @@ def _keys_of(curve: xr.Dataset) -> dict[str, tuple[Any, str]]:
         keys["amplitude"] = (float(curve["amplitude"].values[0]), unit)
     if over != "frequency":
         keys["frequency"] = (float(curve["frequency"].values[0]), "rad/s")
-    keys["restitution"] = (float(curve.attrs["restitution"]), "")
+    # It is NaN where each site has its own.
+    if np.isfinite(curve.attrs["restitution"]):
+        keys["restitution"] = (float(curve.attrs["restitution"]), "")
     return keys
 
 

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
+from math import nan
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -31,8 +32,9 @@ MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB
 class ResponseCurve(NamedTuple):
     """A curve of a case: the ``name`` of its files, its ``case`` without a family, and what is fixed along it.
 
-    ``restitution`` is that of all sites, ``fixed`` the value of the amplitude or frequency that does not vary along the
-    curve; ``member`` is the number (from 0) of its case in the family, ``values`` are those of the family's keys.
+    ``restitution`` is that of all sites, NaN if each has its own; ``fixed`` is the value of the amplitude or frequency
+    that does not vary along the curve; ``member`` is the number (from 0) of its case in the family, ``values`` are
+    those of the family's keys.
     """
 
     name: str
@@ -93,7 +95,10 @@ class NfrcCase(Case):
         if problems:
             return sections, problems
 
-        update: dict[str, Any] = {"restitutions": nfrc.restitutions or [contacts.restitution]}
+        update: dict[str, Any] = {}
+        # Sites with a restitution of their own have no common one by which curves could differ.
+        if not (contacts.each and contacts.each.restitution):
+            update["restitutions"] = nfrc.restitutions or [contacts.restitution]
         if nfrc.infinite is None:
             update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
@@ -309,12 +314,13 @@ class NfrcCase(Case):
         return curves
 
     def curves(self) -> list[FixedParameters]:
-        """The curves of the case, or of its first member: one for each restitution and each value that is fixed."""
-        restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
+        """Return the curves of the case, or of its first member: one a restitution and value that is fixed."""
+        given = self.nfrc.restitutions
+        restitutions = [(f"r{name}-", r) for name, r in zip(distinct(given), given, strict=True)]
         values = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
         curves = []
-        for (of_restitution, restitution), (of_value, value) in itertools.product(restitutions, values):
-            curves.append(FixedParameters(f"r{of_restitution}-{of_value}", restitution=restitution, fixed=value))
+        for (prefix, restitution), (of_value, value) in itertools.product(restitutions or [("", nan)], values):
+            curves.append(FixedParameters(f"{prefix}{of_value}", restitution=restitution, fixed=value))
         return curves
 
 

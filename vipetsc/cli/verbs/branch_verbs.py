@@ -132,12 +132,13 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
     lattice = dict(lattice_rows(case))
     if options.infinite:
         lattice["lattice"] = f"infinite, with sites in the cells of a segment of {case.lattice.cells}"
+    restitutions = first_few([f"{restitution:g}" for restitution in options.restitutions]) or "of each site"
     return [
         *lattice.items(),
         ("nfrc", f"{curves} over the {options.over}, {low:g} to {high:g} {over_unit}".rstrip()),
         ("driven by", excitation),
         (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
-        ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
+        ("restitution", restitutions),
         *_family_rows(case),
         *_isola_rows(case),
         ("harmonics", f"up to {options.harmonics}, {parity}; at most {options.points} points per curve"),
