@@ -26,6 +26,7 @@ from vipetsc.case.section import CaseError as CaseError
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
 from vipetsc.case.section import described, is_within
+from vipetsc.case.strip import with_strip
 from vipetsc.plugins import only
 from vipetsc.register import PartError
 
@@ -42,7 +43,8 @@ class CaseFile(Section):
 
     A subclass names its ``verb`` and the ``section`` that only this verb reads ("" for ``run``), and gives in
     ``refuses`` the reason for every feature of a lattice run that it does not accept (``vipetsc.case.features``);
-    ``waveforms`` are the drives that it accepts if it refuses others. Its hooks: ``check`` finds problems between valid
+    ``waveforms`` are the drives that it accepts if it refuses others; ``has_members`` is True if its table is only read
+    as that of each member. Its hooks: ``check`` finds problems between valid
     keys; ``read`` may fill in the table before its sections are read, and resolve them afterwards. ``builtin_table`` is
     the case without a file, if there is one.
     """
@@ -55,6 +57,7 @@ class CaseFile(Section):
     refuses: ClassVar[Mapping[str, str]] = {}
     waveforms: ClassVar[tuple[str, ...]] = ()
     builtin_table: ClassVar[Table] = {}
+    has_members: ClassVar[bool] = False
 
     def __init__(self, *unnamed: Any, **sections: Any) -> None:
         """Read and resolve the case of these ``sections``: tables by keyword, with a ``name`` or without.
@@ -163,7 +166,10 @@ class CaseFile(Section):
         problems += _check_name(name)
 
         table, unread = with_matrices(table)
-        # Without its cell a case has no other sense: only the matrices are reported.
+        # Places are those of a member's strip, not of the table that its sweep begins with.
+        if not unread and not cls.has_members:
+            table, unread = with_strip(table)
+        # Without its cell a case has no other sense: only its matrices or its strip are reported.
         if unread:
             raise CaseError(problems + unread, source)
         table, wrong = with_parts(table)

@@ -12,6 +12,7 @@ from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.case.points import MOST_POINTS, PointTable
 from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.strip import StripTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 
@@ -185,6 +186,7 @@ class CellTable(Section):
         None,
     )
     from_matrices: MatricesTable | None = described("files of the matrices that the cell was made of, filled in", None)
+    from_strip: StripTable | None = described("the strip that the cell was made of, filled in", None)
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
@@ -232,6 +234,7 @@ class LatticeTable(Section):
         "one of the paper's cells; it also gives defaults for contacts and drive", None
     )
     cell: CellTable | None = described("a user-defined cell, instead of a preset", None)
+    strip: StripTable | None = described("a strip of the plane, which writes the cell", None)
     cells: int = described("number of cells; 600 in the preset diatomic", 300, ge=1, le=MOST_CELLS)
     ends: Literal["fixed", "free", "periodic"] = described("what the first and the last cell are attached to", "fixed")
     reading: Literal["printed", "calibrated"] = described(

@@ -71,6 +71,7 @@ class Sweep(StudyCase):
     axes: tuple[Values, ...]
 
     verb = section = "sweep"
+    has_members = True
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
