@@ -28,6 +28,7 @@ CHANGES = {
         "lattice.scatter",
     ),
     "absorbing ends": ({"lattice": {"absorbing": {"cells": 9, "strength": 1.0}}}, "lattice.absorbing"),
+    "strips": ({"lattice": {"strip": {"rows": 2, "mass": 1.0, "stiffness": 3.0}}}, "lattice.strip"),
     "rings": ({"lattice": {"ends": "periodic"}}, "lattice.ends"),
     "unlike sites": ({"contacts": {"side": "plus"}}, "contacts.side"),
     "touching stops": ({"contacts": {"clearance": 0.0, "side": "plus", "restitution": 1.0}}, "contacts.clearance"),
@@ -70,7 +71,7 @@ def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> se
         table[kind.section] = copy.deepcopy(VERB_SECTIONS.get(kind.section, {}))
     for section, values in changes.items():
         table[section] = table.get(section, {}) | values
-    if "cell" in table.get("lattice", {}):
+    if {"cell", "strip"} & table.get("lattice", {}).keys():
         # A cell that is no preset has no defaults for these sections.
         table["contacts"] = {"sites": [9], "clearance": 1e-3, "stiffness": 1e4}
         table["drive"] = {"frequency": 1.0}

@@ -127,10 +127,9 @@ def _check_place(
     if lattice.ends != "fixed":
         remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
-    if lattice.cell and lattice.cell.from_matrices:
-        remedy = (
-            "a wall moves all degrees of freedom of its cell alike, which rotations do not; give drive.cell and mass"
-        )
+    if lattice.cell and (lattice.cell.from_matrices or lattice.cell.moves_in_plane):
+        remedy = "a wall moves all degrees of freedom of its cell alike, which rotations and motion along x and y do"
+        remedy += " not; give drive.cell and mass"
         yield Problem(f"{path}.end", drive.end, remedy)
     if cell and not all(spring.is_linear for spring in cell.springs if spring.offset):
         yield Problem(f"{path}.end", drive.end, "a wall can only move a linear spring: remove quadratic and cubic")

@@ -20,6 +20,7 @@ FEATURES = {
     "profiles": "remove [lattice.profiles]",
     "scatter": "remove disorder.cells",
     "absorbing ends": "remove [lattice.absorbing]",
+    "strips": "remove [lattice.strip]",
     "rings": "use fixed or free ends",
     # Laws that differ, stops on one side, other masses than the cell's pair.
     "unlike sites": "remove the key",
@@ -99,6 +100,8 @@ def _other_lattices(kind: type[CaseFile], lattice: LatticeTable, moves_wall: boo
         if getattr(lattice, key):
             yield from _refusal(kind, feature, f"lattice.{key}")
 
+    if lattice.cell and lattice.cell.from_strip:
+        yield from _refusal(kind, "strips", "lattice.strip")
     cell, wrong = check_cell(lattice)
     if cell and not wrong:
         # The first key alone: all of them have one reason and one remedy.

@@ -146,6 +146,7 @@ class LawCase(Case):
         "nonlinear springs": "with nonlinear springs, waves depend on amplitude even without contact",
         "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
+        "strips": "the waves that leave a site of a strip go to all sides, and the law has those of one direction",
         "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
         "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
         "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",

@@ -188,6 +188,11 @@ class CellTable(Section):
     from_matrices: MatricesTable | None = described("files of the matrices that the cell was made of, filled in", None)
     from_strip: StripTable | None = described("the strip that the cell was made of, filled in", None)
 
+    @property
+    def moves_in_plane(self) -> bool:
+        """Whether it is the cell of a strip whose masses move along x and y."""
+        return self.from_strip is not None and self.from_strip.motion == "in-plane"
+
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
         springs = tuple(spring.spring() for spring in self.springs)

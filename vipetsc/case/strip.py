@@ -106,16 +106,16 @@ class StripTable(Section):
 
     def problems(self, ends: Any) -> Iterator[Problem]:
         """Problems between the keys of the section, in a lattice with these ``ends``."""
-        own = self.kind == "cell"
-        for key in OF_A_PRESET if own else OF_ONES_OWN:
+        is_given = self.kind == "cell"
+        for key in OF_A_PRESET if is_given else OF_ONES_OWN:
             if getattr(self, key) is not None:
                 yield Problem(f"lattice.strip.{key}", None, f"does not apply to kind = {self.kind!r}; remove it")
-        for key in ("masses", "springs") if own else ("mass", "stiffness"):
+        for key in ("masses", "springs") if is_given else ("mass", "stiffness"):
             if getattr(self, key) is None:
                 yield Problem(f"lattice.strip.{key}", None, f"missing; kind = {self.kind!r} needs it")
         if self.motion == "in-plane":
             yield from self._in_plane_problems(ends)
-        if not own:
+        if not is_given:
             return
 
         count = len(self.masses or ())
@@ -181,8 +181,8 @@ def with_strip(table: Table) -> tuple[Table, list[Problem]]:
         "springs": [_spring_table(spring) for spring in springs],
         "from_strip": strip.model_dump(exclude_none=True),
     }
-    kept = {key: value for key, value in cell.items() if key not in FILLED}
-    lattice = {key: value for key, value in lattice.items() if key != "strip"} | {"cell": kept | filled}
+    others = {key: value for key, value in cell.items() if key not in FILLED}
+    lattice = {key: value for key, value in lattice.items() if key != "strip"} | {"cell": others | filled}
     return table | {"lattice": lattice}, []
 
 

@@ -1,7 +1,7 @@
 """A lattice of the plane: its cell, its bands, and the wide cell of a strip that is cut out of it.
 
 Cell (i, j) lies at i a_1 + j a_2. A spring K of the direction n joins mass p of a cell to mass q of the cell (i, j)
-further. In a wave with the phases k_1 and k_2 from cell to cell it pulls at p with K n n^T (U_p - U_q exp(i k . (i, j)));
+further. In a wave with the phases k_1, k_2 from cell to cell it pulls at p with K n n^T (U_p - U_q exp(i k . (i, j)));
 for motion out of the plane n n^T is 1. Such rows make up the dynamical matrix of the wave vector (k_1, k_2).
 
 A strip of ``rows`` cells side by side along a_2 **is** a chain of wide cells along a_1: a spring of the plane is one
