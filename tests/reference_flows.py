@@ -4,14 +4,18 @@ TSRK lands on contact changes as the compiled flow does, with steps taken one by
 error control.
 """
 
+from contextlib import AbstractContextManager
+
 from petsc4py import PETSc
 
 import numpy as np
 
+from vipetsc.contact.search import LANDED, MISSED, SEARCH, Landing, correct
 from vipetsc.modes import flow
-from vipetsc.modes.flow import EXTREMUM, MOST_ATTEMPTS, NONE, Advance, Change, Flow, correct
+from vipetsc.modes.flow import EXACT, Advance, Change, Flow
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.system import System
+from vipetsc.parallel import StopRequest
 
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.
 RTOL = 1e-13
@@ -45,10 +49,11 @@ class Tsrk(Flow):
         t = 0.0
         h = 0.05 / self.omega
         steps = 0
-        pause = self.limits.check(steps)
+        pause = 0
+        size = max(np.abs(y[: len(y) // 2, 0]).max(), np.abs(y[len(y) // 2 :, 0]).max() / self.omega_ref(period))
         while t < duration:
             if steps == pause:
-                pause = self.limits.check(steps)
+                pause = self.check(steps)
             steps += 1
             length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
             if length < flow.SMALLEST_STEP * duration and length < duration - t:
@@ -56,10 +61,13 @@ class Tsrk(Flow):
 
             flow.observe(step, y, dy, step.start)
             flow.observe(step, state, dy, step.end)
-            change = flow.first_change(step, length)
+            change = flow.first_change(step, length, size)
+            if change.position == flow.UNDECIDED:
+                h = length / 2
+                continue
             changed = change.contact >= 0
             if changed:
-                length, state, changed = self._land(y, length, change)
+                length, state = self._land(y, length, change)
 
             if np.any(step.side):
                 closed += length
@@ -72,7 +80,6 @@ class Tsrk(Flow):
             if changed:
                 events.append((t, change.contact, change.side, flow.switch(step, change)))
                 self._adaptive.restartStep()
-        self.limits.check(steps)
         return Advance(state=y, events=np.array(events).reshape(-1, 4), closed=closed, steps=steps)
 
     def _solver(self, adapt: str) -> PETSc.TS:
@@ -120,18 +127,24 @@ class Tsrk(Flow):
         ts.step()
         return ts.getTime(), self._y.getArray().reshape(y.shape).copy(), ts.getTimeStep()
 
-    def _land(self, y: np.ndarray, h: float, change: Change) -> tuple[float, np.ndarray, bool]:
-        """Step from ``y`` exactly onto a change found in a step of length ``h``: length, state, whether it is one."""
+    def _land(self, y: np.ndarray, h: float, change: Change) -> tuple[float, np.ndarray]:
+        """Step from ``y`` exactly onto a change found in a step of length ``h``: length and state."""
         step = self._record
         dy = np.empty(self._shape)
-        for _ in range(MOST_ATTEMPTS):
-            length = change.length
+        landing = Landing(change.position * h, h, np.inf, 0)
+        state = y
+        while landing.length > 0:
+            length = landing.length
             _, state, _ = self._step(self._fixed, y, length)
             flow.observe(step, state, dy, step.end)
-            change, outcome = correct(change, step.end[change.contact], 2e-16 * h)
-            if outcome != NONE:
-                return length, state, outcome != EXTREMUM
-        raise FlowError(f"TSRK does not land on the change of contact {change.contact + 1}")
+            gap = change.sign * step.end[change.contact, 0] - change.offset
+            rate = change.sign * step.end[change.contact, 1]
+            landing, outcome = correct(landing, gap, rate, change.tolerance, EXACT * change.tolerance)
+            if outcome == LANDED:
+                return length, state
+            if outcome in (SEARCH, MISSED):
+                raise FlowError(f"TSRK does not land on the change of contact {change.contact + 1}")
+        return 0.0, state
 
 
 class FiniteDifferences(Flow):
@@ -143,8 +156,11 @@ class FiniteDifferences(Flow):
     def __init__(self, flow: Flow, step: float = 1e-6) -> None:
         super().__init__(flow.system)
         self.flow = flow
-        self.limits = flow.limits
         self.step = step
+
+    def limited(self, longest: int, stop: StopRequest | None) -> AbstractContextManager[None]:
+        """Limit the arcs of the other flow, several of which make one of these."""
+        return self.flow.limited(longest, stop)
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
         n = self.system.dofs

@@ -12,7 +12,7 @@ from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, UnitCell
-from vipetsc.modes.response.keyed_case import KeyedCase
+from vipetsc.modes.response.over_key import KeyedCase
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 

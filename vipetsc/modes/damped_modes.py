@@ -27,7 +27,7 @@ from vipetsc.modes.balance.harmonic_balance import BalanceFrame
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.departures import Departure
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
 from vipetsc.modes.system import System
 
@@ -119,14 +119,12 @@ class DampedFrame(BalanceFrame):
         )
 
 
-class DampedModes:
+class DampedModes(OrbitProblem):
     """Branches of damped modes of a ``system`` with dashpots ``damping`` (n, n) in N s/m, as a ``PeriodicProblem``.
 
     ``forces`` are those of its contacts, which may dissipate, and of its springs that are not linear. Harmonics are
     taken up to ``order``. Branches begin at the linear ``mode``, counted from 0.
     """
-
-    guards: frozenset[str] = frozenset()
 
     def __init__(
         self,
@@ -263,21 +261,9 @@ class DampedModes:
         first = frame.measures(Attempt(converged=True, reason="", history=[], xi=frame.xi), null_vector)
         return first.tangent * ((np.sign(first.energy_tangent) or 1.0) * direction)
 
-    def turn(self, before: Point, after: Point) -> float:
-        """Return 0: there is one chart, whose angles each step guards."""
-        return 0.0
-
     def departures(self, point: Point) -> list[Departure]:
         """Return the times in which contacts are not what they are at rest."""
         return departures_of(self.forces, self.series(point.x[:-1], 2 * np.pi / point.period).episodes)
-
-    def grazing(self, point: Point) -> list[int]:
-        """Return no contact: at a touch nothing limits the steps."""
-        return []
-
-    def acceleration(self, point: Point) -> float:
-        """Return infinity: a damped motion is nowhere at rest."""
-        return np.inf
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Yield folds of the energy and of the frequency, between two motions that are not linear."""

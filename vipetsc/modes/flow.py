@@ -20,14 +20,14 @@ A[s, r] k_r, the new state y + h sum_r B[r] k_r; E5 and E3 give the estimates of
 into err5^2 / sqrt(err5^2 + err3^2 / 100).
 
 **Changes.** A contact changes when its gap rises through zero: sigma w - D while it is open, D - sigma w while it is
-closed. A step's quintic Hermite interpolant of the gap is cut into its monotone pieces by ``contact.search``, so that
-no pair of changes is missed, however short. Where the largest value of a gap is zero to within the interpolant's error,
-the flow decides whether there is a change.
+closed. The quintic Hermite interpolant of a step's gap is searched by ``contact.search``, so that no pair of changes is
+missed, however short. Where the interpolant's error, which falls as the fourth power of the step or faster, decides
+whether there is a change, the step is halved; below rounding there is none. ``contact.search`` also lands on it.
 
 **Limits.** From a good guess Newton's method goes to orbits near it, whose arcs take about as many steps of the flow as
 the arc of the guess. Where the derivative is almost singular, as near a second branch, a step of the method may lead to
 any period or amplitude, and an arc from there may take longer than any computation: it ends the attempt
-(``ArcLimits``).
+(``Flow.limited``).
 """
 
 import math
@@ -42,7 +42,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import ELASTIC, elastic_force_and_slope, elastic_records
-from vipetsc.contact.search import first_upcrossing_after_start
+from vipetsc.contact.search import LANDED, RETRY, Landing, bernstein, correct, first_upcrossing_after_start
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope, spring_laws
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.system import System
@@ -56,270 +56,57 @@ MOST_LONGER = 100
 UNLIMITED = 2**62
 
 
-class ArcLimits:
-    """Limits of the arcs of one flow, which calls ``check`` as it makes its steps.
-
-    They act within a block of ``attempt`` alone. ``every`` is the number of steps, those of several arcs counted
-    together, between two looks at requests to stop.
-    """
-
-    def __init__(self, every: int) -> None:
-        self._every = every
-        self._stop = StopRequest()
-        self._is_attempt = False
-        self._longest = UNLIMITED
-        # Steps of the present arc, and those of all arcs since the last look.
-        self._steps = 0
-        self._since = 0
-
-    @contextmanager
-    def stopped_by(self, stop: StopRequest) -> Iterator[None]:
-        """Let attempts within the block raise StoppedError where a ``stop`` is requested."""
-        earlier = self._stop
-        self._stop = stop
-        try:
-            yield
-        finally:
-            self._stop = earlier
-
-    @contextmanager
-    def attempt(self, longest: int = UNLIMITED) -> Iterator[None]:
-        """A block in which Newton's method takes arcs of at most ``longest`` steps."""
-        self._is_attempt = True
-        self._longest = longest
-        try:
-            yield
-        finally:
-            self._is_attempt = False
-            self._longest = UNLIMITED
-
-    def refuse(self, steps: float) -> None:
-        """Raise FlowError if an arc may not have so many ``steps``."""
-        if steps > self._longest:
-            raise FlowError(
-                f"an arc of more than {self._longest} steps, {MOST_LONGER} times those of the arc at the guess"
-            )
-
-    def check(self, steps: int) -> int:
-        """Note that the present arc has made so many ``steps``, 0 where it begins; returns at how many to call again.
-
-        Within an attempt it raises FlowError if these are too many, and StoppedError if a stop is requested.
-        """
-        self.refuse(steps)
-        if steps > 0:
-            self.count(steps - self._steps)
-        self._steps = steps
-        return steps + min(self._every - self._since, self._longest + 1 - steps)
-
-    def count(self, steps: int) -> None:
-        """Count so many ``steps`` more; within an attempt it raises StoppedError, at a look, if a stop is requested."""
-        self._since += steps
-        if self._since < self._every:
-            return
-        self._since = 0
-        if self._is_attempt and self._stop.requested:
-            raise StoppedError("stopped on request; continue with --resume")
-
-
-# Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
-NONE, CROSSING, EXTREMUM = range(3)
-# Largest number of attempts at one extremum, and of one landing in all. Bisection of a step to rounding takes about 54:
-# that to the root before an extremum has room after all attempts at the extremum.
-EXTREMUM_ATTEMPTS = 40
-MOST_ATTEMPTS = 120
-# Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.
-Coefficients = tuple[float, float, float, float, float, float]
-# A slope at the start below this fraction of the curvature is the rounding of an extremum.
-ROUNDING = 1e-8
+# Positions in a step of no change, and of a change that the interpolant cannot tell from a near miss.
+NONE = 2.0
+UNDECIDED = -1.0
+# The largest difference of positions of one change, with the interpolant's error on either side.
+DECIDED = 0.01
+# Rounding of a gap, over the clearance and the size of the motion. An onset within it is none.
+ROUNDING = 16 * np.finfo(float).eps
+# The part of it at which a landing need not be improved.
+EXACT = 1 / 8
 
 
 class Change(NamedTuple):
-    """The change of a ``contact`` to or from a ``side``, and an attempt to end a step of ``length`` s on it.
+    """The change of a ``contact`` to or from a ``side`` at a ``position`` in the step, from 0 to 1, or without one.
 
-    The gap sign w - offset rises through zero between the lengths ``low`` and ``high``; an ``extremum`` is landed on
-    where that gap is largest. ``attempts`` counts those at this change. Without a change, ``contact`` is -1.
+    There the gap sign w - offset rises through zero, with the rounding error ``tolerance`` in m.
     """
 
     contact: int
     side: int
     sign: float
     offset: float
-    extremum: bool
-    low: float
-    high: float
-    length: float
-    attempts: int
+    tolerance: float
+    position: float
 
 
 @kernel
-def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, int]:
-    """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
+def first_rise(gap: np.ndarray, tolerance: float, room: np.ndarray) -> float:
+    """Position at which a gap that begins at zero or below first rises through it; ``NONE``, or ``UNDECIDED``.
 
-    The outcome is CROSSING when the length is found to ``floor`` seconds, EXTREMUM when the gap's largest value is
-    found so and not above zero, and NONE when another attempt is needed. ``contact.search`` stops at a tolerance on
-    w; the sensitivities of an orbit with many contacts need the length to rounding.
+    ``gap`` (6,) are the coefficients of the interpolant in Bernstein's form, and the gap has the rounding error
+    ``tolerance``; ``room`` (6,) is overwritten.
     """
-    contact, side, sign, offset, extremum, low, high, length, attempts = change
-    gap = sign * motion[0] - offset
-    value = gap
-    rate = sign * motion[1]
-    if extremum:  # where the slope turns negative
-        value = -sign * motion[1]
-        rate = -sign * motion[2]
-    if value > 0.0:
-        high = min(high, length)
-    else:
-        low = max(low, length)
-    attempts += 1
+    # The error is that of the next power of the position, a fraction of those of the orders 4 and 5. It vanishes at the
+    # start: there it is taken to grow with the position, whose coefficients are k/5.
+    fourth = gap[4] - 4.0 * gap[3] + 6.0 * gap[2] - 4.0 * gap[1] + gap[0]
+    fifth = gap[5] - 5.0 * gap[4] + 10.0 * gap[3] - 10.0 * gap[2] + 5.0 * gap[1] - gap[0]
+    margin = max(0.01 * (abs(fifth) + 1.5 * abs(fourth)), tolerance)
+    for k in range(6):
+        room[k] = gap[k] + 0.2 * k * margin
+    earliest = first_upcrossing_after_start(room, tolerance)
+    if earliest > 1.0:
+        return NONE
 
-    # Without a rise there is no Newton step: one beyond the bracket stands for it, and leads to its bisection.
-    newton = high
-    if rate > 0.0:
-        newton = -value / rate
-    # A root's bracket shrinks to its floor. Rounding of w' may keep Newton's method from an extremum for ever.
-    goes_on = high - low > floor
-    if extremum:
-        goes_on = attempts < EXTREMUM_ATTEMPTS
-    if goes_on and abs(newton) > floor:
-        target = length + newton
-        if not low < target < high:
-            target = 0.5 * (low + high)
-        return Change(contact, side, sign, offset, extremum, low, high, target, attempts), NONE
-
-    if not extremum:
-        return change, CROSSING
-    if gap <= 0.0:
-        return change, EXTREMUM
-    # The flow is beyond zero where the interpolant could not tell: the root lies before, and is sought as such.
-    return Change(contact, side, sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
-
-
-@kernel
-def hermite(a: np.ndarray, b: np.ndarray, h: float, sign: float, offset: float) -> Coefficients:
-    """Coefficients of sign * w - offset on [0, 1] from (w, w', w'') at both ends of a step h."""
-    g0 = sign * a[0] - offset
-    r0 = sign * a[1] * h
-    s0 = sign * a[2] * h * h
-    g1 = sign * b[0] - offset
-    r1 = sign * b[1] * h
-    s1 = sign * b[2] * h * h
-    d = g1 - g0 - r0 - 0.5 * s0
-    e = r1 - r0 - s0
-    f = s1 - s0
-    return g0, r0, 0.5 * s0, 10.0 * d - 4.0 * e + 0.5 * f, -15.0 * d + 7.0 * e - f, 6.0 * d - 3.0 * e + 0.5 * f
-
-
-@kernel
-def _value(c: Coefficients, x: float) -> float:
-    return c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))))
-
-
-@kernel
-def _slope(c: Coefficients, x: float) -> float:
-    """Slope at x; just after 0, for a step that starts on an extremum."""
-    if x == 0.0 and abs(c[1]) <= ROUNDING * abs(c[2]):
-        return c[2]
-    return c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5])))
-
-
-@kernel
-def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
-    """Root between low and high, where the polynomial turns positive; given a ``sign``, where its slope loses it."""
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if middle in (low, high):
-            break
-        if sign == 0.0:
-            is_beyond = _value(c, middle) > 0.0
-        else:
-            is_beyond = sign * _slope(c, middle) <= 0.0
-        if is_beyond:
-            high = middle
-        else:
-            low = middle
-    return 0.5 * (low + high)
-
-
-@kernel
-def _extremum(c: Coefficients, position: float, sign: float) -> float:
-    """Return the extremum near ``position``, in its quarter: a maximum for the ``sign`` 1, a minimum for -1."""
-    low = 0.25 * min(np.floor(4.0 * position), 3.0)
-    # Two extrema in one quarter leave no change of sign to bisect, or that of the other one.
-    if sign * _slope(c, low) <= 0.0 or sign * _slope(c, low + 0.25) >= 0.0:
-        return position
-    return _bisect(c, low, low + 0.25, sign)
-
-
-@kernel
-def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
-    """Position at which ``sign`` times the slope (5,) on [low, 1] turns positive, or 2; cuts the slope there."""
-    turn = first_upcrossing_after_start(sign * slope, 0.0)
-    if turn > 1.0:
-        return turn
-    if turn > 0.0:
-        # De Casteljau's scheme leaves the coefficients on the part after the turn, which begins with 0.
-        for k in range(1, slope.size):
-            for i in range(slope.size - k):
-                slope[i] = (1.0 - turn) * slope[i] + turn * slope[i + 1]
-        slope[0] = 0.0
-    return low + turn * (1.0 - low)
-
-
-@kernel
-def first_rise(c: Coefficients) -> tuple[float, int]:
-    """Position in the step at which a gap that starts at or below zero first rises through it, and the outcome."""
-    # Above the interpolant's error, which is that of the next power of the position.
-    margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))
-    # Bernstein coefficients bound the gap: nearly every call ends here.
-    b1 = c[0] + c[1] / 5.0
-    b2 = c[0] + (4.0 * c[1] + c[2]) / 10.0
-    b3 = c[0] + (6.0 * c[1] + 3.0 * c[2] + c[3]) / 10.0
-    b4 = c[0] + (4.0 * c[1] + 3.0 * c[2] + 2.0 * c[3] + c[4]) / 5.0
-    b5 = _value(c, 1.0)
-    if max(b1, b2, b3, b4, b5) <= -margin:
-        return 1.0, NONE
-
-    start = b1 - c[0]
-    if abs(c[1]) <= ROUNDING * abs(c[2]):
-        start = 0.0
-    slope = np.array([start, b2 - b1, b3 - b2, b4 - b3, b5 - b4])
-    high = 0.0
-    # The pieces on which the gap rises, each from ``left`` to ``top``: a quartic slope has at most two pairs of zeros.
-    for _ in range(3):
-        low = _next_turn(slope, high, 1.0)
-        if low > 1.0:
-            break
-        high = _next_turn(slope, low, -1.0)
-        left = 0.0
-        if low > 0.0:
-            left = _extremum(c, low, -1.0)
-        top = 1.0
-        if high <= 1.0:
-            top = _extremum(c, high, 1.0)
-
-        # The root is in the first quarter of the step that ends above zero.
-        for part in range(1, 5):
-            end = 0.25 * part
-            if end <= left:
-                continue
-            root = 2.0
-            if _value(c, end) > 0.0:
-                root = _bisect(c, left, end, 0.0)
-            if root <= top:
-                return root, CROSSING
-            if end >= top:
-                break
-            left = end
-        if high > 1.0:
-            break
-
-        # Not above zero at the ends of quarters: between them the largest value decides, unless it is within the error.
-        peak = _value(c, top)
-        if peak > margin:
-            return _bisect(c, left, top, 0.0), CROSSING
-        if peak > -margin:
-            return top, EXTREMUM
-    return 1.0, NONE
+    for k in range(6):
+        room[k] = gap[k] - 0.2 * k * margin
+    latest = first_upcrossing_after_start(room, tolerance)
+    if latest - earliest <= DECIDED:
+        return 0.5 * (earliest + latest)
+    if margin > tolerance:
+        return UNDECIDED
+    return latest
 
 
 CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("elastic", ELASTIC)])
@@ -357,13 +144,14 @@ class FlowStep(NamedTuple):
     """Result of a step of a system, for the search of contact changes.
 
     ``side`` (contacts,) of closed contacts, 1 or -1, 0 for open ones; ``start`` and ``end`` (contacts, 3) hold
-    w, w' and w'' at both ends.
+    w, w' and w'' at both ends. ``room`` (3, 6) is overwritten.
     """
 
     system: CompiledSystem
     side: np.ndarray
     start: np.ndarray
     end: np.ndarray
+    room: np.ndarray
 
 
 @inlined
@@ -479,18 +267,19 @@ def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
     """The record of a flow's steps, which begins at the state in column 0 of ``y`` (2n, 1 + m)."""
     contacts = system.contacts.size
     side = np.empty(contacts, np.int64)
-    step = FlowStep(system, side, np.empty((contacts, 3)), np.empty((contacts, 3)))
+    step = FlowStep(system, side, np.empty((contacts, 3)), np.empty((contacts, 3)), np.empty((3, 6)))
     close(system, y, step.side)
     return step
 
 
 @kernel
-def first_change(step: FlowStep, h: float) -> Change:
-    """The first change of a contact in a step of length ``h``, with the first attempt at it."""
-    # A rise at the very end, position 1, is found at the start of the next step.
-    first = 1.0
-    change = Change(contact=-1, side=0, sign=0.0, offset=0.0, extremum=False, low=0.0, high=h, length=h, attempts=0)
+def first_change(step: FlowStep, h: float, size: float) -> Change:
+    """The first change of a contact in a step of length ``h``; ``size`` in m is that of the motion."""
+    change = Change(contact=-1, side=0, sign=0.0, offset=0.0, tolerance=0.0, position=NONE)
+    motion = step.room[0]
+    gap = step.room[1]
     for c in range(step.side.size):
+        bernstein(step.start[c], step.end[c], h, motion)
         for s in (-1, 1):
             clearance = clearance_on(step.system.contacts[c], s)
             if clearance == np.inf or (step.side[c] != 0 and step.side[c] != s):
@@ -501,20 +290,13 @@ def first_change(step: FlowStep, h: float) -> Change:
             if step.side[c] != 0:
                 sign = -sign
                 offset = -offset
-            position, outcome = first_rise(hermite(step.start[c], step.end[c], h, sign, offset))
-            if outcome != NONE and position < first:
-                first = position
-                change = Change(
-                    contact=c,
-                    side=s,
-                    sign=sign,
-                    offset=offset,
-                    extremum=outcome == EXTREMUM,
-                    low=0.0,
-                    high=h,
-                    length=position * h,
-                    attempts=0,
-                )
+            for k in range(6):
+                gap[k] = sign * motion[k] - offset
+            tolerance = ROUNDING * (abs(clearance) + size)
+            position = first_rise(gap, tolerance, step.room[2])
+            # What is undecided comes first, as -1: the step is to be halved.
+            if position < change.position:
+                change = Change(c, s, sign, offset, tolerance, position)
     return change
 
 
@@ -649,9 +431,35 @@ class Flow(ABC):
         )
         self.omega = float(system.linear_modes()[0][-1])
         n = system.dofs
-        self.limits = ArcLimits(every=max(ENTRIES_BETWEEN_LOOKS // (2 * n * (1 + 2 * n)), 1))
+        self.between_looks = max(ENTRIES_BETWEEN_LOOKS // (2 * n * (1 + 2 * n)), 1)
+        self._longest = UNLIMITED
+        self._stop: StopRequest | None = None
         self._variations = np.eye(2 * n, 1 + 2 * n, k=1)  # at the start of an arc, behind the column of the orbit
         self._away = np.where(system.is_pressed, SEPARATION, ONSET)
+
+    @contextmanager
+    def limited(self, longest: int, stop: StopRequest | None) -> Iterator[None]:
+        """A block whose arcs raise FlowError beyond ``longest`` steps, and StoppedError where a ``stop`` is requested.
+
+        Outside of it no arc is too long, and none is stopped.
+        """
+        self._longest = longest
+        self._stop = stop
+        try:
+            yield
+        finally:
+            self._longest = UNLIMITED
+            self._stop = None
+
+    def check(self, steps: float) -> int:
+        """Return at how many steps of an arc that has made so many ``steps`` to call again; raises as ``limited``."""
+        if steps > self._longest:
+            raise FlowError(
+                f"an arc of more than {self._longest} steps, {MOST_LONGER} times those of the arc at the guess"
+            )
+        if self._stop is not None and self._stop.requested:
+            raise StoppedError("stopped on request; continue with --resume")
+        return min(int(steps) + self.between_looks, self._longest + 1)
 
     def omega_ref(self, period: float) -> float:
         """Frequency in rad/s that makes velocities displacements: the larger of the fastest mode's and the orbit's."""
@@ -699,7 +507,7 @@ class Flow(ABC):
 
     @abstractmethod
     def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
-        """Advance state and variations ``y`` (2n, 1 + 2n) by ``duration`` seconds, within ``limits``; ``y`` is lost."""
+        """Advance state and variations ``y`` (2n, 1 + 2n) by ``duration`` s and ``check`` its steps; ``y`` is lost."""
 
 
 # Errors allowed per step, relative to the size of the orbit and of each variation.
@@ -836,14 +644,21 @@ DONE, STUCK, FULL, PAUSED = range(4)
 # Contact changes of one arc beyond which a flow gives up: thirty times as many as the in-phase branch of the paper's
 # model (bilinear) has in a quarter period up to 5 J, 67.
 MOST_CHANGES = 2000
-# A step shorter than this fraction of the arc's time is taken as it was tried if its search for a contact change finds
-# one at the step's very beginning: a contact at rest at its clearance hardly moves in it, and rounding decides.
-SHORT = 1e-6
 COUNTS = [(name, np.int64) for name in ("interval", "has_begun", "steps", "pause", "changes")]
 PROGRESS = np.dtype([*COUNTS, ("time", float), ("length", float), ("closed", float)])
 """How far a flow has come: the number of its present interval, and 1 if that has begun; the steps tried so far, and how
 many are allowed; in that interval the changes, the time in s, the next step's in s, the seconds with a contact closed.
 """
+
+
+@kernel
+def _size(stepper: Stepper) -> float:
+    """The size of the motion in m at the start of a step: the largest displacement, or velocity over a frequency."""
+    n = stepper.step.system.inverse_mass.size
+    size = 0.0
+    for i in range(n):
+        size = max(size, abs(stepper.start[i, 0]), abs(stepper.start[n + i, 0]) / stepper.omega_ref)
+    return size
 
 
 @kernel
@@ -857,53 +672,29 @@ def _take_orbit(orbit: Stepper, stepper: Stepper) -> None:
 
 
 @kernel
-def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
-    """Repeat the step of length ``h`` at time ``t`` so that it ends on a ``change``.
+def _land(stepper: Stepper, orbit: Stepper, h: float, change: Change) -> float:
+    """Repeat a step of length ``h`` so that it ends on a ``change``; returns the new length, -1 if none is found.
 
-    Returns the new length, and whether there is a change at its end; otherwise the gap has a largest
-    value there, not above zero. The ``orbit``, a stepper without variations, makes the attempts. The ``stepper`` makes
-    one step, of the length that is found, with the variations.
+    The ``orbit``, a stepper without variations, makes the attempts, and the ``stepper`` one step with the variations.
     """
-    step = orbit.step
     _take_orbit(orbit, stepper)
-    for _ in range(MOST_ATTEMPTS):
+    step = orbit.step
+    landing = Landing(length=change.position * h, longest=h, residual=np.inf, attempts=0)
+    # A contact changes at once after one that changes with it, as by a symmetry.
+    outcome = LANDED
+    if landing.length > 0.0:
+        outcome = RETRY
+    while outcome == RETRY:
         # Each attempt is a whole step from the start: its end has the order of the pair, an interpolant has not.
-        length = change.length
-        advance(orbit, length)
+        advance(orbit, landing.length)
         observe(step, orbit.end, orbit.end_rates, step.end)
-        # A root is sought to the rounding of the arc's time; an extremum, near which the gap is flat, to that of h.
-        floor = 1e-16 * (t + h)
-        if change.extremum:
-            floor = 1e-15 * h
-        change, outcome = correct(change, step.end[change.contact], floor)
-        if outcome != NONE:
-            break
-    advance(stepper, length)
-    return length, outcome != EXTREMUM
-
-
-@kernel
-def _end_on_change(stepper: Stepper, orbit: Stepper, t: float, h: float, duration: float) -> tuple[float, Change, int]:
-    """Let a step of length ``h`` at time ``t``, which is made, end on its first change.
-
-    Returns the new length, the change, and how the step ends: without a change (NONE), on the change (CROSSING), or
-    where a gap is largest and not above zero (EXTREMUM).
-    """
-    step = stepper.step
-    observe(step, stepper.end, stepper.end_rates, step.end)
-    change = first_change(step, h)
-    if change.contact < 0:
-        return h, change, NONE
-
-    length, changed = _land(stepper, orbit, t, h, change)
-    if changed:
-        return length, change, CROSSING
-    # The landing has shortened the step to nothing: rounding took the step's beginning for an extremum.
-    if t + length == t and h <= SHORT * duration:
-        advance(stepper, h)
-        observe(step, stepper.end, stepper.end_rates, step.end)
-        return h, change, NONE
-    return length, change, EXTREMUM
+        gap = change.sign * step.end[change.contact, 0] - change.offset
+        rate = change.sign * step.end[change.contact, 1]
+        landing, outcome = correct(landing, gap, rate, change.tolerance, EXACT * change.tolerance)
+    if outcome != LANDED:
+        return -1.0
+    advance(stepper, landing.length)
+    return landing.length
 
 
 @kernel
@@ -986,26 +777,33 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray,
             continue
         next_length = grown(h, error, largest)
 
-        h, change, end = _end_on_change(stepper, orbit, t, h, duration)
-        if end == EXTREMUM and t + h == t:
-            outcome = STUCK
-            break
+        observe(step, stepper.end, stepper.end_rates, step.end)
+        change = first_change(step, h, _size(stepper))
+        changes = change.position <= 1.0
+        if changes:
+            length = -1.0
+            if change.position >= 0.0:
+                length = _land(stepper, orbit, h, change)
+            # In a shorter step the interpolant tells more, and a landing begins nearer to the change.
+            if length < 0.0:
+                h = 0.5 * h
+                continue
+            h = length
 
-        _begin_at_end(stepper, end == NONE)
+        _begin_at_end(stepper, not changes)
         if np.any(step.side):
             progress.closed += h
         t += h
         # The end is set exactly: a sum of steps is rounded.
-        if last and end == NONE:
+        if last and not changes:
             t = duration
         h = next_length
-        if end == CROSSING:
+        if changes:
             if progress.changes >= events.shape[0]:
                 outcome = FULL
                 break
             _fill_event(events[progress.changes], t, change, switch(step, change))
             progress.changes += 1
-        if end != NONE:
             observe(step, stepper.start, stepper.stages[0], step.start)
 
     progress.time = t
@@ -1070,7 +868,7 @@ class Dop853Flow(Flow):
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> Advance:
         # The flow takes a step for each radian at least.
-        self.limits.refuse(self.omega_ref(period) * duration)
+        self.check(self.omega_ref(period) * duration)
         state = self._stepper.start[: len(y), : self._columns]
         state[:] = y
         progress = self._flow_through(self._stepper, duration, self._end, period)
@@ -1096,9 +894,8 @@ class Dop853Flow(Flow):
         progress = np.zeros(1, PROGRESS)
         outcome = PAUSED
         while outcome == PAUSED:
-            progress["pause"] = self.limits.check(int(progress["steps"][0]))
+            progress["pause"] = self.check(int(progress["steps"][0]))
             outcome = _flow_through(stepper, orbit, interval, states, self._events, progress)
-        self.limits.check(int(progress["steps"][0]))
         if outcome != DONE:
             why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}
             count = progress["changes"][0]

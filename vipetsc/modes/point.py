@@ -1,10 +1,13 @@
 """One periodic orbit of a branch of nonlinear normal modes, and its quantities in the branch's file."""
 
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from vipetsc.modes.problem import Solution
+from vipetsc.modes.departures import Departure
+from vipetsc.modes.problem import PeriodicProblem, Solution
 
 # Quantities of a point: name in the files, type, unit, description.
 QUANTITIES: dict[str, tuple[str, type, str, str]] = {
@@ -82,3 +85,28 @@ class Point(Solution):
     def describe(self) -> str:
         """The point's number and energy, for messages."""
         return f"point {self.index} (E = {self.energy:.9g} J)"
+
+
+class OrbitProblem(PeriodicProblem[Point]):
+    """Equations whose solutions are orbits with contacts."""
+
+    @abstractmethod
+    def departures(self, point: Point) -> Sequence[Departure]:
+        """The times in the arc of an orbit in which contacts are not what they are at rest.
+
+        Raises FlowError if the arc cannot be integrated.
+        """
+
+    def grazing(self, point: Point) -> list[int]:
+        """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.
+
+        Raises FlowError if the arc cannot be integrated.
+        """
+        return []
+
+    def acceleration(self, point: Point) -> float:
+        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+
+        It is 0 at an equilibrium, and infinite where no rest of the orbit is known.
+        """
+        return np.inf

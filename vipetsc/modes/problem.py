@@ -5,11 +5,15 @@ a point of a branch it gives a ``Frame``: unknowns xi of order one, in which a s
 Continuation, the location of special points and the files of branches use nothing else of a method.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+
+from vipetsc.parallel import StopRequest
 
 
 class NoMotionError(RuntimeError):
@@ -107,19 +111,32 @@ class Frame(Protocol[S]):
         """The point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
 
 
-class PeriodicProblem(Protocol[S]):
+class PeriodicProblem(ABC, Generic[S]):
     """Equations whose solutions form branches.
 
     ``guards`` says which changes from point to point are guarded (``continuation.arclength``), and ``tolerance`` is
-    that of Newton's method.
+    that of Newton's method. Where the search for a point takes long it is given up, by StoppedError, if a ``stop`` is
+    requested.
     """
 
     tolerance: float
-    guards: frozenset[str]
+    guards: frozenset[str] = frozenset()
+    stop: StopRequest | None = None
 
+    @contextmanager
+    def stopped_by(self, stop: StopRequest) -> Iterator[None]:
+        """A block in which the search for a point can be stopped."""
+        self.stop = stop
+        try:
+            yield
+        finally:
+            self.stop = None
+
+    @abstractmethod
     def frame(self, point: S, chart: str = "auto") -> Frame[S]:
         """The frame at ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
 
+    @abstractmethod
     def first_tangent(self, start: S, direction: int) -> np.ndarray:
         """Tangent at the first point, along which the energy (or parameter) grows (``direction`` 1) or falls (-1).
 
@@ -127,8 +144,10 @@ class PeriodicProblem(Protocol[S]):
         """
 
     def turn(self, before: S, after: S) -> float:
-        """Angle in rad between the tangents of two points in relative units; 0 without a tangent."""
+        """Angle in rad between the tangents of two points in relative units; 0 where there is one chart."""
+        return 0.0
 
+    @abstractmethod
     def special_kinds(self, left: S, right: S) -> Iterator[SpecialKind[S]]:
         """Kinds of special points that may lie between two neighbouring points of a branch."""
 

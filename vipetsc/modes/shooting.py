@@ -35,10 +35,10 @@ from dataclasses import replace
 import numpy as np
 
 from vipetsc.modes.departures import Departure, within_arc
-from vipetsc.modes.flow import MOST_LONGER, Arc, Flow, ShootingMap
+from vipetsc.modes.flow import MOST_LONGER, UNLIMITED, Arc, Flow, ShootingMap
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, StartError, unit
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
@@ -285,15 +285,15 @@ class ShootingFrame:
         """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value.
 
         It fails where it comes to an arc of ``MOST_LONGER`` times the steps of that at the guess. Raises StoppedError
-        in a block of ``ArcLimits.stopped_by``.
+        where ``Shooting.stop`` is requested.
         """
         problem = self.problem
         try:
-            with problem.limits.attempt():
+            with problem.flow.limited(UNLIMITED, problem.stop):
                 longest = MOST_LONGER * self.arc(guess).steps
         except FlowError as error:
             return Attempt(converged=False, reason=str(error), history=[], xi=guess, left_domain=True)
-        with problem.limits.attempt(longest):
+        with problem.flow.limited(longest, problem.stop):
             rounding = problem.rounding(self.chart.period)
             return problem.newton.solve(self, guess, row, value, problem.tolerance, rounding)
 
@@ -352,7 +352,7 @@ class ShootingFrame:
         )
 
 
-class Shooting:
+class Shooting(OrbitProblem):
     """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
 
     The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
@@ -377,7 +377,6 @@ class Shooting:
         self.system = system
         self.map = shooting_map
         self.tolerance = tolerance
-        self.limits = flow.limits
         self.newton = DenseNewton(system.dofs + 1, max_newton)
 
         n = system.dofs

@@ -199,10 +199,11 @@ class SpecialSteps(UserSteps):
         over = point.xi[-2]
         if not 1 / self.reach <= over <= self.reach:
             return point, Ending.END_OF_AMPLITUDES.with_numbers(end=over * self.amplitude)
-        end = super().end(before, point)
-        if end is not None and end[1].ending is Ending.END_OF_PARAMETER:
-            return end[0], Ending.END_OF_RANGE.with_numbers(end=end[0].xi[-1] * self.scale)
-        return end
+        return super().end(before, point)
+
+    def ended_at(self, bound: float) -> Ended:
+        """Return that the frequency came to an end of its range."""
+        return Ending.END_OF_RANGE.with_numbers(end=bound * self.scale)
 
 
 def crosses_amplitude(points: list[Response], special: Response) -> bool:

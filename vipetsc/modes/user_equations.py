@@ -22,7 +22,6 @@ import numpy as np
 from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Continuation, Verdict, locate
 from vipetsc.modes.continuation.crossing import crossing_row, step_across
-from vipetsc.modes.continuation.turning import BoundedTurn
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import (
     Attempt,
@@ -33,7 +32,8 @@ from vipetsc.modes.problem import (
     nearest_on_chords,
     unit,
 )
-from vipetsc.modes.response.state import Response, returned
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.turning import BoundedTurn, RangeProblem
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -87,15 +87,13 @@ class UserFrame:
         return Response(xi=attempt.xi, tangent=direction)
 
 
-class UserProblem:
+class UserProblem(RangeProblem):
     """The equations F(x, p) = 0 in unknowns of order one (``PeriodicProblem``).
 
     ``jacobian`` gives dF/dx (n, n); without one both derivatives are central differences. ``scales`` (n + 1,) are the
     units of x and p. The residual is F over a ``unit``, the size of its derivative where the curve begins, so that an
     error of the residual is about one of the unknowns.
     """
-
-    guards: frozenset[str] = frozenset()
 
     def __init__(
         self, function: Function, jacobian: Function | None, scales: np.ndarray, tolerance: float, max_newton: int
@@ -166,10 +164,6 @@ class UserProblem:
         """Return the tangent (n + 1,) at the first point, along which p grows (``direction`` 1) or falls (-1)."""
         return UserFrame(self, start.xi, np.eye(len(start.xi))[-1] * direction).tangent_at(start.xi)
 
-    def turn(self, before: Response, after: Response) -> float:
-        """0: the angle between tangents in a second chart, of which there is none."""
-        return 0.0
-
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
         """Yield folds and branch points."""
         yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
@@ -187,30 +181,22 @@ class UserProblem:
         return float(sign), float(logarithm)
 
 
-class UserSteps(BoundedTurn[Response]):
+class UserSteps(BoundedTurn):
     """Steps to an end of the range ``ends`` (2,) of the scaled parameter, or back to the ``first`` point."""
+
+    smallest_step = 1e-9
+    problem: UserProblem
 
     def __init__(
         self, problem: UserProblem, first: Response, ends: np.ndarray, points: int, largest_step: float
     ) -> None:
-        super().__init__(points, 0.1 * largest_step, 1e-9, largest_step)
-        self.problem = problem
-        self.first = first
-        self.ends = ends
+        super().__init__(problem, points, ends, first)
+        self.first_step = 0.1 * largest_step
+        self.largest_step = largest_step
 
-    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
-        """Return the first point if the curve comes back to it, or that on the end of the range if it passes it."""
-        if returned(self.first, before, point):
-            first = replace(self.first, index=point.index, step=point.step, next_step=point.next_step)
-            return first, Ending.CLOSED.with_numbers()
-        p = point.xi[-1]
-        bound = np.clip(p, *self.ends)
-        if p == bound:
-            return None
-        place = (bound - before.xi[-1]) / (p - before.xi[-1])
-        xi = self.problem.at(before.xi + place * (point.xi - before.xi), float(bound))
-        last = replace(point, xi=xi, tangent=self.problem.frame(point).tangent_at(xi))
-        return last, Ending.END_OF_PARAMETER.with_numbers(end=bound * self.problem.scales[-1])
+    def ended_at(self, bound: float) -> Ended:
+        """Return that the parameter came to its end."""
+        return Ending.END_OF_PARAMETER.with_numbers(end=bound * self.problem.scales[-1])
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Return where and why the curve cannot go on."""

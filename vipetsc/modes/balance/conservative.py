@@ -77,7 +77,7 @@ from vipetsc.modes.balance.harmonic_balance import BalanceFrame, Compliance, Har
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
 from vipetsc.modes.departures import Departure, union_length
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
 
 # An episode centred on an end of the arc counts. Rounding may put its middle outside by up to 1e-9 rad at either end,
@@ -361,7 +361,7 @@ SHORTER = 0.4
 SMALLEST_WEIGHT = 1e-4
 
 
-class ConservativeMotions:
+class ConservativeMotions(OrbitProblem):
     """Branches of conservative motions of ``forces`` at pairs whose ``compliance`` is given, as a ``PeriodicProblem``.
 
     ``control`` is the table [nnm] of a case: harmonics are taken up to the order ``nnm.harmonics`` at most, and as many
@@ -399,10 +399,6 @@ class ConservativeMotions:
         """The times in which contacts are not what they are at rest, from phase 0 to where the motion repeats."""
         balance = self.balance(point.order)
         return departures_of(self.forces, balance.series(point.x, 2 * np.pi / point.period).episodes)
-
-    def grazing(self, point: Point) -> list[int]:
-        """No contact: at a touch the number of harmonics limits a branch, and not the length of its steps."""
-        return []
 
     def acceleration(self, point: Point) -> float:
         """The largest acceleration where a motion rests, over that of a harmonic motion of the same size.
@@ -476,14 +472,6 @@ class ConservativeMotions:
         sign = np.sign(point.energy_tangent) or 1.0
         harmonics = self.balance(start.order).resized(point.tangent[:-1])
         return np.append(harmonics, point.tangent[-1]) * (sign * direction)
-
-    def turn(self, before: Point, after: Point) -> float:
-        """0: no angle is guarded beyond that between the tangents in the unknowns of a step's frame.
-
-        Other problems give the angle in units that do not depend on the chart. There is one chart here, whose unknowns
-        are relative already, and each step guards the angle in these.
-        """
-        return 0.0
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Folds of the energy and of the frequency, between two motions that are not linear."""

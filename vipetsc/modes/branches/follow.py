@@ -146,7 +146,7 @@ class Follower:
             if branch.points:
                 start = branch.regular()[-1]
             else:
-                with method.stopped_by(problem, self.stop):
+                with problem.stopped_by(self.stop):
                     start = method.start(problem, job, self.stop)
             self.growth.run(branch, problem, start, method.rule, direction)
         except interruptions:
@@ -246,7 +246,7 @@ def follow_all(
 
     A branch that fails, by one of ``Method.failures``, is written as far as it came and says why (``Branch.ended``),
     and the others go on. A ``stop`` ends each branch at its next point, or earlier if an orbit's search takes long
-    (``ArcLimits``); of branches that are not begun yet each still computes its start, unless that takes long or has
+    (``Flow.limited``); of branches that are not begun yet each still computes its start, unless that takes long or has
     steps of its own, and one point. With ``resume`` branches that were stopped go on to the same bits, and branches
     that failed or have used up their points go on from their last point. Returns all branches on rank 0, in the order
     of the case; an empty list on the others.

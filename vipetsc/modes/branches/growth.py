@@ -55,7 +55,11 @@ class Growth:
         regular = branch.regular()
         # Points of an earlier run count against the number that a branch may have; its start does not.
         done = max(len(regular) - 1, 0)
-        rule = rule_of(problem, start, done)
+        # A closed curve ends where it began, also if it is resumed elsewhere.
+        first = start
+        if regular:
+            first = regular[0]
+        rule = rule_of(problem, first, done)
         # The ending of a branch that has used up its points tells their number as its case counts them.
         counted = done + int(self.method.counts_start)
         # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
@@ -72,7 +76,7 @@ class Growth:
             branch.points = [self.method.assess(problem, continuation.point)]
 
         try:
-            with self.method.stopped_by(problem, self.stop):
+            with problem.stopped_by(self.stop):
                 seen = self._steps(branch, problem, continuation, rule.chart, monitor)
         except StoppedError:
             # A step in which the branch was stopped is left out, and repeated by a resumed branch.

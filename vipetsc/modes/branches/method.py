@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Generic, NamedTuple
 
 import numpy as np
@@ -86,13 +85,6 @@ class Method(ABC, Generic[S]):
     def computed(self, job: int) -> list[S] | None:
         """All points of a branch that needs no continuation; None of others, which are followed."""
         return None
-
-    def stopped_by(self, problem: PeriodicProblem[S], stop: StopRequest) -> AbstractContextManager[None]:
-        """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
-
-        Here none is: the block has no effect.
-        """
-        return nullcontext()
 
     @abstractmethod
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:

@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import cast
 
@@ -50,15 +49,6 @@ class NnmMethod(Method[Point]):
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps to the end of the ranges."""
         return guarded_steps(problem, self.options, done)
-
-    def stopped_by(self, problem: PeriodicProblem[Point], stop: StopRequest) -> AbstractContextManager[None]:
-        """A block in which a point whose search takes long is given up, by StoppedError, where a ``stop`` is requested.
-
-        That of shot orbits is; the block has no effect on others.
-        """
-        if isinstance(problem, Shooting):
-            return problem.limits.stopped_by(stop)
-        return super().stopped_by(problem, stop)
 
     def chosen(self, problem: PeriodicProblem[Point]) -> list[SpecialKind[Point]]:
         """The points at the values ``nnm.points_at``."""

@@ -22,17 +22,9 @@ from vipetsc.modes.problem import PeriodicProblem, SpecialKind
 from vipetsc.modes.response.branch_switching import crossing_case, first_crossing
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
-from vipetsc.modes.response.isolated import (
-    ClosingSteps,
-    is_on,
-    over_amplitudes,
-    places_of,
-    subharmonic_states,
-    unknown_states,
-)
-from vipetsc.modes.response.keyed_case import KeyedCase
+from vipetsc.modes.response.isolated import is_on, over_amplitudes, places_of, subharmonic_states, unknown_states
 from vipetsc.modes.response.linear import linear_states, linear_variables
-from vipetsc.modes.response.over_key import StatesOverKey
+from vipetsc.modes.response.over_key import KeyedCase, StatesOverKey
 from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -199,9 +191,9 @@ class ResponseMethod(Method[Response]):
         old = self._equations(curve, curve.case)
         case = crossing_case(curve.case, point.kind)
 
-        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> ClosingSteps:
+        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
             assert isinstance(problem, SteadyStates | StatesOverKey)
-            return ClosingSteps(problem, max(self.case.nfrc.points - 1 - done, 0), start)
+            return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0), start)
 
         def start(side: int) -> tuple[SteadyStates | StatesOverKey, Response]:
             return first_crossing(old, point, self._equations(curve, case), side)
@@ -247,8 +239,8 @@ class ResponseMethod(Method[Response]):
     def _isola(self, states: SteadyStates | StatesOverKey, first: Response, name: str) -> CrossingBranch:
         """The isolated curve of that ``name`` through the ``first`` state, along its tangent."""
 
-        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> ClosingSteps:
-            return ClosingSteps(states, max(self.case.nfrc.points - 1 - done, 0), first)
+        def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
+            return TurningSteps(states, max(self.case.nfrc.points - 1 - done, 0), first)
 
         return CrossingBranch(name, lambda: (states, first), rule)
 

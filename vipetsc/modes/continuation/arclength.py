@@ -43,8 +43,8 @@ from scipy.optimize import brentq
 
 from vipetsc.case.nnm import NnmTable
 from vipetsc.endings import NOT_FINISHED, Ended, Ending
-from vipetsc.modes.departures import Departure, changed_families
-from vipetsc.modes.point import Point
+from vipetsc.modes.departures import changed_families
+from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import (
     Attempt,
     ContinuationError,
@@ -67,28 +67,6 @@ GUARDED = {
 }
 # A change of these within its bound is no reason for a shorter step: such changes do not shrink with the step.
 ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
-
-
-class OrbitProblem(PeriodicProblem[Point], Protocol):
-    """Equations whose solutions are orbits with contacts, as ``largest_change`` asks them."""
-
-    def departures(self, point: Point) -> Sequence[Departure]:
-        """The times in the arc of an orbit in which contacts are not what they are at rest.
-
-        Raises FlowError if the arc cannot be integrated.
-        """
-
-    def grazing(self, point: Point) -> list[int]:
-        """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.
-
-        Raises FlowError if the arc cannot be integrated.
-        """
-
-    def acceleration(self, point: Point) -> float:
-        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
-
-        It is 0 at an equilibrium, and infinite where no rest of the orbit is known.
-        """
 
 
 class GuardedChange(NamedTuple):

@@ -16,11 +16,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.over_key import StatesOverKey
-from vipetsc.modes.response.state import Response, returned
+from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps
 
@@ -198,21 +197,3 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
     update = {"over": "amplitude", "fixed": [omega], "range": [amplitude / reach, amplitude * reach]}
     case = lattice.case.model_copy(update={"nfrc": lattice.options.model_copy(update=update)})
     return SteadyStates(case, lattice.restitution, omega, forces=lattice.forces, like=lattice)
-
-
-class ClosingSteps(TurningSteps):
-    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or at an end of the range."""
-
-    def __init__(self, states: Equations, points: int, first: Response) -> None:
-        super().__init__(states, points)
-        self.first = first
-
-    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
-        """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
-        first = self.first
-        if returned(first, before, point):
-            last = Response(
-                xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
-            )
-            return last, Ending.CLOSED.with_numbers()
-        return super().end(before, point)

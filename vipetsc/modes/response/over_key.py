@@ -10,6 +10,9 @@ at an end, and does not change the solution.
 A step may pass the end of the range, beyond which the key may have no valid value (a restitution above 1). The
 equations are continued there by their tangent in v, and the rule of the steps replaces such a state by the one at the
 end of the range (``steps.TurningSteps.end``).
+
+At each value the case is resolved and its lattice built anew (``KeyedCase``); only what the key has not changed is
+taken over.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,14 +20,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcTable
+from vipetsc.case.case_file import CaseError
+from vipetsc.case.nfrc import NfrcCase, NfrcTable
+from vipetsc.lattice import Chain
+from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.latest import LatestValues
-from vipetsc.modes.problem import SpecialKind
+from vipetsc.modes.problem import FlowError, SpecialKind
+from vipetsc.modes.response.condensation import contact_springs
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
-from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.stability import Perturbations, Stability
+from vipetsc.modes.stability import Hill, Perturbations
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5
@@ -45,7 +51,6 @@ class StatesOverKey(SteadyEquations):
     """
 
     def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
-        self.options = options
         self._build = build
         self._kept = LatestValues[float, SteadyStates](KEPT_VALUES)
         low, high = options.range
@@ -53,12 +58,10 @@ class StatesOverKey(SteadyEquations):
 
         first = self.states_at(low)
         super().__init__(
+            options,
             balance=first.balance,
             clearance=first.clearance,
             parameter=ContinuationParameter(over, amplitude, (high - low) / 2),
-            tolerance=options.tolerance,
-            max_newton=options.max_newton,
-            periods=first.periods,
         )
 
     def states_at(self, value: float) -> SteadyStates:
@@ -143,41 +146,57 @@ class StatesOverKey(SteadyEquations):
         value = self._within(xi[-1]) * self.parameter.scale
         return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
 
-    def stability(self, xi: np.ndarray) -> Stability:
-        """The number of growing perturbations of a state ``xi`` (n + 1,), and where multipliers are real."""
-        states, inner = self._at(xi)
-        return states.stability(inner)
-
-    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of the state ``xi`` (n + 1,) at an ``exponent`` lambda/Om at which it is real."""
-        states, inner = self._at(xi)
-        return states.determinant(inner, exponent)
-
-    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
-        states, inner = self._at(xi)
-        return states.growing_pairs(inner)
-
-    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
-
-        Raises NoMotionError without one.
-        """
-        states, inner = self._at(xi)
-        return states.pair_near(inner, guess)
-
-    def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
-        states, inner = self._at(xi)
-        return states.least_growth(inner)
-
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds, and where the number of growing perturbations changes otherwise, within the range."""
+        """Folds and other changes of stability within the range."""
         for kind in super().special_kinds(left, right):
             yield replace(kind, accept=self._is_within)
-        for kind in StabilityChanges(self, left, right).kinds():
-            yield replace(kind, accept=self._is_within)
+
+    def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
+        """Hill's determinant of the lattice at the key's value in ``xi`` (n + 1,), and the forces there."""
+        states, inner = self._at(xi)
+        return states.hill_at(inner)
 
     def _is_within(self, point: Response) -> bool:
         """Whether a state lies within the range, where the equations are those of a lattice."""
         return bool(self._within(point.xi[-1]) == point.xi[-1])
+
+
+class KeyedCase:
+    """The lattices of a ``case`` over its key ``nfrc.over``, with a ``restitution`` and an ``amplitude``.
+
+    Most keys of ``[contacts]`` leave the linear lattice as it is, and what is computed of it serves all their values.
+    It has springs in the place of contacts that alone hold it, whose stiffnesses follow from the law and the
+    precompression. ``amplitude`` is in the unit of the drive (``NfrcTable``).
+    """
+
+    def __init__(self, case: NfrcCase, restitution: float, amplitude: float) -> None:
+        self.case = case
+        self.restitution = restitution
+        self.amplitude = amplitude
+        self._last: SteadyStates | None = None
+
+    def at(self, value: float) -> SteadyStates:
+        """The equations at a ``value`` of the key, over the amplitude; raises FlowError where the case is invalid."""
+        key = self.case.nfrc.over
+        try:
+            case = self.case.at(value, self.amplitude)
+        except CaseError as error:
+            reasons = "; ".join(map(str, error.problems))
+            raise FlowError(f"no lattice with {key} = {value:.6g}: {reasons}") from None
+
+        restitution = self.restitution
+        if key == "contacts.restitution":
+            restitution = value
+        like = None
+        if self._last is not None and _linear_lattice(self._last.case) == _linear_lattice(case):
+            like = self._last
+        self._last = SteadyStates(case, restitution, case.nfrc.fixed[0], like=like)
+        return self._last
+
+
+def _linear_lattice(case: NfrcCase) -> tuple[Chain, tuple[float, ...]]:
+    """What makes up the linear lattice of a ``case``: its chain, and springs in N/m in the place of contacts.
+
+    Clearances, which do not belong to it, are left out, so that two can be compared.
+    """
+    return replace(case.model().chain, clearances=()), contact_springs(case)

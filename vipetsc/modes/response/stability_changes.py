@@ -13,52 +13,24 @@ decay.
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Protocol
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from vipetsc.modes.problem import NoMotionError, SpecialKind
-from vipetsc.modes.response.state import Measures, Response
-from vipetsc.modes.stability import AT_ZERO, Perturbations, Stability
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.stability import AT_ZERO, Perturbations
+
+if TYPE_CHECKING:
+    from vipetsc.modes.response.equations import SteadyEquations
 
 BRANCH_POINT = "branch-point"
 PERIOD_DOUBLING = "period-doubling"
 NEIMARK_SACKER = "neimark-sacker"
 
 
-class StatesWithStability(Protocol):
-    """The questions that states of a curve (``SteadyStates``) must answer, each state given by its unknowns ``xi``."""
-
-    @property
-    def options(self) -> Any:
-        """The section [nfrc] of the case."""
-
-    def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state ``xi`` (n + 1,)."""
-
-    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
-
-    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
-
-    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
-
-        Raises NoMotionError without one.
-        """
-
-    def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
-
-    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of a state ``xi`` (n + 1,)."""
-
-
 class StabilityChanges:
     """Changes of stability between two neighbouring states of a curve: those that ``nfrc.special_points`` asks for."""
 
-    def __init__(self, states: StatesWithStability, left: Response, right: Response) -> None:
+    def __init__(self, states: "SteadyEquations", left: Response, right: Response) -> None:
         self.states = states
         self.left = left
         self.right = right

@@ -15,7 +15,7 @@ number of harmonics, as the loss is that of the harmonics kept. A force with the
 Re(i Om f* u)/2 at the displacement u of its mass. Fractions are over this power, and T is what leaves to higher cells.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -24,19 +24,16 @@ from vipetsc.lattice import ComplianceError, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.latest import LatestValues
-from vipetsc.modes.problem import FlowError, SpecialKind
+from vipetsc.modes.problem import FlowError
 from vipetsc.modes.response.condensation import compliance_of, driven_points, forces_of
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, largest_values
-from vipetsc.modes.response.stability_changes import StabilityChanges
-from vipetsc.modes.response.state import Measures, Response
-from vipetsc.modes.stability import Hill, Perturbations, Stability
+from vipetsc.modes.response.state import Measures
+from vipetsc.modes.stability import Hill, Perturbations
 
 # The power of a force counts as rounding below this fraction of amplitude times frequency times displacement, as in a
 # finite lattice without loss: nothing comes in, of which there could be fractions.
 LEAST_WORK = 1e-12
-# States whose stability is kept: the ends of a step, and one between them. Without special points one is enough.
-KEPT_STATES = 3
 # Frequencies of a range among which the largest linear motion is looked for. It is a unit, of which the order of
 # magnitude matters alone.
 TRIED = 33
@@ -82,7 +79,6 @@ class SteadyStates(SteadyEquations):
         # Along a curve over the amplitude all states have one linear motion and one Hill's determinant.
         self._motions = LatestValues[float, LinearMotion](KEPT_MOTIONS)
         self._hill: Hill | None = None
-        self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
         shifted = None
         if like is not None:
             self._hill = like._hill
@@ -93,6 +89,7 @@ class SteadyStates(SteadyEquations):
 
         clearance = self._unit()
         super().__init__(
+            options,
             balance=HarmonicBalance(
                 self.compliance,
                 self.forces,
@@ -103,9 +100,6 @@ class SteadyStates(SteadyEquations):
             ),
             clearance=clearance,
             parameter=ContinuationParameter(options.over, fixed, self._scale(clearance)),
-            tolerance=options.tolerance,
-            max_newton=options.max_newton,
-            periods=options.subharmonic,
         )
 
     def _unit(self) -> float:
@@ -185,7 +179,7 @@ class SteadyStates(SteadyEquations):
         base = self.motion_frequency(xi)
         series = self.balance.series(x, base)
 
-        unstable, fastest = perturbations or self._perturbations(xi, series)
+        unstable, fastest = perturbations or self._perturbations(xi)
         rate = complex(np.nan, np.nan)
         if fastest is not None:
             rate = fastest
@@ -224,59 +218,21 @@ class SteadyStates(SteadyEquations):
             incident=incident,
         )
 
-    def stability(self, xi: np.ndarray) -> Stability:
-        """The number of growing perturbations of a state ``xi`` (n + 1,), and where multipliers are real.
-
-        The latest are kept, since neighbours on a curve are compared.
-        """
-        return self._stabilities.get(xi.tobytes(), lambda: self._evaluate_stability(xi))
-
-    def _series(self, xi: np.ndarray) -> ForceSeries:
-        """The forces of the motion in ``xi`` (n + 1,)."""
-        return self.balance.series(xi[:-1] * self.clearance, self.motion_frequency(xi))
-
-    def _evaluate_stability(self, xi: np.ndarray) -> Stability:
-        series = self._series(xi)
-        return self.hill(self.motion_frequency(xi)).stability(series)
-
-    def _perturbations(self, xi: np.ndarray, series: ForceSeries) -> Perturbations:
-        """How many perturbations of a state ``xi`` grow, and which the fastest; ``series`` are its forces."""
+    def _perturbations(self, xi: np.ndarray) -> Perturbations:
+        """How many perturbations of a state ``xi`` grow, and which the fastest."""
         # The count is cheaper than the zeros themselves, and most states are stable.
         unstable = self.stability(xi).unstable
         if not unstable:
             return Perturbations(unstable, 0j)
-        return Perturbations(unstable, self.hill(self.motion_frequency(xi)).fastest(series))
+        hill, series = self.hill_at(xi)
+        return Perturbations(unstable, hill.fastest(series))
 
-    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
-        hill = self.hill(self.motion_frequency(xi))
-        return float(hill.determinants(self._series(xi), np.array([exponent]))[0].real)
-
-    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
-        return self.hill(self.motion_frequency(xi)).pairs(self._series(xi))
-
-    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
-
-        Raises NoMotionError without one.
-        """
-        return self.hill(self.motion_frequency(xi)).near(self._series(xi), guess)
-
-    def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
-        return self.hill(self.motion_frequency(xi)).least
-
-    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds, and where the number of growing perturbations changes otherwise."""
-        yield from super().special_kinds(left, right)
-        yield from StabilityChanges(self, left, right).kinds()
-
-    def hill(self, omega: float) -> Hill:
-        """Hill's determinant of motions at ``omega`` in rad/s.
+    def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
+        """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there.
 
         The latest is kept, since it keeps the compliances at the frequencies of perturbations.
         """
+        omega = self.motion_frequency(xi)
         if self._hill is None or self._hill.omega != omega:
             options = self.options
             decay = 0.0
@@ -290,7 +246,7 @@ class SteadyStates(SteadyEquations):
                 finite=not (options.infinite or options.open_ends),
                 decay=decay,
             )
-        return self._hill
+        return self._hill, self.balance.series(xi[:-1] * self.clearance, omega)
 
     def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
         """T, R, U and L (4,) of the module's docstring: powers over the power that comes in.

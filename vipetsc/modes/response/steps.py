@@ -13,11 +13,11 @@ import numpy as np
 from vipetsc.endings import Ended, Ending
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.continuation.arclength import Continuation, Verdict
-from vipetsc.modes.continuation.turning import BoundedTurn
 from vipetsc.modes.problem import Attempt, ContinuationError
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.turning import BoundedTurn
 from vipetsc.parallel import StoppedError, StopRequest
 
 # Largest number of states on growing amplitudes to the beginning of a range: the examples have 40 to 180. Where the
@@ -28,41 +28,30 @@ LONGEST_RAMP = 30.0
 MOST_WEIGHTS = 10_000
 
 
-class TurningSteps(BoundedTurn[Response]):
+class TurningSteps(BoundedTurn):
     """The step rule of steady states (``StepRule``): a bounded turn, and an end on the curve's range.
 
-    Lengths of steps are those of [nfrc], in units of the unknowns; ``points`` is the largest number of states.
+    Lengths of steps are those of [nfrc], in units of the unknowns; ``points`` is the largest number of states. An
+    isolated curve also ends where it comes back to its ``first`` state.
     """
 
     points_key = "nfrc.points"
+    problem: SteadyStates | StatesOverKey
 
-    def __init__(self, states: SteadyStates | StatesOverKey, points: int) -> None:
+    def __init__(self, states: SteadyStates | StatesOverKey, points: int, first: Response | None = None) -> None:
         options = states.options
-        super().__init__(points, options.first_step, options.smallest_step, options.largest_step)
-        self.states = states
+        super().__init__(states, points, np.array(options.range) / states.parameter.scale, first)
+        self.first_step = options.first_step
+        self.smallest_step = options.smallest_step
+        self.largest_step = options.largest_step
 
-    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
-        """The state on the end of the range, where ``point`` has passed it."""
-        states = self.states
-        scale = states.parameter.scale
-        low, high = (bound / scale for bound in states.options.range)
-        p = point.xi[-1]
-        if low <= p <= high:
-            return None
-        bound = high
-        if p < low:
-            bound = low
-        # The last state is moved back to the end itself: curves over the same range end at the same parameter. The line
-        # through both states is nearer to it than the last one, and along a fold Newton's method needs that.
-        place = (bound - before.xi[-1]) / (p - before.xi[-1])
-        xi = states.at(before.xi + place * (point.xi - before.xi), bound)
-        tangent = states.frame(point).tangent_at(xi)
-        last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
-        return last, Ending.END_OF_RANGE.with_numbers(end=bound * scale)
+    def ended_at(self, bound: float) -> Ended:
+        """Return that the parameter came to an end of its range."""
+        return Ending.END_OF_RANGE.with_numbers(end=bound * self.problem.parameter.scale)
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Message where and why the curve cannot go on, and which key to change."""
-        states = self.states
+        states = self.problem
         omega, amplitude = states.drive(last.xi[-1])
         at = f"{omega:.8g} rad/s at amplitude {amplitude:.6g}"
         if isinstance(states, StatesOverKey):

@@ -1,11 +1,14 @@
-"""Steps on which a curve turns by half of what is allowed: the step rule of curves without half-traces."""
+"""Steps on which a curve turns by half of what is allowed, to an end of a range: the step rule of responses."""
 
 from abc import ABC, abstractmethod
-from typing import Generic
+from dataclasses import replace
 
-from vipetsc.endings import Ended
+import numpy as np
+
+from vipetsc.endings import Ended, Ending
 from vipetsc.modes.continuation.arclength import Geometry, Verdict
-from vipetsc.modes.problem import Attempt, S
+from vipetsc.modes.problem import Attempt, PeriodicProblem
+from vipetsc.modes.response.state import Response, returned
 
 # The following three numbers decide how many states lie on a curve, not its course: each state solves the equations. On
 # the curve of ``runs/examples/nfrc.toml`` for the restitution 0.7, with 21 harmonics, its folds stay the same to 1e-8
@@ -22,21 +25,33 @@ MOST_GROWTH = 1.6
 LEAST_ANGLE = 1e-9
 
 
-class BoundedTurn(ABC, Generic[S]):
+class RangeProblem(PeriodicProblem[Response]):
+    """Equations with a parameter, of which a solution at a given value can be asked for."""
+
+    @abstractmethod
+    def at(self, guess: np.ndarray, p: float) -> np.ndarray:
+        """Unknowns (n + 1,) of the solution at the scaled parameter ``p`` near a ``guess``; or ContinuationError."""
+
+
+class BoundedTurn(ABC):
     """A step rule (``StepRule``) that bounds the turn of the curve in a step, and the correction over the step.
 
     Of ``points`` there are as many at most; steps are from ``smallest_step`` to ``largest_step`` long, in units of the
-    unknowns. A subclass says where the curve ends.
+    unknowns. The curve ends at an end of the range ``ends`` (2,) of the scaled parameter, or where it comes back to its
+    ``first`` point, if that is given.
     """
 
     points_key = "points"
     chart = ""
+    first_step: float
+    smallest_step: float
+    largest_step: float
 
-    def __init__(self, points: int, first_step: float, smallest_step: float, largest_step: float) -> None:
+    def __init__(self, problem: RangeProblem, points: int, ends: np.ndarray, first: Response | None = None) -> None:
+        self.problem = problem
         self.points = points
-        self.first_step = first_step
-        self.smallest_step = smallest_step
-        self.largest_step = largest_step
+        self.ends = ends
+        self.first = first
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
         """Return the verdict on a failed attempt: half the step."""
@@ -44,7 +59,7 @@ class BoundedTurn(ABC, Generic[S]):
         why = f"Newton's method ended with {attempt.reason} (residuals {residuals})"
         return Verdict(accepted=False, step=step / 2, why=why)
 
-    def judge(self, before: S, after: S, geometry: Geometry) -> Verdict:
+    def judge(self, before: Response, after: Response, geometry: Geometry) -> Verdict:
         """Accept a step on which neither the tangent turns too far nor the correction is too long; else half of it."""
         # A comparison with NaN is false, which refuses the step.
         why = ""
@@ -58,10 +73,26 @@ class BoundedTurn(ABC, Generic[S]):
         # An accepted turn is at most TURN, so that the quotient is at least 1/2, but for rounding.
         return Verdict(accepted=True, step=min(after.step * max(growth, 0.5), self.largest_step))
 
-    @abstractmethod
-    def end(self, before: S, point: S) -> tuple[S, Ended] | None:
-        """Return the last point of the curve and how it ended, if it ends at ``point``; else None."""
+    def end(self, before: Response, point: Response) -> tuple[Response, Ended] | None:
+        """Return the first point if the curve comes back to it, or that on the end of the range if it passes it."""
+        if self.first is not None and returned(self.first, before, point):
+            first = replace(self.first, index=point.index, step=point.step, next_step=point.next_step)
+            return first, Ending.CLOSED.with_numbers()
+        p = point.xi[-1]
+        bound = float(np.clip(p, *self.ends))
+        if p == bound:
+            return None
+        # The last point is moved back to the end itself: curves over the same range end at the same parameter. The line
+        # through both points is nearer to it than the last one, and along a fold Newton's method needs that.
+        place = (bound - before.xi[-1]) / (p - before.xi[-1])
+        xi = self.problem.at(before.xi + place * (point.xi - before.xi), bound)
+        last = replace(point, xi=xi, tangent=self.problem.frame(point).tangent_at(xi))
+        return last, self.ended_at(bound)
 
     @abstractmethod
-    def stuck(self, last: S, attempt: Attempt | None, verdict: Verdict) -> str:
+    def ended_at(self, bound: float) -> Ended:
+        """Return how a curve ended that has come to the ``bound`` of the scaled parameter."""
+
+    @abstractmethod
+    def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Why no step leads on from the ``last`` point."""
