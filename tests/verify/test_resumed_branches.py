@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ import pytest
 
 from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
@@ -103,3 +107,20 @@ def test_findings_of_a_stopped_branch_have_the_order_of_one_that_was_not(tmp_pat
     stopped_at(tmp_path / "parts", 4)
     follow(tmp_path / "parts")
     assert file_of(tmp_path / "parts").findings == whole.findings
+
+
+def test_a_closed_curve_that_is_resumed_ends_where_it_began(tmp_path):
+    """A closed curve of doubled periods that had used up its points ends at its first point, as a whole one does."""
+    with (files("vipetsc.examples") / "period-doubling.toml").open("rb") as file:
+        table = tomllib.load(file)
+    curves = []
+    for points in (100, 200):
+        table["nfrc"] |= {"points": points, "harmonics": 11}
+        case = NfrcCase.from_table(table)
+        _, crossing, *_ = follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
+        curves.append(crossing)
+
+    used_up, closed = curves
+    assert used_up.ended.ending is Ending.POINTS_USED
+    assert closed.ended.ending is Ending.CLOSED
+    assert closed.points[-1].xi.tolist() == closed.points[0].xi.tolist()
