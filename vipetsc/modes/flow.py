@@ -698,6 +698,23 @@ def _land(stepper: Stepper, orbit: Stepper, h: float, change: Change) -> float:
 
 
 @kernel
+def _end_on_change(stepper: Stepper, orbit: Stepper, h: float) -> tuple[float, Change]:
+    """Let a step of length ``h``, which is made, end on its first change; returns its length, and the change.
+
+    The length is -1 where the step is too long to tell whether there is a change, or to land on it.
+    """
+    step = stepper.step
+    observe(step, stepper.end, stepper.end_rates, step.end)
+    change = first_change(step, h, _size(stepper))
+    length = h
+    if change.position == UNDECIDED:
+        length = -1.0
+    elif change.contact >= 0:
+        length = _land(stepper, orbit, h, change)
+    return length, change
+
+
+@kernel
 def _begin_at_end(stepper: Stepper, smooth: bool) -> None:
     """Begin the next step at the end of the last one; after a ``smooth`` one, without a change, its rates are known."""
     _, _, start, end = stepper.flat
@@ -777,18 +794,13 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray,
             continue
         next_length = grown(h, error, largest)
 
-        observe(step, stepper.end, stepper.end_rates, step.end)
-        change = first_change(step, h, _size(stepper))
-        changes = change.position <= 1.0
-        if changes:
-            length = -1.0
-            if change.position >= 0.0:
-                length = _land(stepper, orbit, h, change)
-            # In a shorter step the interpolant tells more, and a landing begins nearer to the change.
-            if length < 0.0:
-                h = 0.5 * h
-                continue
-            h = length
+        length, change = _end_on_change(stepper, orbit, h)
+        # In a shorter step the interpolant tells more, and a landing begins nearer to the change.
+        if length < 0.0:
+            h = 0.5 * h
+            continue
+        h = length
+        changes = change.contact >= 0
 
         _begin_at_end(stepper, not changes)
         if np.any(step.side):
