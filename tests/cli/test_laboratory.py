@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 
+import h5py
+import numpy as np
 import pytest
 
 CASE = """
@@ -52,7 +55,24 @@ def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_pa
     assert not any("rad/s" in word or "History" in word for word in words)
     assert "stroke-width: 2.5" in picture
 
+    # The same record from HDF5, and a label of which no picture has the text.
+    columns = np.loadtxt(tmp_path / "a/curves/run-points.csv", delimiter=",", skiprows=1)
+    with h5py.File(tmp_path / "laser.h5", "w") as file:
+        file["time"] = columns[:, 0]
+        file["tip"] = columns[:, 1]
+        file["raw/near"] = columns[:, 2]
+    records = "--record laser.h5 --record laser.h5:raw/near=near"
+    ended = typed(f"plot b --fig points {records} --label Tpi=Sensor --format svg")
+    assert ended.returncode == 0, ended.stderr
+    assert "--label Tpi" in ended.stderr
+    assert (tmp_path / "b/figures/points.svg").exists()
+
+    for name, line in (("key", "axes.linewidht: 2"), ("value", "axes.linewidth: wide"), ("latex", "text.usetex: true")):
+        (tmp_path / f"{name}.mplstyle").write_text(f'# a style\naxes.edgecolor: "#112233"\n{line}\n')
     for wrong, telling in (
+        ("--style key.mplstyle", "line 3: matplotlib has no setting axes.linewidht; did you mean axes.linewidth"),
+        ("--style value.mplstyle", "line 3"),
+        *([] if shutil.which("latex") else [("--style latex.mplstyle", "LaTeX")]),
         ("--fig points --record x.toml", "x.toml"),
         ("--fig points --record a/curves/run-points.csv:2=top", "points are near, tip"),
         ("--fig ledger", "one run"),

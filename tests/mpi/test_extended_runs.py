@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.dynamics import simulate
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import on_root
@@ -54,11 +54,12 @@ def test_what_cannot_go_on_is_refused(folder):
     with pytest.raises(FolderError, match=r"time\.end.*--extend"):
         simulate(case_until(0.03, "ts"), path)
 
-    for case in (case_until(0.01, "ts"), case_until(0.03, "ts", drive={"amplitude": 7.0})):
-        with pytest.raises(FolderError, match="another run") as refused:
-            simulate(case, path, extend=True)
-        assert "changes nothing else" in str(refused.value)
-        assert "--force" not in str(refused.value)
+    with pytest.raises(FolderError, match="another run") as refused:
+        simulate(case_until(0.03, "ts", drive={"amplitude": 7.0}), path, extend=True)
+    assert "changes nothing else" in str(refused.value)
+    assert "--force" not in str(refused.value)
+    with pytest.raises(FolderError, match=r"later time\.end"):
+        simulate(case_until(0.01, "ts"), path, extend=True)
 
     (path / "end-state" / "source").unlink()
     with pytest.raises(FolderError, match="end-state"):
@@ -74,3 +75,19 @@ def test_an_extension_that_was_killed_goes_on_without_being_asked(folder):
     longer = case_until(0.03, "ts")
     (folder / "run" / "case.toml").write_text(longer.to_toml())
     assert simulate(longer, folder / "run").statistics["end"] == pytest.approx(0.03, rel=1e-3)
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("end", [0.04, 0.09])
+def test_an_extension_that_was_stopped_may_have_another_end(folder, end):
+    """An extension to 0.06 s is given up for one to a sooner or a later end, and has the bits of one long run."""
+    long = simulate(case_until(end, "ts"), folder / "long")
+    simulate(case_until(0.02, "ts"), folder / "run")
+    stopped = simulate(case_until(0.06, "ts"), folder / "run", extend=True, stop=StopAt(20))
+    assert stopped.resumable
+    with pytest.raises(FolderError, match=r"later time\.end"):
+        simulate(case_until(0.015, "ts"), folder / "run", extend=True)
+    extended = simulate(case_until(end, "ts"), folder / "run", extend=True)
+    assert extended.complete
+    assert extended.statistics["end"] == long.statistics["end"]
+    assert_same_bits(datasets(folder / "long" / "run.h5"), datasets(folder / "run" / "run.h5"))

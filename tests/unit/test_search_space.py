@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -308,3 +310,14 @@ def test_the_text_of_a_search_over_keys_gives_the_same_search():
     units = {"contacts.clearance[1]": "m", "contacts.clearance.first": "m", "lattice.cell.masses[1]": "kg"}
     units |= {"lattice.cell.springs[2].stiffness": "N/m", "contacts.each.restitution[1]": ""}
     assert {path: unit_of(path, {}) for path in units} == units
+
+
+@pytest.mark.parametrize(
+    "path, value", [("drive.more.first.cell", None), ("name.first.second", 1), ("a.b.c[2].d.e", 1)]
+)
+def test_a_key_that_cannot_be_set_leaves_the_table_as_it_was(path, value):
+    """Sections that are made for a key go with it."""
+    table = {"name": "x", "a": {"b": {"c": [1]}}}
+    before = copy.deepcopy(table)
+    assert put(table, path, value)
+    assert table == before

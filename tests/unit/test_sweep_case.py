@@ -151,6 +151,12 @@ def test_one_impossible_member_does_not_spoil_the_others():
     assert not sweep_of("[sweep.contacts]\nsites = [[10], [20]]").warnings()
 
 
+def test_what_matrices_make_does_not_vary_with_them():
+    """A sweep over matrices, which replace springs, may not vary single springs as well."""
+    with pytest.raises(CaseError, match=r"springs\[2\].stiffness.*lattice.cell.matrices"):
+        sweep_of('[sweep.lattice.cell]\nmatrices = ["a.npz", "b.npz"]\n"springs[2].stiffness" = [1.0, 2.0]').members()
+
+
 def test_names_of_members_are_those_of_their_values():
     """A name depends on a member's values, not on the order of the axes; equal members have one name."""
     amplitudes = "[sweep.drive]\namplitude = [1.0, 2.0, 1.0]\n"

@@ -85,8 +85,25 @@ def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, follo
         assert ends[after][0].tolist() == ends[before][1].tolist()
 
 
+def test_a_longer_member_keeps_whole_samples_a_period(tmp_path):
+    """``run FOLDER --member N --set time.end=...`` counts samples by the period, as the sweep does."""
+    sweep = {"measures": ["motion"], "drive": {"frequency": [2.3, 2.4]}}
+    for follow, omegas in (({}, (2.3, 2.4)), ({"follow": "up", "fields": True}, (2.3,))):
+        plan = Sweep.from_table(IMPACT | {"sweep": sweep | follow})
+        for number, omega in enumerate(omegas):
+            for override, samples in (("time.end=77.7", 16), ("time.samples_per_period=12", 12)):
+                case = plan.case_in(tmp_path, number, [override])
+                assert 2 * np.pi / omega / case.time.sample_interval == pytest.approx(samples, rel=1e-12)
+                assert case.time.end * omega / (2 * np.pi) == pytest.approx(round(case.time.end * omega / 2 / np.pi))
+
+
 def test_members_follow_one_another_along_numbers():
-    """A last axis without an order, and a sweep without fields, are refused by the key."""
+    """A last axis without an order, a sweep without fields, and an invalid member are refused by the key."""
+    invalid = Sweep.from_table(
+        IMPACT | {"sweep": {"follow": "up", "fields": True, "drive": {"amplitude": [1.0, 1e300]}}}
+    )
+    with pytest.raises(CaseError, match=r"drive\.amplitude = 1e"):
+        invalid.tried()
     for sweep, word in (
         ({"fields": True, "drive": {"frequency": [2.2, 2.3]}, "contacts": {"law": ["bilinear", "hertz"]}}, "last axis"),
         ({"drive": {"frequency": [2.2, 2.3]}}, "sweep.fields"),

@@ -200,11 +200,24 @@ def put(table: dict[str, Any], path: str, value: Any) -> list[Problem]:
     A path is "a.b.c", or "a.b[2].c" with an entry of a list, counted from 1. A key of the table may have dots itself.
     """
     place: Any = table
+    added: tuple[dict[str, Any], str] | None = None
     key, rest = _divided(place, path)
     while rest:
+        if added is None and isinstance(place, dict) and key not in place:
+            added = place, key
         place = _below(place, key, put_missing=True)
         key, rest = _divided(place, rest)
 
+    problems = _put(place, key, path, value)
+    # A section that was made for the key has no place without it.
+    if problems and added is not None:
+        parent, section = added
+        parent.pop(section, None)
+    return problems
+
+
+def _put(place: Any, key: str, path: str, value: Any) -> list[Problem]:
+    """Set the ``key`` of a ``place``, the last one of a ``path``; as ``put``."""
     item = ITEM.fullmatch(key)
     if item and isinstance(place, dict) and isinstance(place.get(item[1]), list):
         return _put_item(place[item[1]], int(item[2]) - 1, path, value)

@@ -209,8 +209,9 @@ def _check_stability(lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]
         return
     remedy = "is negative, and other springs and dashpots do not outweigh it: the lattice is unstable at rest"
     if of_matrices:
+        matrix = "K" if key.endswith("stiffness") else "C"
         key = "matrices"
-        remedy = "K or C is not positive semidefinite in the lattice; write all digits, and check signs and boundary"
+        remedy = f"{matrix} is not positive semidefinite in the lattice; write all digits, and check signs and boundary"
     yield Problem(f"lattice.cell.{key}", None, remedy)
 
 

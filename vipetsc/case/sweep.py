@@ -32,6 +32,9 @@ MOST_TRIED_SITES = 200_000
 # Ramp, in periods, of a harmonic drive that goes on from the run before: the full force is there at once, as far as a
 # ramp, which must be positive, allows. A sine has grown to 6e-3 of its amplitude by then.
 SHORT_RAMP = 1e-3
+# A key, and the beginnings of those that it fills in.
+MATRICES = "lattice.cell.matrices"
+OF_MATRICES = tuple(f"lattice.cell.{key}" for key in ("masses", "springs", "grounding"))
 
 
 class SweepTable(Section):
@@ -97,6 +100,9 @@ class Sweep(StudyCase):
             remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
 
+        if MATRICES in values and (made := [key for key in values if key.startswith(OF_MATRICES)]):
+            remedy = f"cannot vary with {MATRICES}, which makes it; vary one of the two"
+            problems.append(Problem(f"sweep.{made[0]}", given[made[0]], remedy))
         axes, wrong = axes_of(values, options.zip)
         if options.follow != "none" and not options.fields:
             remedy = "needs the fields of each run, with which the next one begins: set sweep.fields = true"
@@ -202,13 +208,13 @@ class Sweep(StudyCase):
         order = sorted(range(len(values)), key=lambda i: values[i], reverse=self.options.follow == "down")
         return numbers[..., order].reshape(-1, len(order)).tolist()
 
-    def case_in(self, folder: Path, number: int) -> Case:
+    def case_in(self, folder: Path, number: int, overrides: Sequence[str] = ()) -> Case:
         """Return the case of the member ``number`` of the sweep in a ``folder``, where members may follow one another.
 
         Such a member begins with the last state of the run before it, which ``folder`` has. Its harmonic drive is on
-        from the beginning, since that of the run before was. Raises CaseError.
+        from the beginning, since that of the run before was. ``overrides`` are as for ``case``. Raises CaseError.
         """
-        case = self.case(number)
+        case = self.case(number, overrides)
         chain = next(chain for chain in self.chains() if number in chain)
         if number == chain[0]:
             return case
@@ -228,18 +234,22 @@ class Sweep(StudyCase):
         remedy = f"is not a member; ensemble.h5 lists the names (member), and the numbers go from 0 to {self.count - 1}"
         raise CaseError([Problem("--member", name, remedy)], self.name)
 
-    def case(self, number: int) -> Case:
-        """The case of the member ``number``; raises CaseError if it is no valid one."""
+    def case(self, number: int, overrides: Sequence[str] = ()) -> Case:
+        """The case of the member ``number``, changed by ``overrides`` as those of ``Case.load``; raises CaseError."""
         member = self.member(number)
         if member.case is None:
             raise CaseError(member.problems, f"{self.name}, member {number}")
-        return member.case
+        if not overrides:
+            return member.case
+        # The table as it is written: a resolved one has lost how its samples were counted.
+        table, _ = self.member_table(member.index)
+        return Case.from_table(table, overrides)
 
     def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
         """Members in their order, all of them or ``most`` drawn at random.
 
-        Raises CaseError if none of these is a valid case, and if any is invalid because of what its disorder draws: the
-        remaining samples would have another distribution.
+        Raises CaseError if none of these is a valid case, if any is not where members follow one another, and if any is
+        invalid because of what its disorder draws: the remaining samples would have another distribution.
         """
         # Drawn with a seed of its own, so that every rank and every call tries the same ones.
         numbers = np.arange(self.count)
@@ -249,8 +259,10 @@ class Sweep(StudyCase):
         # Each text once, since members with the same seed have the same problem.
         if refused := {str(p): p for member in members for p in member.problems if p.key.startswith("disorder")}:
             raise CaseError(refused.values(), self.name)
-        if not any(member.case for member in members):
-            raise CaseError(members[0].problems, self.name)
+        # Where members follow one another, those behind an invalid one would have no beginning.
+        invalid = [member for member in members if member.case is None]
+        if len(invalid) == len(members) or (invalid and self.options.follow != "none"):
+            raise CaseError(invalid[0].problems, self.name)
         return members
 
     def tried(self) -> list[SweepMember]:

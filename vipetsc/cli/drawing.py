@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
-from vipetsc.cli.messages import echo
+from vipetsc.cli.messages import echo, echo_warnings
 from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import BRANCHES, SWEEP, ResultKind
@@ -92,6 +92,9 @@ def draw_pictures(
     for other in comm.gather(left_out) or []:
         left_out.add(other)
     report(pictures, comm, on_root(comm, lambda: sentences_on(pictures, folders, left_out, names)))
+    found = on_root(comm, lambda: left_out.labelled)
+    if look and (unknown := [text for text in look.labels if text not in found]):
+        echo_warnings(comm, [f"--label {', '.join(unknown)}: no picture that was drawn has this text or key"])
     return sorted(path for paths in comm.gather(drawn_here) or [] for path in paths)
 
 

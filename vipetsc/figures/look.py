@@ -1,11 +1,14 @@
 """How a user wants pictures to look: width, units, decibels, labels, titles, a style; applied to finished figures."""
 
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure, FigureBase
@@ -13,13 +16,15 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from vipetsc.figures.log_ticks import log_ticks
-from vipetsc.wording import key_name
+from vipetsc.wording import key_name, nearest
 
 LETTER_OF_PANEL = re.compile(r"\([a-z](\.[ivx]+)?\)")
 AMPLITUDES = ("m", "m/s", "m/s²", "m/s^2", "N")  # units of which a level is 20 log10 of the value
 POWERS = ("J", "W")  # units of which it is 10 log10
 ANGULAR = re.compile(r"([-+]?\d[\d.]*(?:e[-+]?\d+)?)([ \u00a0])(k?)rad/s\b")
 MOST_TICKS = 5
+# A line of a file of settings; comments begin with #, which colours in quotes may have too.
+SETTING = re.compile(r'\s*(?:(?P<key>[\w.]+)\s*:\s*(?:"(?P<quoted>[^"]*)"|(?P<value>[^#"]*?))\s*)?(?:#.*)?')
 
 
 class Unit(NamedTuple):
@@ -69,8 +74,8 @@ class Look:
     labels: Mapping[str, str] = field(default_factory=dict)
     titles: bool = True
 
-    def apply(self, figure: Figure) -> None:
-        """Change a ``figure`` that is drawn, but not laid out."""
+    def apply(self, figure: Figure) -> set[str]:
+        """Change a ``figure`` that is drawn, but not laid out; return those of the ``labels`` that it has."""
         if self.width:
             width, height = figure.get_size_inches()
             figure.set_size_inches(self.width, height * np.sqrt(self.width / width))
@@ -81,10 +86,13 @@ class Look:
                 self._convert(axis)
         if self.unit == "Hz":
             _replace_texts(figure, lambda text: ANGULAR.sub(_in_hertz, text))
+        found = set()
         for text, label in self.labels.items():
             # A picture shows a key of a case by its name.
             for sought in (text, key_name(text)):
-                _replace_texts(figure, partial(_replaced, sought=sought, label=label))
+                if _replace_texts(figure, partial(_replaced, sought=sought, label=label)):
+                    found.add(text)
+        return found
 
     def _convert(self, axis: Axis) -> None:
         """Give an ``axis`` the unit that is asked for, if its label has another of that kind."""
@@ -102,6 +110,33 @@ class Look:
             if of_level[2] in units:
                 axis.set_label_text(f"{of_level[1]}(dB re 1 {of_level[2]})")
                 _show_levels(axis, factor)
+
+
+def style_problem(file: str) -> str:
+    """Return why a ``file`` of matplotlib's settings cannot be used, with the line; "" if it can."""
+    try:
+        lines = Path(file).read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        return str(error)
+
+    settings = mpl.RcParams()
+    for number, line in enumerate(lines, 1):
+        match = SETTING.fullmatch(line)
+        if match is None:
+            return f"line {number} is not of the form KEY: VALUE"
+        key, value = match["key"], match["quoted"] or match["value"]
+        if not key:
+            continue
+        if key not in mpl.rcParams:
+            near = nearest(key, mpl.rcParams)
+            return f"line {number}: matplotlib has no setting {key}" + (f"; did you mean {near}?" if near else "")
+        try:
+            settings[key] = value
+        except ValueError as error:
+            return f"line {number}: {error}"
+    if settings.get("text.usetex") and shutil.which("latex") is None:
+        return "text.usetex needs LaTeX, which is not installed; install it, or remove that line"
+    return ""
 
 
 def _replaced(text: str, sought: str, label: str) -> str:
@@ -162,9 +197,12 @@ def _remove_titles(figure: Figure) -> None:
             axes.set_title(tag[0] if tag else "", loc=place)
 
 
-def _replace_texts(figure: Figure, change: Callable[[str], str]) -> None:
-    """Change all texts of a ``figure`` but the labels of ticks."""
+def _replace_texts(figure: Figure, change: Callable[[str], str]) -> bool:
+    """Change all texts of a ``figure`` but the labels of ticks; return whether any is another one."""
+    has_changed = False
     for text in figure.findobj(Text):
         changed = change(text.get_text())
         if changed != text.get_text():
             text.set_text(changed)
+            has_changed = True
+    return has_changed

@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from vipetsc.case.identify import MeasuredError, RecordTable, read_measured
 from vipetsc.figures import panels, style
 from vipetsc.figures.style import NoPicture, Shown
-from vipetsc.io.tables import TableError, read_table
+from vipetsc.io.tables import ColumnError, column_names, is_hdf5
 from vipetsc.spectra.fourier import amplitude_spectrum, spectrogram
 
 MOST_POINTS = 8  # on a page; a note says that there are more
-MOST_ROWS = 1_000_000  # of a record
 SLOW = 1e3  # rad/s: frequencies up to it are in rad/s, others in krad/s
 DECADES = 4  # of amplitudes in a spectrum, below its largest
 # Quantities of points: their names in labels, their units, and what a figure of each is called.
@@ -152,7 +151,8 @@ def read_records(text: str, names: Sequence[str], quantity: str) -> list[PointRe
 
     Of FILE the columns are taken whose names begin with that of a point, as in the tables of ``export``: a word about
     the quantity and a unit in brackets may follow. COLUMN is a name or a number from 1. The first column is the time in
-    s; values are in SI units. Files are those that ``identify`` reads. Raises NoPicture for a file that cannot be used.
+    s; values are in SI units. Files are those that ``identify`` reads: an HDF5 file has datasets for columns, and the
+    times in the one called ``time``. Raises NoPicture for a file that cannot be used.
     """
     file, _, choice = text.partition(":")
     wanted: list[tuple[int | str, str]] = []
@@ -163,20 +163,23 @@ def read_records(text: str, names: Sequence[str], quantity: str) -> list[PointRe
         wanted.append((int(column) if column.isdigit() else column, point))
     else:
         try:
-            heads = read_table(Path(file), MOST_ROWS).names
-        except (OSError, TableError) as error:
+            heads = column_names(Path(file))
+        except ColumnError as error:
             raise NoPicture(f"--record {file}: {error}") from None
         for number, head in enumerate(heads, 1):
             word, _, what = head.partition(" ")
             if word in names and (quantity in what or not any(other in what for other in QUANTITIES)):
-                wanted.append((number, word))
+                wanted.append((head if is_hdf5(Path(file)) else number, word))
         if not wanted:
             remedy = f"no column is named after a point ({', '.join(names)}); write FILE:COLUMN=POINT"
             raise NoPicture(f"--record {file}: {remedy}")
 
+    time: int | str = 1
+    if is_hdf5(Path(file)):
+        time = "time"
     sensors = [{"quantity": quantity, "cell": 1, "column": column} for column, _ in wanted]
     try:
-        read = read_measured(RecordTable.model_validate({"file": file, "time": 1, "sensors": sensors}))
+        read = read_measured(RecordTable.model_validate({"file": file, "time": time, "sensors": sensors}))
     except MeasuredError as error:
         raise NoPicture(f"--record {file}: {error.key}: {error.remedy}") from None
     stem = Path(file).name

@@ -93,17 +93,20 @@ class Drawing(NamedTuple):
 class LeftOut:
     """Pictures that have nothing to show: the ``reasons`` by the names of their figures, and of these by their stems.
 
-    ``drawn`` are the names of the figures of which a picture was drawn, or stays.
+    ``drawn`` are the names of the figures of which a picture was drawn, or stays; ``labelled`` are the texts that have
+    been replaced by the labels of a ``Look``.
     """
 
     reasons: dict[str, dict[str, str]] = field(default_factory=dict)
     drawn: set[str] = field(default_factory=set)
+    labelled: set[str] = field(default_factory=set)
 
     def add(self, other: "LeftOut") -> None:
         """Add what another rank has left out and drawn."""
         for name, reasons in other.reasons.items():
             self.reasons.setdefault(name, {}).update(reasons)
         self.drawn |= other.drawn
+        self.labelled |= other.labelled
 
 
 def band_colour(number: int) -> str:
@@ -260,7 +263,7 @@ def draw_each(
                 sys.audit("vipetsc.draw", drawing.stem)
                 figure = drawing.draw()
                 if look:
-                    look.apply(figure)
+                    left_out.labelled |= look.apply(figure)
                 written += [save(figure, path, note) for path in paths]
             left_out.drawn.add(name)
         except NoPicture as none:

@@ -44,8 +44,8 @@ ACCOMPANYING = (
 
 Difference = Callable[[str], str | None]
 """Takes the text of an earlier case; returns why its results are not the wanted ones, or None if they are."""
-Obstacle = Callable[[], str | None]
-"""Returns why results cannot go on from their end, or None if they can."""
+Obstacle = Callable[[Any, Any], str | None]
+"""Takes what ``ResultKind.grows`` was and is; returns why results cannot go on from their end, or None if they can."""
 
 
 @dataclass(frozen=True)
@@ -221,9 +221,9 @@ def _problem(
     keys = [key for key in then | now if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free]
     if not keys:
         return None
+    if keys == [kind.grows] and extend:
+        return extend(then[kind.grows], now[kind.grows])
     if keys == [kind.grows] and now[kind.grows] > then[kind.grows]:
-        if extend:
-            return extend()
         remedy = f"go on from its end with --extend, {remedy}"
     elif extend:
         remedy = f"--extend takes a later {kind.grows} and changes nothing else; choose another folder with --out"

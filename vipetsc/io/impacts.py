@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -31,15 +32,32 @@ COLUMNS = {
 }
 
 
-def impacts(run: str | Path | xr.Dataset) -> pd.DataFrame:
-    """Return a table of the impacts of a ``run``: its folder, its ``run.h5``, or the dataset of one in memory.
+class RunResult(Protocol):
+    """What ``simulate`` returns: a run in a ``folder``, or its ``dataset`` in memory."""
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the run; None of one in memory."""
+
+    @property
+    def dataset(self) -> xr.Dataset | None:
+        """The run; None of one that was stopped, and in memory beyond rank 0."""
+
+
+def impacts(run: str | Path | xr.Dataset | RunResult) -> pd.DataFrame:
+    """Return a table of the impacts of a ``run``: what ``simulate`` returns, a folder, a ``run.h5``, or a dataset.
 
     The index ``episode`` counts impacts by their onsets, from 1. Columns are the ``cell`` and those of ``COLUMNS``, in
     SI units, which ``attrs["units"]`` has by column. Where the folder has an analysis with the energies of the linear
     modes there are also ``cluster``, the number of the group of impacts that overlap in time, and for each part of the
     frequency axis ``transfer to PART`` in J: what the impact moved to it, NaN in a cluster of several impacts, which
-    cannot be told apart. Raises OSError or ValueError as ``open_run``.
+    cannot be told apart. Raises OSError or ValueError as ``open_run``, and ValueError for a run without results here.
     """
+    if not isinstance(run, str | Path | Mapping):
+        held = run.folder or run.dataset
+        if held is None:
+            raise ValueError("the run was stopped, or is that of another rank")
+        run = held
     if not isinstance(run, str | Path):
         return _table(run, None)
     path = Path(run)

@@ -118,9 +118,23 @@ class RunFolder:
             self._summarise(attributes | {"case": tomllib.loads(attributes["case"])})
         return attributes
 
-    def extension_obstacle(self) -> str | None:
-        """Why the run in the folder cannot go on from its end; None if it can, or has not ended. For one rank."""
-        if not (self.folder / "run.h5").exists() or any(self._parts.glob("*")):
+    def extension_obstacle(self, then: float, now: float) -> str | None:
+        """Why the run in the folder, which was to end at ``then`` in s, cannot go on to ``now``; None if it can.
+
+        What a longer extension has begun before it was killed is dropped. For one rank.
+        """
+        is_begun = any(self._parts.glob("*"))
+        path = self.folder / "run.h5"
+        if now < then:
+            ended = then
+            # Next to what an extension has begun lies the run from whose end it went on.
+            if is_begun and path.exists():
+                ended = _end_of(path)
+            if not now > ended:
+                return f"the run goes to {ended:g} s: set a later time.end"
+            discard(self._parts)
+            is_begun = False
+        if not path.exists() or is_begun:
             return None
         stamp = self._end / "source"
         if not stamp.exists():
@@ -140,13 +154,9 @@ class RunFolder:
             return
         aside = self.folder / ".parts.part"
         discard(aside)
-        try:
-            opened = h5py.File(path)
-        except OSError as error:
-            raise FolderError(f"{path}: {error}; --force repeats the run") from error
-        with opened as file:
-            if not tomllib.loads(file.attrs["case"])["time"]["end"] < end:
-                return
+        if not _end_of(path) < end:
+            return
+        with h5py.File(path) as file:
             aside.mkdir()
             count = 1 + path.stat().st_size // CHUNK_BYTES
             for number in range(count):
@@ -287,6 +297,15 @@ class RunFolder:
             elif len(log):
                 dataset[...] = columns[name]
         chunks.put_chunks(in_chunks, self)
+
+
+def _end_of(path: Path) -> float:
+    """Return the end in s of the run in the file at ``path``; raises FolderError for one that cannot be read."""
+    try:
+        with h5py.File(path) as file:
+            return float(tomllib.loads(file.attrs["case"])["time"]["end"])
+    except OSError as error:
+        raise FolderError(f"{path}: {error}; --force repeats the run") from error
 
 
 class FieldMemory:

@@ -195,7 +195,7 @@ def read_columns(path: Path, places: Mapping[str, int | str], most_rows: int = M
     A place is the number of a column, from 1, or its name; of HDF5 it is a dataset of one dimension, or with "[3]"
     behind its name the third column of one of two. Raises ColumnError.
     """
-    if path.suffix.lower() not in HDF5 and not h5py.is_hdf5(path):
+    if not is_hdf5(path):
         try:
             table = read_table(path, most_rows)
         except (OSError, TableError) as error:
@@ -210,6 +210,29 @@ def read_columns(path: Path, places: Mapping[str, int | str], most_rows: int = M
     except (OSError, TypeError) as error:
         raise ColumnError(f"is not an HDF5 file of numbers ({error})") from None
     return columns
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether the file at ``path`` is HDF5, by its name or its content."""
+    return path.suffix.lower() in HDF5 or h5py.is_hdf5(path)
+
+
+def column_names(path: Path, most_rows: int = MOST_ROWS) -> list[str]:
+    """Return the names of the columns of a table of text, [] where it has none, or of an HDF5 file's datasets.
+
+    Those of one dimension count, in their order. Raises ColumnError.
+    """
+    try:
+        if not is_hdf5(path):
+            return read_table(path, most_rows).names
+        names: list[str] = []
+        with h5py.File(path) as file:
+            file.visititems(
+                lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) and item.ndim == 1 else None
+            )
+        return names
+    except (OSError, TableError) as error:
+        raise ColumnError(str(error)) from None
 
 
 def _index_of(place: int | str, table: TextTable, key: str) -> int:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eig, eigh
 from scipy.sparse import csc_matrix, diags
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
@@ -36,6 +37,9 @@ MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute w
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
 # nearly parallel, and cancel.
 ACCURACY = 1e-8
+# Differences in a rigid motion, over its largest displacement, that are rounding: 1e-13 to 1e-6 are seen. In motions
+# that strain soft springs the differences are as large as the displacements.
+EVEN = 1e-3
 
 
 class ComplianceError(ValueError):
@@ -224,6 +228,7 @@ class ModalCompliance:
         modal_damping = vectors.T @ (damping @ vectors)
         # "<=": masses that no springs join have squared frequencies of 0 alone, and a largest one of 0.
         still = np.abs(squared) <= RIGID * np.abs(squared).max()
+        vectors[:, still] = self._without_strain(vectors[:, still])
         lossless = np.abs(modal_damping).max(axis=1) <= RIGID * np.abs(modal_damping).max(initial=0.0)
         rigid = still & lossless
 
@@ -236,6 +241,20 @@ class ModalCompliance:
         if chain.is_damped:
             self._check(poles)
         return poles
+
+    def _without_strain(self, motions: np.ndarray) -> np.ndarray:
+        """Return rigid ``motions`` (dofs, motion) in which masses that springs join move alike to the last bit.
+
+        Divided by omega^2, what rounding leaves between them would be larger than all strains at low frequencies.
+        """
+        _, bodies = connected_components(self.stiffness, directed=False)
+        even = motions.copy()
+        for body in range(bodies.max(initial=-1) + 1):
+            members = bodies == body
+            mean = motions[members].mean(axis=0)
+            is_even = np.abs(motions[members] - mean).max(axis=0) <= EVEN * np.abs(motions).max(axis=0)
+            even[np.ix_(members, is_even)] = mean[is_even]
+        return even
 
     def _check(self, poles: Poles) -> None:
         """Compare the sum over ``poles`` with a direct solution; raises ComplianceError where they differ."""

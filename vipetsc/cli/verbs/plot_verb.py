@@ -163,15 +163,10 @@ def look_of(options: argparse.Namespace, inches: float | None) -> "Look":
 
     Called on one rank. Raises FolderError for a style that is not one.
     """
-    import matplotlib as mpl
+    from vipetsc.figures.look import Look, style_problem
 
-    from vipetsc.figures.look import Look
-
-    if options.style:
-        try:
-            mpl.rc_params_from_file(options.style, use_default_template=False)
-        except (OSError, ValueError) as error:
-            raise FolderError(f"--style {options.style}: {error}") from None
+    if options.style and (problem := style_problem(options.style)):
+        raise FolderError(f"--style {options.style}: {problem}")
     return Look(
         style=options.style,
         width=inches,

@@ -55,14 +55,15 @@ def load(options: argparse.Namespace) -> Case:
 
     plan = _sweep_of(options)
     number = plan.number(options.member)
-    case = plan.case(number)
-    if plan.options.follow != "none":
+    if plan.options.follow == "none":
+        case = plan.case(number, options.set)
+    else:
         folder = Path(options.case)
         if not folder.is_dir():
             remedy = "begins with the end of another member; give the folder of the finished sweep, not its file"
             raise CaseError([Problem("--member", options.member, remedy)])
-        case = plan.case_in(folder, number)
-    return case.varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
+        case = plan.case_in(folder, number, options.set)
+    return case.varied(name=f"{plan.name}-{plan.ids()[number]}")
 
 
 def _sweep_of(options: argparse.Namespace) -> Sweep:

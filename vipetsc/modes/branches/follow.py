@@ -138,6 +138,7 @@ class Follower:
         points = method.computed(job)
         if points is not None:
             branch.points = points
+            branch.findings += method.findings(job, points)
             branch.ended = Ending.END_OF_RANGE.with_numbers(end=method.case.nfrc.range[1])
             return
         problem = method.problem(job)

@@ -86,6 +86,10 @@ class Method(ABC, Generic[S]):
         """All points of a branch that needs no continuation; None of others, which are followed."""
         return None
 
+    def findings(self, job: int, points: list[S]) -> list[str]:
+        """Sentences on the ``points`` of a branch that needs no continuation."""
+        return []
+
     @abstractmethod
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:
         """Steps and end of a branch that has ``done`` regular points after its start."""

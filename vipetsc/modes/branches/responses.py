@@ -23,7 +23,7 @@ from vipetsc.modes.response.branch_switching import crossing_case, first_crossin
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.isolated import is_on, over_amplitudes, places_of, subharmonic_states, unknown_states
-from vipetsc.modes.response.linear import linear_states, linear_variables
+from vipetsc.modes.response.linear import BESIDE, linear_states, linear_variables, resonances
 from vipetsc.modes.response.over_key import KeyedCase, StatesOverKey
 from vipetsc.modes.response.stability_changes import BRANCH_POINT
 from vipetsc.modes.response.state import Response
@@ -33,6 +33,7 @@ from vipetsc.modes.special_curves import SpecialCurve, SpecialSteps, crosses_amp
 from vipetsc.modes.stability import Perturbations
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
+from vipetsc.wording import shortened
 
 # Between the name of a curve and the number of an isolated one near it.
 ISOLA = "-isola-"
@@ -110,6 +111,19 @@ class ResponseMethod(Method[Response]):
         if not curve.case.is_linear:
             return None
         return list(linear_states(curve.case, curve.fixed, self._compliance_of(curve)))
+
+    def findings(self, job: int, points: list[Response]) -> list[str]:
+        """A sentence on the linear motions at frequencies of modes that nothing damps."""
+        curve = self.curves[job]
+        beside = list(linear_states(curve.case, curve.fixed, self._compliance_of(curve), BESIDE))
+        at = resonances(points, beside)
+        if not at:
+            return []
+        listed = shortened([f"{omega:.9g}" for omega in dict.fromkeys(at)])
+        return [
+            f"at {listed} rad/s, the frequency of a mode without damping, the response has no bound: its values there"
+            " are rounding; change nfrc.range or nfrc.points, or give the lattice dashpots"
+        ]
 
     def finish(self, problem: PeriodicProblem[Response], branch: Branch[Response]) -> None:
         """Add the linear motions under a force or a wall, with which a curve is compared."""

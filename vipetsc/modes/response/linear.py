@@ -6,7 +6,7 @@ have it as well, for comparison: ``linear``, the parameter, and ``linear_<quanti
 Contacts that are springs of the linear lattice (``condensation``) are so here, too.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,12 +18,19 @@ from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, magn
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.spectra.responses import LAYOUT, LINEAR, LINEAR_OUTPUTS, OUTPUTS
 
+# A response is that of rounding where it is so many times as large as one beside it, at a frequency that differs by
+# this fraction: such a resonance would be a hundred million times as high as the motion at rest.
+RESONANT = 100.0
+BESIDE = 1e-6
 
-def linear_states(case: NfrcCase, fixed: float, compliance: WaveCompliance | ModalCompliance) -> Iterator[Response]:
+
+def linear_states(
+    case: NfrcCase, fixed: float, compliance: WaveCompliance | ModalCompliance, shift: float = 0.0
+) -> Iterator[Response]:
     """The linear motions at ``nfrc.points`` values of the frequency or the amplitude, evenly spaced over the range.
 
     The other one of the two is ``fixed``; a force or a wall drives the lattice, whose ``compliance`` is that of
-    ``compliance_of``.
+    ``compliance_of``. Frequencies are higher by the fraction ``shift``.
     """
     options = case.nfrc
     contacts = stops_of(case, 1.0)
@@ -34,8 +41,9 @@ def linear_states(case: NfrcCase, fixed: float, compliance: WaveCompliance | Mod
     low, high = options.range
     scale = (high - low) / 2
 
-    for index, value in enumerate(np.linspace(low, high, max(options.points, 2)).tolist()):
+    for index, value in enumerate(np.linspace(low, high, options.points).tolist()):
         omega, amplitude = (value, fixed) if options.over == "frequency" else (fixed, value)
+        omega *= 1 + shift
         # The mean, which is zero, and the fundamental.
         relative = np.zeros((pairs, 2), complex)
         relative[:, 1] = amplitude * compliance.response(omega)[0, :, pairs:] @ weights
@@ -63,6 +71,20 @@ def linear_states(case: NfrcCase, fixed: float, compliance: WaveCompliance | Mod
             outputs=outputs.of(motion),
         )
         yield Response(xi=np.array([value / scale]), tangent=np.ones(1), index=index, measures=measures)
+
+
+def resonances(states: Sequence[Response], beside: Sequence[Response]) -> list[float]:
+    """The frequencies in rad/s of those ``states`` in which a mode that nothing damps has its own.
+
+    There the displacements are many times as large as those of the states ``beside`` them, at ``BESIDE``.
+    """
+    found = []
+    for state, other in zip(states, beside, strict=True):
+        size = state.measured.outputs["first_displacement"].max()
+        # Also where it is no number.
+        if not size <= RESONANT * other.measured.outputs["first_displacement"].max():
+            found.append(state.measured.frequency)
+    return found
 
 
 def linear_variables(states: list[Response], over: str) -> Variables:
