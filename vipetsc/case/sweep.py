@@ -100,9 +100,9 @@ class Sweep(StudyCase):
             remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
 
-        if MATRICES in values and (made := [key for key in values if key.startswith(OF_MATRICES)]):
+        if MATRICES in values and (filled_in := [key for key in values if key.startswith(OF_MATRICES)]):
             remedy = f"cannot vary with {MATRICES}, which makes it; vary one of the two"
-            problems.append(Problem(f"sweep.{made[0]}", given[made[0]], remedy))
+            problems.append(Problem(f"sweep.{filled_in[0]}", given[filled_in[0]], remedy))
         axes, wrong = axes_of(values, options.zip)
         if options.follow != "none" and not options.fields:
             remedy = "needs the fields of each run, with which the next one begins: set sweep.fields = true"

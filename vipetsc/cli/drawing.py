@@ -92,8 +92,8 @@ def draw_pictures(
     for other in comm.gather(left_out) or []:
         left_out.add(other)
     report(pictures, comm, on_root(comm, lambda: sentences_on(pictures, folders, left_out, names)))
-    found = on_root(comm, lambda: left_out.labelled)
-    if look and (unknown := [text for text in look.labels if text not in found]):
+    labelled = on_root(comm, lambda: left_out.labelled)
+    if look and (unknown := [text for text in look.labels if text not in labelled]):
         echo_warnings(comm, [f"--label {', '.join(unknown)}: no picture that was drawn has this text or key"])
     return sorted(path for paths in comm.gather(drawn_here) or [] for path in paths)
 

@@ -86,13 +86,13 @@ class Look:
                 self._convert(axis)
         if self.unit == "Hz":
             _replace_texts(figure, lambda text: ANGULAR.sub(_in_hertz, text))
-        found = set()
+        replaced = set()
         for text, label in self.labels.items():
             # A picture shows a key of a case by its name.
             for sought in (text, key_name(text)):
                 if _replace_texts(figure, partial(_replaced, sought=sought, label=label)):
-                    found.add(text)
-        return found
+                    replaced.add(text)
+        return replaced
 
     def _convert(self, axis: Axis) -> None:
         """Give an ``axis`` the unit that is asked for, if its label has another of that kind."""

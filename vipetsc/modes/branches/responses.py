@@ -115,8 +115,8 @@ class ResponseMethod(Method[Response]):
     def findings(self, job: int, points: list[Response]) -> list[str]:
         """A sentence on the linear motions at frequencies of modes that nothing damps."""
         curve = self.curves[job]
-        beside = list(linear_states(curve.case, curve.fixed, self._compliance_of(curve), BESIDE))
-        at = resonances(points, beside)
+        shifted = list(linear_states(curve.case, curve.fixed, self._compliance_of(curve), BESIDE))
+        at = resonances(points, shifted)
         if not at:
             return []
         listed = shortened([f"{omega:.9g}" for omega in dict.fromkeys(at)])

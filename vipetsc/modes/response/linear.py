@@ -73,18 +73,18 @@ def linear_states(
         yield Response(xi=np.array([value / scale]), tangent=np.ones(1), index=index, measures=measures)
 
 
-def resonances(states: Sequence[Response], beside: Sequence[Response]) -> list[float]:
+def resonances(states: Sequence[Response], shifted: Sequence[Response]) -> list[float]:
     """The frequencies in rad/s of those ``states`` in which a mode that nothing damps has its own.
 
-    There the displacements are many times as large as those of the states ``beside`` them, at ``BESIDE``.
+    There the displacements are many times as large as those of the states ``shifted`` by ``BESIDE``.
     """
-    found = []
-    for state, other in zip(states, beside, strict=True):
+    at_resonance = []
+    for state, other in zip(states, shifted, strict=True):
         size = state.measured.outputs["first_displacement"].max()
         # Also where it is no number.
         if not size <= RESONANT * other.measured.outputs["first_displacement"].max():
-            found.append(state.measured.frequency)
-    return found
+            at_resonance.append(state.measured.frequency)
+    return at_resonance
 
 
 def linear_variables(states: list[Response], over: str) -> Variables:

@@ -223,8 +223,8 @@ def largest_values(harmonics: np.ndarray) -> np.ndarray:
         # Beyond a sample's distance lies another peak. Where nothing bends, nothing moves.
         step = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend != 0)
         phase = phase + np.clip(step, -spacing, spacing)
-    found = np.abs((harmonics * np.exp(rates * phase[:, None])).sum(axis=1).real)
-    return np.maximum(found, top)
+    highest_value = np.abs((harmonics * np.exp(rates * phase[:, None])).sum(axis=1).real)
+    return np.maximum(highest_value, top)
 
 
 def _samples(harmonics: np.ndarray) -> np.ndarray:
