@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import combinations
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -69,9 +70,16 @@ def _letters(figure: Figure) -> Iterator[str]:
     """
     together = {part for part in figure.findobj(lambda one: getattr(one, "_suptitle", None)) if _begins(part._suptitle)}
     shown = [axes for axes in figure.get_axes() if axes.axison and axes.get_label() != "<colorbar>"]
+    # A second axis of a panel has the letter of the first.
+    shown = [axes for number, axes in enumerate(shown) if not any(_on_one_place(axes, one) for one in shown[:number])]
     for axes in shown:
         if len(shown) > 1 and axes.figure not in together and not axes.get_title("left").startswith("("):
             yield f"no letter: {axes.get_title('left')!r}, {axes.get_ylabel()!r}"
+
+
+def _on_one_place(axes: Axes, other: Axes) -> bool:
+    """Whether two axes are those of one panel."""
+    return bool(np.allclose(axes.get_position().bounds, other.get_position().bounds))
 
 
 def _begins(text: Text) -> bool:

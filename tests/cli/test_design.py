@@ -7,7 +7,7 @@ import pytest
 import xarray
 
 from tests.conftest import datasets, set_words
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import registry
@@ -114,30 +114,6 @@ def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     # There are three costs in each of two readings.
     assert done.stdout.count("none is out of phase") == 6
     assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("design.lambda.first=-0.1", "design.lambda.first = -0.1"),
-        ("design.lambda.coutn=3", "did you mean design.lambda.count"),
-        ("design.eta.last=1.5", "design.eta.last = 1.5"),
-        ("design.eta.first=1.0", "design.eta.first = 1.0"),
-        ("design.lambda.last=0.1", "must be above design.lambda.first"),
-        ("design.readings=['printd']", "did you mean 'printed'"),
-        ("design.readings=['printed', 'printed']", "once"),
-        ("design.lambda.count=1000000", "at most"),
-        ("design.wavenumbers=2.5", "design.wavenumbers"),
-        ("desing.wavenumbers=5", "did you mean design"),
-        ("design=3", "must be a section"),
-        ("lattice.preset=diatomic", "only the four-band preset"),
-    ],
-)
-def test_what_is_wrong_with_a_search_is_named(change, message):
-    """A wrong key or value is named, with the remedy where there is one."""
-    with pytest.raises(CaseError) as error:
-        DesignCase.load(None, [change])
-    assert message in str(error.value)
 
 
 def test_the_section_may_stand_beside_those_of_other_verbs():

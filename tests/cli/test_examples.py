@@ -38,13 +38,6 @@ def test_every_case_file_is_listed_with_its_verb_and_a_sentence(in_process, monk
     assert remedy.startswith("vipetsc examples NAME copies")
 
 
-def test_a_case_with_scatter_is_validated(in_process):
-    """``validate`` shows the distribution of a scattered clearance and the factors of the first sample."""
-    ended = in_process("validate", EXAMPLES / "disorder.toml")
-    assert ended.returncode == 0, ended.stderr
-    assert re.search(r"disorder of clearance +normal, deviation 1 %; seed 0: times 0\.99", ended.stdout)
-
-
 def test_a_copied_case_reads_its_data_wherever_it_is_and_wherever_it_is_called(in_process, tmp_path, monkeypatch):
     """The case and the file that it names are copied together, and the case is the same from another folder."""
     ended = in_process("examples", "waveform", "three-mass.toml", "--out", tmp_path / "mine", cwd=tmp_path)
@@ -90,23 +83,6 @@ def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):
     for words in (["--force"], []):
         assert in_process("examples", "beads", "waveform", *words, cwd=tmp_path).returncode == 0
         assert (tmp_path / "waveform.csv").read_bytes() == (EXAMPLES / "waveform.csv").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["wavefrm"], "NAME = 'wavefrm': no such case file; did you mean waveform?"),
-        (["x"], "`vipetsc examples` lists them"),
-        (["--out", "y"], "name the case files to copy, or take --all"),
-        (["beads", "--out", __file__], "is a file, not a folder; choose another --out"),
-    ],
-)
-def test_what_cannot_be_copied_is_refused(in_process, tmp_path, words, problem):
-    """An unknown name, a missing name, and a file in the place of the folder are refused, and nothing is written."""
-    refused = in_process("examples", *words, cwd=tmp_path)
-    assert refused.returncode == 2
-    assert problem in refused.stderr
-    assert not any(tmp_path.iterdir())
 
 
 def test_a_relative_name_is_that_of_a_file_next_to_the_case_before_one_of_the_current_folder(tmp_path, monkeypatch):

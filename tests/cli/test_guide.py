@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shlex
 import shutil
@@ -53,36 +54,26 @@ NOT_TYPED = {
 }
 
 
-def session() -> str:
-    """Return all blocks in order as one script for bash, which ends at the first command that fails.
-
-    One interpreter runs consecutive blocks of Python, each in a namespace of its own, because to load the package takes
-    longer than to run them.
-    """
-    script = ["set -ex"]
-    waiting: list[str] = []
-    for number, (page, language, text) in enumerate(blocks()):
-        # An excerpt of a case file without the name of a file is not typed.
+def session() -> list[list[str]]:
+    """Return all blocks in order as steps for ``tests/session.py``."""
+    steps = []
+    for page, language, text in blocks():
         named = CASE_NAME.match(text)
-        if language == "toml" and not named:
-            continue
-
-        script.append(f": {page.name}")
-        if language == "python":
-            waiting.append(f"block-{number}.py")
-            script.append(f"cat > block-{number}.py <<'END'\n{text}END")
-            continue
-
-        script += run_together(waiting)
-        waiting = []
-        if language == "toml":
-            name, added = named.groups()
-            script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
+        if language == "toml" and named:
+            steps.append(["file", text, named[1]])
+        elif language == "python":
+            steps.append(["python", text, f"{page.stem}.py"])
+        elif language == "sh":
+            for line in text.replace("\\\n", " ").splitlines():
+                # A call of scripts/test would run this test again.
+                if line.startswith("python -m vipetsc "):
+                    steps.append(["vipetsc", line.removeprefix("python -m vipetsc ")])
+                elif not line.startswith("scripts/test "):
+                    steps.append(["shell", line])
         else:
-            assert language == "sh", language
-            # A call of scripts/test would run this test again.
-            script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
-    return "\n".join(script + run_together(waiting))
+            # An excerpt of a case file without the name of a file is not typed.
+            assert language == "toml", language
+    return steps
 
 
 def blocks() -> Iterator[tuple[Path, str, str]]:
@@ -90,12 +81,6 @@ def blocks() -> Iterator[tuple[Path, str, str]]:
     for page in GUIDE:
         for language, text in filter(all, BLOCK.findall(page.read_text(encoding="utf-8"))):
             yield page, language, text
-
-
-def run_together(files: list[str]) -> list[str]:
-    """Return the command that runs Python ``files`` one after the other, if there are any."""
-    runner = "import runpy, sys; [runpy.run_path(name, run_name='__main__') for name in sys.argv[1:]]"
-    return [f'python -c "{runner}" {" ".join(files)}'] if files else []
 
 
 @pytest.mark.mpirun
@@ -115,8 +100,10 @@ def type_session(folder: Path) -> None:
     # A test under mpirun has variables that a terminal does not have.
     outside = {name: value for name, value in clean_environment().items() if not name.startswith(("OMPI_", "PRTE_"))}
     environment = outside | {"PYTHONPATH": str(ROOT), "VIPETSC_PYTHON": sys.executable}
+    (folder / "steps.json").write_text(json.dumps(session()), encoding="utf-8")
+    command = [sys.executable, "-m", "tests.session", "steps.json"]
     ended = subprocess.run(
-        ["bash", "-c", session()], cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
 
     assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-4000:]
@@ -250,15 +237,6 @@ def test_the_chapter_on_verbs_lists_those_that_are_there():
     assert listed(r"interrupted commands\n\n(.*?)\s+look at the output folder first") == leaving
 
 
-def test_the_names_that_extend_gives_are_where_it_says():
-    """Every name in a table of the chapter *extend* occurs in one of the files of its row."""
-    text = (MANUAL / "extend.md").read_text(encoding="utf-8")
-    for files, what in re.findall(r"^\| (`\w+/.*?) \| (.*?) \|$", text, flags=re.M):
-        sources = "".join((ROOT / "vipetsc" / name).read_text() for name in re.findall(r"`([\w/.]+)`", files))
-        for name in re.findall(r"`(\w+)`", what):
-            assert re.search(rf"\b{name}\b", sources), (files, name)
-
-
 def test_a_name_with_a_file_behind_it_is_in_that_file():
     """Where the manual gives a name of the code and, in brackets, its module or file, the name occurs in there."""
     found = 0
@@ -273,15 +251,6 @@ def test_a_name_with_a_file_behind_it_is_in_that_file():
             assert re.search(rf"\b{name}\b", path.read_text(encoding="utf-8")), (page.name, name, place)
             found += 1
     assert found > 5
-
-
-def test_the_index_counts_the_studies_of_the_gallery():
-    """The index and the gallery say how many studies there are: as many as the gallery has rows, each with its page."""
-    rows = re.findall(r"^\| \[\S+\]\(gallery/(\S+)\.md\)", (MANUAL / "gallery.md").read_text(), flags=re.M)
-    assert sorted(rows) == sorted(path.stem for path in (MANUAL / "gallery").glob("*.md"))
-    number = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen"}[len(rows)]
-    assert f"| {number} studies" in (MANUAL / "index.md").read_text()
-    assert f"has {number} studies" in (MANUAL / "gallery.md").read_text()
 
 
 def sections() -> dict[str, str]:

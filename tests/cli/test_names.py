@@ -51,25 +51,6 @@ def test_a_backend_of_windows_is_of_no_matter(vipetsc, tmp_path):
     assert (tmp_path / "bands.png").exists()
 
 
-@pytest.mark.parametrize("words", [["validate", "no\udcfftext.toml"], ["run", "--out", "no\udcfftext"]])
-def test_a_name_that_is_no_text_is_refused(in_process, tmp_path, words):
-    """A name of a file that is not valid in UTF-8 is refused before anything is written."""
-    ended = in_process(*words, cwd=tmp_path)
-    assert ended.returncode == 2
-    assert "UTF-8" in ended.stderr
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("drive", [f"amplitude = {'[' * 900}{']' * 900}", f"{'a.' * 900}b = 1"], ids=["lists", "dots"])
-def test_tables_in_tables_without_end_are_refused(in_process, tmp_path, drive):
-    """A case file with hundreds of nested lists or tables is refused with a sentence."""
-    path = tmp_path / "deep.toml"
-    path.write_text(f"[drive]\n{drive}\n")
-    ended = in_process("validate", path)
-    assert ended.returncode == 2
-    assert "recursion depth" in ended.stderr and "Traceback" not in ended.stderr
-
-
 def test_samples_in_a_folder_whose_name_is_no_text_are_refused(in_process, tmp_path):
     """Samples in a folder whose name is not valid text are refused, as no result could hold their path."""
     folder = tmp_path / os.fsdecode(b"no\xfftext")

@@ -45,15 +45,6 @@ def test_a_curve_leaves_its_files_and_its_picture(in_process, case, tmp_path):
     assert in_process("plot", out).returncode == 0
 
 
-def test_a_range_that_descends_is_refused(in_process, case, tmp_path):
-    """A wrong value is refused with its key and exit code 2, and no folder is created."""
-    ended = in_process("nfrc", case, "--out", tmp_path / "none", "--set", "nfrc.range=[2.0, 1.0]")
-
-    assert ended.returncode == 2
-    assert "nfrc.range" in ended.stderr
-    assert not (tmp_path / "none").exists()
-
-
 @pytest.mark.slow
 def test_a_curve_that_cannot_go_on_keeps_its_points(in_process, case, tmp_path):
     """A smallest step that is too long for a fold ends the curve with exit code 1; its points and picture remain."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import h5py
 import pytest
 
 CASE = """
@@ -44,18 +43,6 @@ def test_a_branch_leaves_its_files_and_its_picture(in_process, case, tmp_path):
     }
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [("nnm.modes=[7]", "2 modes"), ("nnm.map=third", "nnm.map"), ("nmn.map=1", "did you mean nnm")],
-)
-def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
-    """A wrong key or value is refused with a hint and exit code 2, and no folder is created."""
-    done = in_process("nnm", case, "--out", tmp_path / "out", "--set", change)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.mpirun
 def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     """A branch whose steps become too short ends with exit code 1 and the key to change; its points are in the file."""
@@ -67,14 +54,3 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert done.returncode == 1
     assert "change nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
-
-
-def test_a_file_that_is_no_branch_is_refused(in_process, tmp_path):
-    """An HDF5 file of another kind under a branch's name is refused with exit code 2 and without a traceback."""
-    with h5py.File(tmp_path / "branch-x.h5", "w") as file:
-        file["energy"] = [1.0]
-
-    done = in_process("plot", tmp_path)
-    assert done.returncode == 2
-    assert "is not a branch" in done.stderr
-    assert "Traceback" not in done.stderr

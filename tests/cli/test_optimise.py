@@ -63,12 +63,3 @@ def test_two_objectives_leave_a_front_with_its_ends_and_its_knee(in_process, cas
     wrong = in_process("plot", out / "optimum.h5", "--fig", "ledger")
     assert wrong.returncode == 2
     assert "compared_curves" in wrong.stderr
-
-
-@pytest.mark.parametrize("name", ["clearances", "amplitudes", "band", "gate", "absorber"])
-def test_the_cases_in_runs_are_valid(in_process, name):
-    """``validate`` accepts each search in ``runs`` and prints the number of its designs."""
-    done = in_process("validate", f"runs/examples/optimise-{name}.toml")
-
-    assert done.returncode == 0, done.stderr
-    assert "designs of" in done.stdout

@@ -144,29 +144,6 @@ def test_list_says_what_is_left(in_process, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
-    """An unknown id is refused with a list of the known ones, and a folder with other files is refused."""
-    wrong = in_process("paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
-    assert wrong.returncode == 2
-    assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
-    assert "claims are C1 to C18" in wrong.stderr
-    assert not (tmp_path / "out").exists()
-
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign" / "letter.txt").write_text("mine")
-    foreign = in_process("paper", "--only", "fig10", "--out", tmp_path / "foreign")
-    assert foreign.returncode == 2
-    assert "choose another --out" in foreign.stderr
-
-
-def test_quick_and_full_do_not_mix(in_process, tmp_path):
-    """The quick grid is refused in a folder of the full grid, and the message names a remedy."""
-    (tmp_path / "plan.json").write_text('{"grid": "full"}')
-    mixed = in_process("paper", "--quick", "--only", "fig10", "--out", tmp_path)
-    assert mixed.returncode == 2
-    assert "holds the paper on the full grid; choose another --out for the quick one" in mixed.stderr
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     """Open one browser for all sizes of its window."""

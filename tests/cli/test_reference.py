@@ -179,22 +179,3 @@ def test_the_manual_at_the_prompt(in_process):
     assert wrong.returncode == 2
     assert "vipetsc manual lists" in wrong.stderr
     assert re.findall(r"^(\w[\w ]+)$", listed, flags=re.M)[:4] == ["Tutorials", "How to", "Theory", "Reference"]
-
-
-def test_messages_in_the_chapter_on_trouble_are_the_programs():
-    """Every piece of a message that the chapter's tables quote stands in the sources."""
-    text = (ROOT / "vipetsc/manual/trouble.md").read_text(encoding="utf-8")
-    tables = re.findall(
-        r"^\| (?:warning|message|ending) .*\n\|[-|]+\n((?:\|.*\n)+)", text.partition("## MPI")[0], flags=re.M
-    )
-    quoted = [
-        quote for table in tables for row in table.splitlines() for quote in re.findall("`([^`]+)`", row.split("|")[1])
-    ]
-    # If the pattern found nothing, the test would pass without a check.
-    assert len(quoted) > 20
-
-    # Adjacent strings of a message are joined.
-    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "vipetsc").rglob("*.py"))
-    joined = re.sub(r"\"\s*\n\s*f?\"", "", sources)
-    for piece in {part.strip() for quote in quoted for part in quote.split("...")}:
-        assert piece in joined, piece

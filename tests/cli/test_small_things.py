@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ from tests.conftest import clean_environment, modified
 from tests.faults.scenarios import BRANCHES, DESIGN, RUN
 from vipetsc.case import NnmCase
 from vipetsc.case.design import DesignCase
-from vipetsc.cli.tables import duration
 from vipetsc.cli.verbs.bands_verb import damping_report, damping_table
 from vipetsc.cli.verbs.plot_verb import pictures_of
 from vipetsc.lattice import UnitCell
@@ -51,15 +49,6 @@ def test_branches_and_searches_need_not_be_drawn(in_process, with_figures, tmp_p
     assert any((out / "figures").glob("*.png"))
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.0042, "0.0042 s"), (99.4, "99 s"), (112.0, "110 s"), (119.0, "120 s"), (74_040.0, "1230 min")],
-)
-def test_durations_are_written_without_powers_of_ten(seconds, text):
-    """Durations have two significant digits in seconds, and three in minutes from two minutes on."""
-    assert duration(seconds) == text
-
-
 def test_waves_that_do_not_decay_are_null_in_json():
     """The decay length is null at frequency 0, and finite at 1000 rad/s.
 
@@ -87,16 +76,6 @@ def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch,
     assert folders == [tmp_path]
 
 
-def test_columns_of_the_list_of_the_paper_are_apart(in_process, tmp_path):
-    """In the list of figures of ``paper --list`` a blank precedes every column."""
-    listed = in_process("paper", "--list", "--out", tmp_path / "paper").stdout.splitlines()
-    (title,) = (line for line in listed if line.startswith("figure"))
-    figures = listed[listed.index(title) + 1 :]
-    for column in ("paper", "pictures", "state", "claims"):
-        start = title.index(column)
-        assert {line[start - 1] for line in figures} == {" "}, column
-
-
 @pytest.mark.slow
 def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
     """A run.h5 that another program has open for writing is refused as such, not as a file that is no run."""
@@ -122,25 +101,6 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
         assert "run.h5 cannot be opened as a run: another program has it open for writing" in ended.stderr, verb
         assert "is not a run" not in ended.stderr, verb
     assert json.loads((out / "summary.json").read_text())["complete"]
-
-
-def test_bands_of_beads_are_none(in_process, tmp_path):
-    """A cell without springs has no pass band: ``bands`` says so, writes an empty list, and draws no picture."""
-    answer = in_process("bands", "runs/examples/beads.toml", "--out", tmp_path)
-    assert answer.returncode == 0
-    assert answer.stdout == "no pass bands: only contacts join the masses, so that there are no linear waves\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["bands.json"]
-    numbers = json.loads(in_process("bands", "runs/examples/beads.toml", "--out", tmp_path, "--json").stdout)
-    assert numbers["bands"] == numbers["gaps"] == []
-
-
-def test_what_is_not_driven_has_no_drive(in_process):
-    """For a lattice with an initial motion and no drive, ``validate`` names the motion, and not a burst of 0 N."""
-    shown = in_process("validate", "runs/examples/packet.toml").stdout
-    assert re.search(r"^  begins with  a packet .*, Om = 927.0256 rad/s$", shown, flags=re.M)
-    assert re.search(r"^  drive +none$", shown, flags=re.M)
-    assert re.search(r"^  end +0.7 s$", shown, flags=re.M)
-    assert "burst" not in shown
 
 
 @pytest.mark.mpirun

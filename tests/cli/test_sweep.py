@@ -99,23 +99,6 @@ def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp
         assert found["velocity"].shape == (301, 40, 2)
 
 
-def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
-    """A number beyond the last member, an unknown name and a folder without a sweep end with 2 and write nothing."""
-    out = tmp_path / "out"
-    changes = set_words("sweep.drive.amplitude=[0.1, 0.2]", "sweep.contacts.sites=[1]")
-    assert in_process("sweep", case, "--out", out, *changes).returncode == 0
-
-    for path, name, message in (
-        (out, "2", "--member = '2': is not a member"),
-        (case, "x", "is not a member"),
-        (tmp_path, "0", "case"),
-    ):
-        bad = in_process("run", path, "--member", name, "--out", tmp_path / "bad")
-        assert bad.returncode == 2
-        assert message in bad.stderr
-        assert not (tmp_path / "bad").exists()
-
-
 def test_a_failed_member_is_named_and_the_others_go_on(in_process, case, tmp_path):
     """Members with a site outside the lattice are named and NaN in the ensemble; others are computed; the code is 1."""
     out = tmp_path / "out"
@@ -146,14 +129,6 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path)
         (stalled,) = json.loads(file.attrs["failed"])
     assert stalled["place"] == [0, 1]
     assert "stalled" in stalled["reason"]
-
-
-@pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
-def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
-    """An unknown key and an amplitude of zero are refused with exit code 2, and no folder is created."""
-    ended = in_process("sweep", case, "--out", tmp_path / "out", "--set", value)
-    assert ended.returncode == 2, ended.stdout
-    assert not (tmp_path / "out").exists()
 
 
 def test_full_fields_on_request(in_process, case, tmp_path):
@@ -198,10 +173,3 @@ def test_measures_again_from_files(in_process, case, tmp_path):
     nothing = in_process("analyse", tmp_path)
     assert nothing.returncode == 2
     assert "contains no run.h5" in nothing.stderr
-
-
-def test_validate_counts_the_members(in_process, case):
-    """``validate`` prints the number of members, in all and along each axis, and of members with invalid cases."""
-    ended = in_process("validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
-    assert ended.returncode == 0, ended.stderr
-    assert "12 members (2 x 6), 6 of them impossible" in ended.stdout

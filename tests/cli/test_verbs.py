@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from vipetsc.case import Case
 from vipetsc.case.verb_cases import VERB_CASES
 from vipetsc.cli.verb import DONE, FAILED, STOPPED, Outcome, default_folder
 from vipetsc.cli.verbs.plot_verb import pictures_of
-from vipetsc.cli.verbs.verb_list import VERBS, study_verbs, verb_of
+from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import KINDS
 
@@ -144,23 +143,6 @@ def test_the_help_names_the_folder_that_is_used(name):
     assert default_folder(f"out{name}", name).name == (f"out{name}" if name == "run" else f"out{name}-{name}")
 
 
-def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
-    """The table has the rows that concern the verb, each once, and no rows of a run if the verb makes none."""
-    response = in_process("validate", example_case("nfrc")).stdout
-    assert re.search(r"^  nfrc +3 curves over the amplitude, 0.4 to 1.6 of the clearance$", response, flags=re.M)
-    assert re.search(r"^  lattice +infinite, ", response, flags=re.M)
-    # These rows would describe a run.
-    assert not re.search(r"^  (samples|burst, end|drive, end|engine|disk)", response, flags=re.M)
-
-    prediction = in_process("validate", example_case("predict")).stdout
-    assert re.search(r"^  predict +19 amplitudes, 17 to 1500 N$", prediction, flags=re.M)
-    assert re.search(r"^  composed of +24 runs of one site ", prediction, flags=re.M)
-    assert not re.search(r"^  law ", prediction, flags=re.M)
-    # Both run and predict read the case, and both have the rows of the lattice.
-    rows = re.findall(r"^  (\w[\w ]*?)  ", prediction, flags=re.M)
-    assert len(rows) == len(set(rows))
-
-
 @pytest.mark.parametrize("name", DRAWN)
 def test_results_are_recognised_by_their_file(tmp_path, name):
     """Results are recognised by their folder, and by the file of the results in it."""
@@ -193,14 +175,3 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
     (folders[0] / "ensemble.h5").rename(folders[0] / "law.h5")
     with pytest.raises(FolderError, match="sweeps and folders of branches, can be drawn on one page"):
         pictures_of(folders)
-
-
-def test_a_folder_without_results_is_taken_for_a_run(tmp_path):
-    """An empty folder is treated as that of a run, so that the message names the missing run.h5."""
-    assert pictures_of([tmp_path])[0].kind.source == "run"
-
-
-def test_the_verb_of_a_case_is_found_by_its_class():
-    """``verb_of`` returns the verb by whose class a case was read."""
-    assert verb_of(Case.load(example_case("run"))) is VERBS["run"]
-    assert verb_of(VERBS["predict"].case.load(example_case("predict"))) is VERBS["predict"]

@@ -10,7 +10,6 @@ from tests.conftest import assert_same_bits, datasets
 from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.parallel import StopRequest
 
 
 def three_cells(**nnm) -> NnmCase:
@@ -65,40 +64,6 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
             # The table has a row of names, and then one row for each point.
             rows = (folder / f"branch-{branch.name}.csv").read_text().splitlines()
             assert len(rows) == len(branch.points) + 1 > 2
-
-
-@pytest.mark.parallel([1, 2])
-def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
-    """A request to stop on one rank ends its branch at the next point; the other branch goes on.
-
-    A resumed branch has the same bits as an uninterrupted one.
-    """
-    comm = MPI.COMM_WORLD
-    # Each of two ranks follows one branch: only the rank with mode-1 sees the request.
-    case = three_cells(points=20)
-    stop = StopRequest()
-
-    def listener(branch, point):
-        stop.requested = branch.name == "mode-1" and point.index == 13
-
-    stopped = follow_all(case, folder, comm, listener=listener, stop=stop)
-    comm.Barrier()
-
-    whole = folder / "whole"
-    if comm.rank == 0:
-        first, second = stopped
-        assert first.ended.sentence == "stopped on request after point 13; continue with --resume"
-        assert len(read_branch(folder / "branch-mode-1.h5").points) == 14
-        assert second.ended.sentence.startswith("20 points reached")
-        whole.mkdir()
-    comm.Barrier()
-
-    follow_all(case, folder, comm, resume=True)
-    follow_all(case, whole, comm)
-    comm.Barrier()
-
-    for name in ("branch-mode-1.h5", "branch-mode-2.h5"):
-        assert_same_bits(datasets(folder / name), datasets(whole / name))
 
 
 @pytest.mark.parallel([2])

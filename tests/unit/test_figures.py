@@ -20,11 +20,10 @@ from vipetsc.figures import style
 from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
 from vipetsc.figures.panels import label_panels
-from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
+from vipetsc.figures.registry import draw, draw_bands, figure_names
 from vipetsc.figures.runs import phase
 from vipetsc.figures.schematics import draw_unit_cell
 from vipetsc.figures.style import SCREEN, LeftOut, NoPicture, new_figure, rc_style, save
-from vipetsc.figures.sweep_members import Files
 from vipetsc.io.kinds import BRANCHES, OPTIMUM
 from vipetsc.io.read import open_run
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
@@ -215,20 +214,6 @@ def test_a_site_that_was_not_reached_has_no_portrait(tmp_path):
     write_run(tmp_path / "run.h5")
     with open_run(tmp_path / "run.h5") as run, pytest.raises(NoPicture, match="cell 8, the first site, was at rest"):
         phase(run.assign(displacement=xr.zeros_like(run["displacement"])), None)
-
-
-@pytest.mark.slow
-def test_all_of_a_picture_can_be_read(tmp_path):
-    """Texts of every picture of a run lie on the page and apart from each other; axes have labels and panels names."""
-    write_run(tmp_path / "run.h5")
-    measure_run(tmp_path)
-    with rc_style(), Files() as files:
-        for name, make, *_ in drawings("run", [tmp_path], files):
-            if name in OF_POINTS:
-                continue
-            figure = make()
-            save(figure, tmp_path / f"{name}.png")
-            assert (name, complaints(figure)) == (name, [])
 
 
 def test_the_analysis_names_what_it_left_out(measured):

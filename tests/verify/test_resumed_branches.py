@@ -10,7 +10,6 @@ from typing import Any
 from mpi4py import MPI
 
 import h5py
-import pytest
 
 from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
@@ -49,20 +48,6 @@ def file_of(folder: Path) -> Branch[Any]:
     return read_branch(folder / "branch-out-of-phase.h5")
 
 
-def test_a_stopped_branch_that_stands_still_ends_at_the_same_point(tmp_path):
-    """A branch whose check compares its latest six points ends where one does that was not stopped at its third."""
-    # Any six points are one point by this measure.
-    nnm = {"guards": {"standstill": 6, "advance": 100.0}}
-    whole = follow(tmp_path / "whole", **nnm)
-    assert whole.points[-1].index == 7
-
-    stopped_at(tmp_path / "parts", 3, **nnm)
-    resumed = follow(tmp_path / "parts", **nnm)
-
-    assert (resumed.ended, resumed.findings, resumed.missing) == (whole.ended, whole.findings, whole.missing)
-    assert len(resumed.points) == len(whole.points)
-
-
 def test_a_branch_that_other_sources_began_is_computed_again(tmp_path):
     """The points of other sources are dropped while a branch is not complete, and stay where it is."""
     stopped_at(tmp_path, 3)
@@ -89,24 +74,6 @@ def test_a_branch_that_goes_on_has_the_orbits_that_it_lacked(tmp_path):
     follow(tmp_path, **nnm)
 
     assert file_of(tmp_path).missing == ["the branch has no orbit of 100 J"]
-
-
-@pytest.fixture
-def marked(monkeypatch):
-    """Each step has a special point that is not located."""
-
-    def locate(problem, left, right, missed, **options):
-        missed.append(f"a special point after {left.describe()}")
-        return []
-
-    monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
-
-
-def test_findings_of_a_stopped_branch_have_the_order_of_one_that_was_not(tmp_path, marked):
-    whole = follow(tmp_path / "whole")
-    stopped_at(tmp_path / "parts", 4)
-    follow(tmp_path / "parts")
-    assert file_of(tmp_path / "parts").findings == whole.findings
 
 
 def test_a_closed_curve_that_is_resumed_ends_where_it_began(tmp_path):

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
-from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import sweep_members
-from vipetsc.figures.registry import FIGURES, draw
+from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, ROWS, amplitudes
 from vipetsc.figures.style import GREY, SKY, rc_style
 from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, series_of
@@ -116,22 +115,6 @@ def limits(images):
 def members(ensemble):
     """The folders of the members with fields, in the order of their amplitudes."""
     return [folder for _, folder in whole_members(ensemble)]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("plain_pictures")
-def test_every_figure_is_drawn_from_files(whole):
-    folder = Path(whole.attrs["folder"])
-    first, *others = OF_FIELDS
-    page, vector = draw("sweep", [folder], [first], ("png", "pdf"))
-    written = [page, *draw("sweep", [folder], others)]
-
-    assert vector.name == f"{first}-calibrated.pdf"
-    assert {path.name for path in written} == {f"{name}-calibrated.png" for name in OF_FIELDS}
-    assert {path.parent for path in (*written, vector)} == {folder / "figures"}
-    for path in written:
-        # An empty page has one colour.
-        assert np.ptp(imread(path)[..., :3]) > 0.5
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from tests.hertz_branch import GRAZING, write_branch
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import runs, transfer_curves
 from vipetsc.figures.panels import block_means
-from vipetsc.figures.registry import FIGURES, draw
+from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
 from vipetsc.figures.transfer import ROOM, closing_error
@@ -215,10 +215,6 @@ def test_whole_members_alone_make_no_curves(whole):
         assert not offered_figures(name, whole)
 
 
-def test_nothing_to_draw_from_nothing():
-    assert all(not dict((FIGURES | PAGES)[name].function(Sweeps([], Files()))) for name in NAMES)
-
-
 @pytest.mark.slow
 def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures):
     assert list(transfer_pictures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
@@ -356,15 +352,6 @@ def test_regimes_without_an_ensemble(whole):
 
     # The figure has the two points without a curve.
     assert len(all_axes(figure)[0].lines) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["png", "pdf"])
-def test_files_are_named_by_figure_and_suffix(reduced, kind):
-    written = draw("sweep", [reduced], ["ibtet_backbone"], [kind])
-    assert [p.name for p in written] == [f"ibtet_backbone-calibrated-1-site-4-cycles.{kind}"]
-    # An empty page is smaller.
-    assert all(path.stat().st_size > 10_000 for path in written)
 
 
 def test_curves_of_a_sweep(reduced):

@@ -74,7 +74,7 @@ def cost_maps(search: xr.Dataset) -> Figure:
         if np.isnan(list(best.values())).any():
             axes.set_title(f"{TITLES[cost]}: none is out of phase")
         else:
-            axes.set_title(f"{TITLES[cost]}: ({best['lambda']:.3g}, {best['eta']:.3g})")
+            axes.set_title(f"{TITLES[cost]}:\n({best['lambda']:.3g}, {best['eta']:.3g})")
             _draw_best(axes, result, best)
 
         if j == 0:

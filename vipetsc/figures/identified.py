@@ -188,7 +188,7 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     misfit.set(xlabel="window (below: contacts)", ylabel="misfit / noise", title="Misfit")
     for panel in (misfit, course):
         # Windows are counted: a tick between two of them would mean nothing.
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        _count_along(panel, windows)
 
     values = identified["windows/value"].values
     for number, parameter in enumerate(plan.parameters):
@@ -209,9 +209,15 @@ def growing_windows(identified: xr.Dataset) -> Figure:
         if failed:
             title += f", {failed} failed"
         axes.set(xlabel="valley", ylabel="deviance - least", title=title)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        _count_along(axes, valley)
     panels.label_panels([misfit, course, *starts])
     return figure
+
+
+def _count_along(axes: Axes, numbers: np.ndarray) -> None:
+    """Give the x axis of ``axes`` ticks at whole numbers alone, also where all ``numbers`` are one."""
+    axes.set_xlim(numbers.min() - 0.5, numbers.max() + 0.5)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 FIGURES = (record_and_model, residual_correlations, misfit_profiles, parameter_correlation, growing_windows)

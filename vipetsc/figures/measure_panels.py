@@ -78,7 +78,8 @@ class MeasurePage:
     The other lines are notes below the picture.
 
     ``legend_labels`` are the texts of the legend, empty for none. ``lay_out`` makes the ``figure`` and its ``panels``,
-    which stand in ``body``, the figure without the strip of the legend; ``width`` is in inches.
+    which stand in ``body``, the figure without the strip of the legend; ``width`` and ``label_height``, the length of a
+    label along y, are in inches.
     """
 
     label: str
@@ -89,6 +90,7 @@ class MeasurePage:
     _legend_figure: SubFigure = field(init=False)
     panels: list[Axes] = field(init=False)
     width: float = field(init=False)
+    label_height: float = field(init=False)
 
     def lay_out(self, titles: Sequence[str], columns: int = 0) -> None:
         """Make the page with a panel for each of ``titles``, in so many ``columns`` unless they are 0 or too many."""
@@ -105,7 +107,10 @@ class MeasurePage:
         height = 2.4
         if rows > 1:
             height = 0.3 + 1.75 * rows
-        height += 0.15 * len(heading)
+        above = 0.15 * len(heading)
+        # A label in the middle of the page's left edge ends below the title, and as far from the lower edge.
+        self.label_height = height - above
+        height += above
         strip = self._legend_height()
         self.figure = style.new_figure(self.width, height + strip)
         for line in filter(None, self.lines[1:]):
@@ -146,7 +151,7 @@ class MeasurePage:
         for axes in self.panels:
             label_positions(axes.xaxis, x, (self.width - SIDES) / columns)
         self.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
-        self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
+        self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.label_height))))
 
     def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
         """Label and scale the axes of all panels of curves, and write the legend; return the figure.
