@@ -176,3 +176,131 @@ def test_refused_strips(key, word, strip):
     with pytest.raises(CaseError) as error:
         Case.from_table(table)
     assert any(problem.key == key and word in problem.remedy for problem in error.value.problems)
+
+
+def run_table(places=(), **keys):
+    """A square strip of 12 x 5 cells with a harmonic drive on one mass and, at some places, stops to the ground."""
+    table = strip_table(rows=5, cells=12, **keys)
+    table["drive"] = {"amplitude": 20.0, "waveform": "harmonic", "frequency": 1000.0, "place": [3, 2]}
+    if places:
+        contacts = {"places": places, "clearance": 1e-4, "stiffness": 1e8, "restitution": 0.8}
+        table["contacts"] = contacts
+    return table
+
+
+def test_places_are_cells_and_masses():
+    table = run_table(places=[[4, 1], [4, 5], [9, 3]], drive={})
+    table["output"]["points"] = [{"name": "far", "place": [12, 5]}]
+    table["initial"] = {"kind": "velocity", "place": [2, 4], "velocity": 0.1}
+    case = Case.from_table(table)
+    assert (case.drive.cell, case.drive.mass) == (3, 2)
+    assert case.contacts.sites == [4, 4, 9]
+    assert [tuple(pair) for pair in case.model().chain.pairs] == [(-1, 0, 0), (-1, 4, 0), (-1, 2, 0)]
+    assert (case.output.points[0].cell, case.output.points[0].mass) == (12, 5)
+    assert (case.initial.cell, case.initial.mass) == (2, 4)
+    assert Case.from_toml(case.to_toml()) == case
+
+
+def test_masses_and_offsets_of_contacts_count_in_the_cell_of_the_plane():
+    table = strip_table(rows=3, cells=6, kind="honeycomb", edges="periodic")
+    contacts = {"clearance": 1e-4, "stiffness": 1e8, "places": [[2, 3]], "pair": [2, 1]}
+    for offset, pair in (([0, 0], (5, 4, 0)), ([0, 1], (5, 0, 0)), ([1, 0], (5, 4, 1))):
+        case = Case.from_table(table | {"contacts": contacts | {"offset": offset}})
+        assert tuple(case.model().chain.pairs[0]) == pair
+
+
+PATTERNS = {
+    "row": ({"row": 2, "every": 4}, [[1, 2], [5, 2], [9, 2]]),
+    "column": ({"column": 7}, [[7, j] for j in range(1, 6)]),
+    "line": ({"line": [[4, 1], [8, 5]]}, [[4, 1], [5, 2], [6, 3], [7, 4], [8, 5]]),
+    "disc": ({"centre": [3, 3], "radius": 1}, [[2, 3], [3, 2], [3, 3], [3, 4], [4, 3]]),
+    "within": ({"within": [[5, 2], [4, 1]]}, [[4, 1], [4, 2], [5, 1], [5, 2]]),
+}
+
+
+@pytest.mark.parametrize("name", sorted(PATTERNS))
+def test_patterns(name):
+    pattern, places = PATTERNS[name]
+    assert Case.from_table(run_table(pattern)) == Case.from_table(run_table(places))
+
+
+def test_a_random_share_depends_on_its_seed_alone():
+    def share(seed):
+        contacts = Case.from_table(run_table({"share": 0.3, "seed": seed})).contacts
+        return [(i, *pair) for i, pair in zip(contacts.sites, contacts.each.pair, strict=True)]
+
+    assert len(share(1)) == 18 == len({*share(1)})
+    assert share(1) == share(1) != share(2)
+
+
+def test_a_beam_has_phases_and_amplitudes():
+    table = run_table()
+    table["drive"] = {"amplitude": "2 N", "waveform": "harmonic", "frequency": 1000.0, "places": {"column": 4}}
+    table["drive"]["beam"] = {"wavevector": [0.1, 0.5], "width": 1.5}
+    drives = Case.from_table(table).model().drives
+    assert [(drive.cell, drive.mass) for drive in drives] == [(3, row) for row in range(5)]
+    late = np.linspace(0.08, 0.09, 7)  # after the ramp
+    for row, drive in enumerate(drives):
+        expected = 2 * np.exp(-0.5 * ((row - 2) / 1.5) ** 2) * np.sin(1000 * late - 0.5 * row)
+        np.testing.assert_allclose(drive.waveform.force(late), expected, rtol=0, atol=1e-12)
+
+
+def test_defects_and_scatter_by_place():
+    strip = {
+        "defects": [
+            {"quantity": "masses[1]", "places": [[2, 1], [3, 4]], "factor": 2.0},
+            {"quantity": "springs[2].stiffness", "places": [[3, 2]], "value": 5.0},
+        ]
+    }
+    chain = strip_case(**strip).model().chain
+    masses = chain.coefficients(0, 6).masses
+    exact = np.full((6, 4), M)
+    exact[1, 0] = exact[2, 3] = 2 * M
+    np.testing.assert_array_equal(masses, exact)
+    # The springs along come first, one a row; then those across, which begin in the rows 1 to 3.
+    stiffness = chain.coefficients(0, 6).stiffness
+    assert np.argwhere(stiffness != K).tolist() == [[2, 4 + 1]] and stiffness[2, 5] == 5.0
+    table = strip_table() | {"disorder": {"seed": 3, "cells": {"masses[*]": {"relative": 0.1}}}}
+    scattered = Case.from_table(table).model().chain.coefficients(0, 6).masses
+    assert len(np.unique(scattered)) == 24 and abs(scattered.mean() / M - 1) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("section", "value", "key", "word"),
+    [
+        ("contacts", {"places": [[3, 6]]}, "contacts.places", "outside"),
+        ("contacts", {"places": [[3]]}, "contacts.places[1]", "2 items"),
+        ("contacts", {"places": {"rows": 3}}, "contacts.places.rows", "row"),
+        ("contacts", {"places": {"centre": [3, 3]}}, "contacts.places.radius", "disc"),
+        ("contacts", {"places": {"row": 3, "column": 40}}, "contacts.places", "no cell"),
+        ("contacts", {"places": [[3, 3]], "pair": [0, 2]}, "contacts.pair", "1 to 1"),
+        ("contacts", {"places": [[3, 5]], "pair": [1, 1], "offset": [0, 1]}, "contacts.offset", "edge"),
+        ("contacts", {"sites": [3], "offset": [0, 1]}, "contacts.offset", "contacts.places"),
+        ("drive", {"place": [13, 1]}, "drive.place", "outside"),
+        ("drive", {"place": [3, 1, 2]}, "drive.place", "masses 1 to 1"),
+        ("drive", {"place": [3, 1], "mass": 2}, "drive.place", "cell and mass"),
+        ("drive", {"place": [3, 1], "beam": {"wavevector": [0, 1]}}, "drive.beam", "places"),
+        (
+            "drive",
+            {"places": {"column": 2}, "waveform": "burst", "beam": {"wavevector": [0, 1]}},
+            "drive.phase",
+            "burst",
+        ),
+        ("initial", {"kind": "velocity", "place": [1, 2, 3, 4], "velocity": 1.0}, "initial.place", "at most 3"),
+    ],
+)
+def test_refused_places(section, value, key, word):
+    table = run_table()
+    if section == "contacts":
+        value = {"clearance": 1e-4, "stiffness": 1e8} | value
+    if section == "drive":
+        value = {"frequency": 1000.0, "waveform": "harmonic"} | value
+    with pytest.raises(CaseError) as error:
+        Case.from_table(table | {section: value})
+    assert any(problem.key == key and word in str(problem) for problem in error.value.problems), str(error.value)
+
+
+def test_places_need_a_strip():
+    with pytest.raises(CaseError) as error:
+        Case.from_table({"drive": {"place": [3, 2]}, "contacts": {"places": [[1, 1]]}})
+    assert [problem.key for problem in error.value.problems] == ["drive.place", "contacts.places"]

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
+from vipetsc.case.places import Place, Places
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
 from vipetsc.case.section import described
 from vipetsc.io.names import file_hash, resolved_path
@@ -62,6 +63,8 @@ class StrikeTable(Section):
     cell: int = described("cell of the mass", ge=1)
     mass: int = described("number of the mass in the cell", 1, ge=1)
     velocity: Finite = described("velocity of this mass at t = 0", unit="m/s")
+    place: Place | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
+    places: Places | None = described("a strip: cells whose masses are struck, instead of cell and mass", None)
 
 
 class InitialTable(Section):
@@ -103,6 +106,8 @@ class InitialTable(Section):
     sha256: str | None = described("file: its SHA-256 hash, filled in", None)
     mass: int | None = described("velocity: number of the struck mass in its cell; default: 1", None, ge=1)
     velocity: Finite | None = described("velocity: velocity of the struck mass at t = 0", None, unit="m/s")
+    place: Place | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
+    places: Places | None = described("a strip: cells whose masses are struck, instead of cell and mass", None)
     more: list[StrikeTable] | None = described("velocity: further struck masses, `[[initial.more]]`", None)
     frequency: Positive | None = described(
         "frequency of the motion, to which tolerances refer where nothing is driven; filled in", None, unit="rad/s"

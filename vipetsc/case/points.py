@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section
+from vipetsc.case.places import Place
 from vipetsc.case.section import described
 
 NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point, which is part of names in result files
@@ -22,6 +23,7 @@ class PointTable(Section):
     )
     cell: int = described("cell of the point", ge=1)
     mass: int = described("number of the mass in the cell", 1, ge=1)
+    place: Place | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
 
 
 def masses_remedy(dofs: int) -> str:

@@ -12,7 +12,7 @@ from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.case.points import MOST_POINTS, PointTable
 from vipetsc.case.section import BY_SHAPE, described
-from vipetsc.case.strip import StripTable
+from vipetsc.case.strip import DEFAULT_CELLS, StripTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 
@@ -240,7 +240,7 @@ class LatticeTable(Section):
     )
     cell: CellTable | None = described("a user-defined cell, instead of a preset", None)
     strip: StripTable | None = described("a strip of the plane, which writes the cell", None)
-    cells: int = described("number of cells; 600 in the preset diatomic", 300, ge=1, le=MOST_CELLS)
+    cells: int = described("number of cells; 600 in the preset diatomic", DEFAULT_CELLS, ge=1, le=MOST_CELLS)
     ends: Literal["fixed", "free", "periodic"] = described("what the first and the last cell are attached to", "fixed")
     reading: Literal["printed", "calibrated"] = described(
         "parameters of a preset: as printed in the paper, or calibrated to reproduce its figures", "calibrated"

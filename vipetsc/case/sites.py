@@ -7,6 +7,7 @@ from pydantic import Field, create_model
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
+from vipetsc.case.places import Pair, Places
 from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
 from vipetsc.case.section import BY_SHAPE, described
 from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
@@ -141,6 +142,8 @@ class ContactsTable(ElasticLaw):
     )
     pair: Ends | None = described("host and resonator, instead of those of the cell; host 0 is the ground", None)
     next_cell: bool | None = described("whether the resonator is in the next cell, as in a chain of beads", None)
+    places: Places | None = described("a strip: cells with stops, instead of sites; `pair` is by default [0, 1]", None)
+    offset: Pair | None = described("a strip: how many cells [i, j] further the resonator is; i is 0 or 1", None)
     precompression: Positive | None = described(
         "indentation in the static state, from which displacements are measured; for a stop on one side", None, unit="m"
     )

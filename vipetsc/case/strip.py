@@ -14,21 +14,17 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from vipetsc.case.places import DefectTable, Finite, Pair, Placing, Positive, Vector, for_all, translated, without_strip
 from vipetsc.case.reading import Table, read_section
 from vipetsc.case.section import Problem, Section, described
 from vipetsc.lattice.cell import Spring
 from vipetsc.lattice.plane import KINDS, PlaneCell, PlaneSpring
 
+DEFAULT_CELLS = 300
 MOST_SPRINGS = 20_000  # of a wide cell: every step goes over all of them, and every result lists them
 FILLED = {"masses", "springs", "from_strip"}  # keys of a cell that a strip fills in
 OF_A_PRESET = ("mass", "stiffness", "stiffness_across")
 OF_ONES_OWN = ("masses", "springs", "vectors", "positions")
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Point = Annotated[list[Finite], Field(min_length=2, max_length=2)]
-Pair = Annotated[list[int], Field(min_length=2, max_length=2)]
-Place = Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=3)]
 
 
 class StripSpring(Section):
@@ -38,7 +34,7 @@ class StripSpring(Section):
     end: int = described("mass at the other end", ge=1)
     offset: Pair = described("how many cells [i, j] further `end` is; i is -1, 0 or 1", [0, 0])
     stiffness: Finite = described("stiffness", unit="N/m")
-    direction: Point | None = described("direction [x, y] of the spring, for motion in the plane", None)
+    direction: Vector | None = described("direction [x, y] of the spring, for motion in the plane", None)
     damping: Finite = described("constant of a dashpot parallel to the spring", 0.0, unit="N s/m")
     quadratic: Finite = described("coefficient of the elongation squared in the force", 0.0, unit="N/m^2")
     cubic: Finite = described("coefficient of the elongation cubed in the force", 0.0, unit="N/m^3")
@@ -80,10 +76,13 @@ class StripTable(Section):
     )
     masses: list[Positive] | None = described("cell: masses of a cell of the plane", None, unit="kg", min_length=1)
     springs: list[StripSpring] | None = described("cell: springs of a cell of the plane", None, min_length=1)
-    vectors: Annotated[list[Point], Field(min_length=2, max_length=2)] | None = described(
+    vectors: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = described(
         "cell: vectors from a cell to the next one along and across, for pictures; default: [[1, 0], [0, 1]]", None
     )
-    positions: list[Point] | None = described("cell: positions of the masses in the cell, for pictures", None)
+    positions: list[Vector] | None = described("cell: positions of the masses in the cell, for pictures", None)
+    defects: list[DefectTable] | None = described(
+        "quantities that differ at some places; written to `lattice.profiles`", None
+    )
 
     def plane_cell(self) -> PlaneCell:
         """The cell of the plane of a valid section."""
@@ -148,42 +147,71 @@ class StripTable(Section):
 
 
 def with_strip(table: Table) -> tuple[Table, list[Problem]]:
-    """Return ``table`` with the wide cell of its strip, and problems with it; the table itself if it has none."""
+    """Return ``table`` with the wide cell of its strip and without places, and the problems with these.
+
+    Without a strip it is the table itself, which must not name places.
+    """
     lattice = table.get("lattice")
     # Types are not checked yet.
-    if not isinstance(lattice, dict):
-        return table, []
-    cell = lattice.get("cell", {})
-    given = lattice.get("strip", {})
+    cell = lattice.get("cell", {}) if isinstance(lattice, dict) else {}
+    given = lattice.get("strip") if isinstance(lattice, dict) else None
     earlier = cell.get("from_strip") if isinstance(cell, dict) else None
-    if not isinstance(given, dict) or not isinstance(cell, dict):
+    if not isinstance(lattice, dict) or not isinstance(cell, dict) or (given is None and earlier is None):
+        return table, list(without_strip(table))
+    if not isinstance(given, dict | None) or not isinstance(earlier, dict | None):
         return table, []
-    if "strip" not in lattice:
-        return table, []
-    if earlier is None and cell.keys() & FILLED:
+    if given is not None and earlier is None and cell.keys() & FILLED:
         return table, [Problem("lattice.strip", None, "give it or the masses and springs of lattice.cell, not both")]
 
-    merged = given
-    if isinstance(earlier, dict):
-        merged = earlier | given
-    strip, problems = read_section(StripTable, merged, "lattice.strip")
+    key = "lattice.cell.from_strip" if given is None else "lattice.strip"
+    strip, problems = read_section(StripTable, (earlier or {}) | (given or {}), key)
     problems = problems or list(strip.problems(lattice.get("ends")))
     if problems:
         return table, problems
+    cells = lattice.get("cells", DEFAULT_CELLS)
+    if type(cells) is not int:
+        return table, []  # the type is refused where sections are read
+    placing = Placing(strip.plane_cell(), (cells, strip.rows), strip.edges == "periodic")
+    # A cell that was written before is kept: scatter, sweeps and fits may have changed its numbers.
+    if given is not None:
+        lattice, problems = _written(lattice, cell, strip, placing)
+    if not problems:
+        table = _with_all(table | {"lattice": lattice}, strip, placing)
+        problems = placing.problems
+    return table, problems
 
-    plane = strip.plane_cell()
-    springs = plane.wide_springs(strip.rows, strip.edges)
+
+def _written(lattice: Table, cell: Table, strip: StripTable, placing: Placing) -> tuple[Table, list[Problem]]:
+    """The section ``lattice`` with its ``cell`` and its profiles written by a valid ``strip``."""
+    springs = placing.plane.wide_springs(strip.rows, strip.edges)
     if len(springs) > MOST_SPRINGS:
         remedy = f"makes {len(springs)} springs in a wide cell, of at most {MOST_SPRINGS}; use fewer rows"
-        return table, [Problem("lattice.strip.rows", strip.rows, remedy)]
+        return lattice, [Problem("lattice.strip.rows", strip.rows, remedy)]
     filled = {
-        "masses": plane.wide_masses(strip.rows),
+        "masses": placing.plane.wide_masses(strip.rows),
         "springs": [_spring_table(spring) for spring in springs],
         "from_strip": strip.model_dump(exclude_none=True),
     }
     others = {key: value for key, value in cell.items() if key not in FILLED}
     lattice = {key: value for key, value in lattice.items() if key != "strip"} | {"cell": others | filled}
-    return table | {"lattice": lattice}, []
+    profiles = placing.of_defects(strip.defects or [], strip.edges)
+    if profiles:
+        lattice["profiles"] = (lattice.get("profiles") or {}) | profiles
+    return lattice, []
+
+
+def _with_all(table: Table, strip: StripTable, placing: Placing) -> Table:
+    """The ``table`` with its places translated, and profiles and scatter of ``[*]`` given to all masses or springs."""
+    cell = table["lattice"]["cell"]
+    counts = len(cell.get("masses", ())), len(cell.get("springs", ()))
+    table = translated(table, placing)
+    profiles = table["lattice"].get("profiles")
+    if isinstance(profiles, dict):
+        table["lattice"] = table["lattice"] | {"profiles": for_all(profiles, *counts)}
+    disorder = table.get("disorder")
+    if isinstance(disorder, dict) and isinstance(disorder.get("cells"), dict):
+        table["disorder"] = disorder | {"cells": for_all(disorder["cells"], *counts)}
+    return table
 
 
 def _spring_table(spring: Spring) -> dict[str, Any]:

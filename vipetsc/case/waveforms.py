@@ -13,6 +13,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
+from vipetsc.case.places import BeamTable, Place, Places
 from vipetsc.case.samples import WALL_UNITS, SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.case.section import described
@@ -64,7 +65,11 @@ def _build_burst(drive: "OneDrive") -> Waveform:
 
 def _build_harmonic(drive: "OneDrive") -> Waveform:
     return ramped(
-        drive.amplitude, frequency=_given(drive.frequency), ramp=_given(drive.ramp), duration=drive.duration or np.inf
+        drive.amplitude,
+        frequency=_given(drive.frequency),
+        ramp=_given(drive.ramp),
+        duration=drive.duration or np.inf,
+        phase=drive.phase or 0.0,
     )
 
 
@@ -162,7 +167,7 @@ WAVEFORMS = {
     "harmonic": WaveformRecord(
         build=_build_harmonic,
         describe=lambda drive: f"{_omega(drive)}, ramp {drive.ramp or 0:g} s",
-        takes=("ramp", "duration"),
+        takes=("ramp", "duration", "phase"),
         ramp=_harmonic_ramp,
     ),
     "chirp": WaveformRecord(
@@ -281,6 +286,7 @@ class OneDrive(Section):
     parameters: dict[str, Finite] | None = described(
         "parameters of a waveform that a module of [plugins] registers", None, unit="that of the parameter"
     )
+    phase: Finite | None = described("phase of the sine of a harmonic drive", None, unit="rad")
     frequency: Positive | None = described(
         "angular frequency, of a chirp its centre; alternatively `wavenumber` or `at`, with `band`", None, unit="rad/s"
     )
@@ -291,6 +297,9 @@ class OneDrive(Section):
     at: Literal["max-group-velocity"] | None = described("position of the wave in `band`", None)
     cell: int = described("the driven cell", 1, ge=1)
     mass: int = described("the driven mass in that cell", 1, ge=1)
+    place: Place | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
+    places: Places | None = described("a strip: cells that are driven, a drive each", None)
+    beam: BeamTable | None = described("phases and amplitudes of the drives at `places`", None)
     end: Literal["left", "right"] | None = described(
         "the end whose wall moves with the waveform, instead of a force on a mass", None
     )

@@ -357,12 +357,17 @@ def _set(row: np.ndarray, coefficients: np.ndarray) -> None:
 
 
 def ramped(
-    amplitude: float, frequency: float, ramp: float, duration: float = np.inf, sweep: float | None = 0.0
+    amplitude: float,
+    frequency: float,
+    ramp: float,
+    duration: float = np.inf,
+    sweep: float | None = 0.0,
+    phase: float = 0.0,
 ) -> Pieces:
     """A sine of ``frequency`` in rad/s that rises over ``ramp`` s and falls likewise before ``duration``, if it ends.
 
-    With a ``sweep`` its frequency goes linearly from half of that below to half of it above; without one (None) it is
-    no sine, but a step. ``ramp`` is at most half the duration.
+    Its ``phase`` in rad is that at the beginning. With a ``sweep`` its frequency goes linearly from half of that below
+    to half of it above; without one (None) it is no sine, but a step. ``ramp`` is at most half the duration.
     """
     ends = np.isfinite(duration)
     starts = [0.0, ramp]
@@ -380,7 +385,7 @@ def ramped(
         rate = sweep / duration  # 0 of a sine that does not end
         x = table["start"]
         # Each piece goes on with the phase and the frequency that the sweep has reached.
-        table["phase"] = x * (lowest + 0.5 * rate * x)
+        table["phase"] = phase + x * (lowest + 0.5 * rate * x)
         table["frequency"] = lowest + rate * x
         table["rate"] = rate
     return Pieces.of(amplitude, frequency, duration, table)

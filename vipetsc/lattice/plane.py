@@ -10,6 +10,7 @@ a mass moves in two directions, x and y, which are two degrees of freedom one af
 K n n^T of a spring is one of scalar springs, some of them negative (``vipetsc.lattice.cell``).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -94,12 +95,19 @@ class PlaneCell:
 
         Free edges cut the springs that cross them, fixed ones hold these, periodic ones join the last row to the first.
         """
-        springs: list[Spring] = []
-        for spring in self.springs:
+        springs = [spring for _, _, parts in self._all_wide(rows, edges) for spring in parts]
+        return self._merged(springs) if self.in_plane else springs
+
+    def owners(self, rows: int, edges: Edges) -> list[tuple[int, int]]:
+        """Return for each of ``wide_springs`` out of the plane its number in the cell and the row where it begins."""
+        return [(number, row) for number, row, parts in self._all_wide(rows, edges) for _ in parts]
+
+    def _all_wide(self, rows: int, edges: Edges) -> Iterator[tuple[int, int, list[Spring]]]:
+        """Yield the number of each spring, the row where it begins, and the springs of the wide cell that it is."""
+        for number, spring in enumerate(self.springs):
             across = spring.offset[1]
             for row in range(min(0, -across), max(rows, rows - across)):
-                springs += self._wide(spring, row, row + across, rows, edges)
-        return self._merged(springs) if self.in_plane else springs
+                yield number, row, self._wide(spring, row, row + across, rows, edges)
 
     def _projector(self, spring: PlaneSpring) -> np.ndarray:
         """The matrix n n^T (components, components) of a spring; 1 out of the plane."""
