@@ -80,7 +80,6 @@ def test_guards_are_what_the_points_obey(short_branch):
 
         turns.append(np.arccos(np.clip(first @ second, -1, 1)))
         changes.append(half_trace_change(before, after))
-        assert abs(before.episodes - after.episodes) <= guards.contacts
 
     # Bounds that no step comes near would not be tested by this branch.
     assert 0.3 * guards.half_trace < max(changes) <= guards.half_trace

@@ -22,10 +22,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vipetsc.modes.balance.conservative import departures_of, fraction_closed
+from vipetsc.modes.balance.conservative import episodes_in_arc, fraction_closed
 from vipetsc.modes.balance.harmonic_balance import BalanceFrame
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.departures import Departure
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
@@ -104,7 +103,7 @@ class DampedFrame(BalanceFrame):
             period=period,
             energy=energy,
             residual=float(np.abs(self.residual(attempt.xi)).max()),
-            episodes=len(departures_of(modes.forces, series.episodes)),
+            episodes=episodes_in_arc(modes.forces, series.episodes),
             closed=fraction_closed(series),
             newton=max(len(attempt.history) - 1, 0),
             order=modes.order,
@@ -260,10 +259,6 @@ class DampedModes(OrbitProblem):
         null_vector = np.linalg.svd(frame.jacobian(frame.xi))[2][-1]
         first = frame.measures(Attempt(converged=True, reason="", history=[], xi=frame.xi), null_vector)
         return first.tangent * ((np.sign(first.energy_tangent) or 1.0) * direction)
-
-    def departures(self, point: Point) -> list[Departure]:
-        """Return the times in which contacts are not what they are at rest."""
-        return departures_of(self.forces, self.series(point.x[:-1], 2 * np.pi / point.period).episodes)
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Yield folds of the energy and of the frequency, between two motions that are not linear."""

@@ -382,7 +382,6 @@ class Arc:
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
     ``episodes`` counts how often contacts close, or open if they are pressed at rest, within the arc: one that goes on
     at the start counts as one that begins there. ``closed`` are the seconds with one or more contacts closed.
-    ``away_at_start`` (contacts,) says of each contact whether an episode goes on at the start.
     """
 
     duration: float
@@ -392,22 +391,7 @@ class Arc:
     events: np.ndarray
     episodes: int
     closed: float
-    away_at_start: np.ndarray
     steps: int
-
-    def spans(self) -> Iterator[tuple[float, float]]:
-        """Begin and end in s of every episode; those that go on at the start begin at 0, the last may end with the arc.
-
-        Changes of a contact alternate between away from what it is at rest and back to that: one that is pressed at
-        rest has a single stop, on which alone it closes.
-        """
-        for contact, is_away in enumerate(self.away_at_start):
-            times = self.events[self.events[:, 1] == contact, 0].tolist()
-            if is_away:
-                times = [0.0, *times]
-            if len(times) % 2:
-                times.append(self.duration)
-            yield from zip(times[::2], times[1::2], strict=True)
 
 
 class Flow(ABC):
@@ -491,7 +475,6 @@ class Flow(ABC):
             events=events,
             episodes=episodes,
             closed=advance.closed,
-            away_at_start=is_away,
             steps=advance.steps,
         )
 

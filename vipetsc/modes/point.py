@@ -1,12 +1,9 @@
 """One periodic orbit of a branch of nonlinear normal modes, and its quantities in the branch's file."""
 
-from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from vipetsc.modes.departures import Departure
 from vipetsc.modes.problem import PeriodicProblem, Solution
 
 # Quantities of a point: name in the files, type, unit, description.
@@ -89,13 +86,6 @@ class Point(Solution):
 
 class OrbitProblem(PeriodicProblem[Point]):
     """Equations whose solutions are orbits with contacts."""
-
-    @abstractmethod
-    def departures(self, point: Point) -> Sequence[Departure]:
-        """The times in the arc of an orbit in which contacts are not what they are at rest.
-
-        Raises FlowError if the arc cannot be integrated.
-        """
 
     def grazing(self, point: Point) -> list[int]:
         """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.

@@ -34,7 +34,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.modes.departures import Departure, within_arc
 from vipetsc.modes.flow import MOST_LONGER, UNLIMITED, Arc, Flow, ShootingMap
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
@@ -530,15 +529,6 @@ class Shooting(OrbitProblem):
         first, second = chart.to_unknowns(chart.encode(before.x, before.period), tangents).T
         # The product of two unit vectors may be beyond 1 by rounding.
         return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
-
-    def departures(self, point: Point) -> list[Departure]:
-        """The times in the arc of an orbit in which contacts are not what they are at rest.
-
-        Raises FlowError if the arc cannot be integrated.
-        """
-        spans = self.arc(point.x, point.period).spans()
-        in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
-        return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
 
     def grazing(self, point: Point) -> list[int]:
         """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""

@@ -69,20 +69,17 @@ class SystemTable(Section):
 class Guards(Section):
     """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
 
-    ``half_trace`` bounds the change of asinh(c) of every Floquet half-trace c; ``contacts`` that of the number of
-    contact episodes of the arc that is integrated (a part or the whole of the orbit), of which those that a symmetry of
-    the orbit takes to one another count once; ``corrector`` the length of the correction over that of the step;
-    ``turn`` the angle in rad between consecutive tangents in the chart of the step, and ``turn_relative`` that in the
-    chart ``relative``, since near grazing another chart hides the angle between two branches that cross. Residuals
-    cannot show a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
-    within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and the paper's branches move by
-    2e-6 in 200 points at least.
+    ``half_trace`` bounds the change of asinh(c) of every Floquet half-trace c; ``corrector`` the length of the
+    correction over that of the step; ``turn`` the angle in rad between consecutive tangents in the chart of the step,
+    and ``turn_relative`` that in the chart ``relative``, since near grazing another chart hides the angle between two
+    branches that cross. Residuals cannot show a jump: both arcs satisfy the equations to rounding. A branch whose last
+    ``standstill`` points are all within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and
+    the paper's branches move by 2e-6 in 200 points at least.
     """
 
     half_trace: Annotated[float, Field(ge=0)] = described(
         "change of asinh of a Floquet half-trace; 0 disables a guard", 0.5
     )
-    contacts: Annotated[int, Field(ge=0)] = described("number of contact episodes that appear or disappear", 1)
     corrector: Annotated[float, Field(ge=0)] = described("length of the correction over that of the step", 0.05)
     turn: Annotated[float, Field(ge=0)] = described("angle between tangents, in the chart of the step", 0.2, unit="rad")
     turn_relative: Annotated[float, Field(ge=0)] = described(

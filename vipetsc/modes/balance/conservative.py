@@ -75,7 +75,6 @@ from scipy.optimize import brentq
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.balance.harmonic_balance import BalanceFrame, Compliance, HarmonicBalance
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
-from vipetsc.modes.departures import Departure, union_length
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
@@ -85,12 +84,12 @@ from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Special
 ROUNDING = 1e-9 / (2 * np.pi)
 
 
-def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Departure]:
-    """When contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+def episodes_in_arc(forces: SiteForces, episodes: Iterable[Episode]) -> int:
+    """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
 
     That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
     shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed for
-    the whole period, or open, has none. The middle and the length of a departure are over the period.
+    the whole period, or open, does not count.
     """
     end = 0.5
     if forces.odd:
@@ -99,17 +98,15 @@ def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Depar
     for episode in episodes:
         by_pair[episode.pair].append((episode.onset, episode.onset + episode.length))
 
-    departures = []
+    count = 0
     for pair, stops in enumerate(forces.contacts):
         spans = by_pair[pair]
         if stops.is_pressed:
             spans = _between(spans)
-        for begin, stop in spans:
-            middle = (begin + stop) / (4 * np.pi)
-            # Whether it lies within the arc that is longer by the rounding at both ends, counted from its beginning.
-            if (middle + ROUNDING) % 1 < end + 2 * ROUNDING:
-                departures.append(Departure(middle=middle, length=(stop - begin) / (2 * np.pi)))
-    return departures
+        # The middle lies within the arc that is longer by the rounding at both ends, counted from its beginning.
+        middles = [(begin + stop) / (4 * np.pi) for begin, stop in spans]
+        count += sum((middle + ROUNDING) % 1 < end + 2 * ROUNDING for middle in middles)
+    return count
 
 
 def fraction_closed(series: ForceSeries) -> float:
@@ -125,7 +122,10 @@ def fraction_closed(series: ForceSeries) -> float:
             # An episode that contains phase 0 begins before it, at the end of the period.
             intervals.append((begin + 2 * np.pi, 2 * np.pi))
         intervals.append((max(begin, 0.0), episode.onset + episode.length))
-    return union_length(np.array(intervals)) / (2 * np.pi)
+    # Sorted by ends and by beginnings apart, the gaps between neighbours are those of the union.
+    times = np.sort(np.array(intervals), axis=0)
+    gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
+    return float(times[-1, 1] - times[0, 0] - gaps) / (2 * np.pi)
 
 
 def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -312,7 +312,7 @@ class HarmonicFrame(BalanceFrame):
             period=period,
             energy=balance.energy(x, omega, self.shift),
             residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
-            episodes=len(departures_of(balance.forces, series.episodes)),
+            episodes=episodes_in_arc(balance.forces, series.episodes),
             closed=fraction_closed(series),
             # The history has the residual of the guess, too; that of a guess which is not corrected is empty.
             newton=max(len(attempt.history) - 1, 0),
@@ -394,11 +394,6 @@ class ConservativeMotions(OrbitProblem):
         if balance.size not in self._newtons:
             self._newtons[balance.size] = DenseNewton(balance.size + 1, self.control.max_newton)
         return self._newtons[balance.size]
-
-    def departures(self, point: Point) -> list[Departure]:
-        """The times in which contacts are not what they are at rest, from phase 0 to where the motion repeats."""
-        balance = self.balance(point.order)
-        return departures_of(self.forces, balance.series(point.x, 2 * np.pi / point.period).episodes)
 
     def acceleration(self, point: Point) -> float:
         """The largest acceleration where a motion rests, over that of a harmonic motion of the same size.

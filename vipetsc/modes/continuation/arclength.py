@@ -17,11 +17,9 @@ branches bring their own.
 **Guards** bound what may change from one point to the next, by which jumps to another arc are noticed: the points of
 both arcs satisfy the equations to rounding, so that residuals do not distinguish them. Arcs that lie close together, as
 in neighbouring tongues of internal resonances, differ in their half-traces c = (mu + 1/mu)/2 of the Floquet multipliers
-mu, in their contacts, or in their direction. A step in which one of them changes by more than its bound is refused. A
-jump between arcs that differ in none of these by more is not noticed. Bounds on half-traces and contacts also keep
-steps so short that few special points are missed. Along the in-phase branch of the paper's model with Hertz's law, up
-to 6 GJ, 83 of 316 grazing points and 47 of 197 branch points lie in pairs within one step without them, and are not
-found; folds and the branch itself are the same.
+mu or in their direction. A step in which one of them changes by more than its bound is refused. A jump between arcs
+that differ in neither by more is not noticed. The bound on half-traces also keeps steps so short that few special
+points are missed. The number of contacts needs no bound: of a step in which several begin or end each is located.
 
 **Special points** are zeros of test functions, found by Brent's method (``locate``): of dE along the tangent at energy
 folds, of dT at frequency folds, of what half-traces show elsewhere. They are not interpolated between two points of the
@@ -43,7 +41,6 @@ from scipy.optimize import brentq
 
 from vipetsc.case.nnm import NnmTable
 from vipetsc.endings import NOT_FINISHED, Ended, Ending
-from vipetsc.modes.departures import changed_families
 from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import (
     Attempt,
@@ -59,14 +56,13 @@ from vipetsc.modes.problem import (
 # The change that a guard limits, for messages, and the key with its bound.
 GUARDED = {
     "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
-    "contacts": ("too many contacts appear or disappear", "nnm.guards.contacts"),
     "corrector": ("the corrector moves too far", "nnm.guards.corrector"),
     "turn": ("the branch turns too sharply", "nnm.guards.turn"),
     "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
     "truncation": ("the neglected harmonics are too large", "nnm.harmonics or nnm.truncation"),
 }
 # A change of these within its bound is no reason for a shorter step: such changes do not shrink with the step.
-ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
+ALL_OR_NOTHING = {"turn_relative", "truncation"}
 
 
 class GuardedChange(NamedTuple):
@@ -84,7 +80,7 @@ def largest_change(
     ``geometry`` has the fields of ``Geometry``: ``corrector`` and ``turn``. Which other changes are guarded
     ``problem.guards`` says.
     """
-    changes = {"contacts": contact_changes(problem, before, after, control.guards.contacts), **geometry}
+    changes = dict(geometry)
     if "half_trace" in problem.guards:
         changes["half_trace"] = half_trace_change(before, after)
     if "turn_relative" in problem.guards:
@@ -106,20 +102,6 @@ def largest_change(
         if size > worst.size:
             worst = GuardedChange(size, guard)
     return worst
-
-
-def contact_changes(problem: OrbitProblem, before: Point, after: Point, allowed: int) -> int:
-    """The number of contact episodes that appear or disappear between two points.
-
-    If there are more than ``allowed``, those that are images of one another by a symmetry count once. In a lattice that
-    is its own mirror image, or with equal stops on both sides, contacts begin in pairs along the whole branch
-    (``modes.departures``): a shorter step does not separate them, and they are no sign of a jump. Images are looked for
-    in that case alone, since this needs the arcs of both orbits again.
-    """
-    change = abs(after.episodes - before.episodes)
-    if change <= allowed or not allowed:
-        return change
-    return changed_families(problem.departures(before), problem.departures(after))
 
 
 def half_trace_change(a: Point, b: Point) -> float:

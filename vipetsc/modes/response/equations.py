@@ -16,7 +16,6 @@ of G_s (``HarmonicBalance.rate``) plus a central difference of the drive's term 
 """
 
 from abc import abstractmethod
-from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,22 +24,17 @@ import numpy as np
 from vipetsc.case.nfrc import NfrcTable
 from vipetsc.lattice import ComplianceError, IncidentWave
 from vipetsc.modes.balance.harmonic_balance import BalanceFrame, HarmonicBalance
-from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError, SpecialKind
-from vipetsc.modes.response.stability_changes import StabilityChanges
-from vipetsc.modes.response.state import Measures, Response
-from vipetsc.modes.response.turning import RangeProblem
-from vipetsc.modes.stability import Hill, Perturbations, Stability
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError
+from vipetsc.modes.response.stability_changes import StatesWithStability
+from vipetsc.modes.response.state import Response
 
 # Relative step of the central difference in frequency. Its relative error is (SLOPE/d)^2 at the relative distance d
 # from a pole of A w, and 1e-16/SLOPE by rounding. A mode that hardly moves the pairs makes A w large close to its pole
 # alone. Such an error makes Newton's method converge linearly, with a factor of its size; the solutions do not depend
 # on it.
 SLOPE = 1e-8
-# States whose stability is kept: the ends of a step, and one between them. Without special points one is enough.
-KEPT_STATES = 3
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.
 FAILURES = NoMotionError, ComplianceError, np.linalg.LinAlgError
@@ -108,7 +102,7 @@ class SteadyFrame(BalanceFrame):
         return Response(xi=attempt.xi, tangent=direction)
 
 
-class SteadyEquations(RangeProblem):
+class SteadyEquations(StatesWithStability):
     """The equations of steady states, for ``Continuation``; a subclass gives the ``linear_motion`` of the drive.
 
     ``options`` are the section [nfrc] of the case, ``balance`` the equations of the harmonics, ``clearance`` in m is
@@ -119,60 +113,19 @@ class SteadyEquations(RangeProblem):
     def __init__(
         self, options: NfrcTable, balance: HarmonicBalance, clearance: float, parameter: ContinuationParameter
     ) -> None:
-        self.options = options
+        super().__init__(options)
         self.balance = balance
         self.periods = options.subharmonic
         self.clearance = clearance
         self.parameter = parameter
         self.tolerance = options.tolerance
         self.max_newton = options.max_newton
-        self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
         # Along a curve over the amplitude the drive's term is the same for all states of a step.
         self._drive_terms = LatestValues[tuple[float, bytes], np.ndarray](1)
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:
         """The motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
-
-    @abstractmethod
-    def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
-        """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there."""
-
-    def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state ``xi`` (n + 1,). The latest are kept, since neighbours on a curve are compared."""
-
-        def evaluate() -> Stability:
-            hill, series = self.hill_at(xi)
-            return hill.stability(series)
-
-        return self._stabilities.get(xi.tobytes(), evaluate)
-
-    @abstractmethod
-    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of the state ``xi`` (n + 1,) for its file.
-
-        Its growing ``perturbations`` are looked for unless they are given.
-        """
-
-    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
-        hill, series = self.hill_at(xi)
-        return float(hill.determinants(series, np.array([exponent]))[0].real)
-
-    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
-        hill, series = self.hill_at(xi)
-        return hill.pairs(series)
-
-    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of the state ``xi`` (n + 1,) near a ``guess``; raises NoMotionError without one."""
-        hill, series = self.hill_at(xi)
-        return hill.near(series, guess)
-
-    def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
-        hill, _ = self.hill_at(xi)
-        return hill.least
 
     @cached_property
     def newton(self) -> DenseNewton:
@@ -236,11 +189,6 @@ class SteadyEquations(RangeProblem):
         """Tangent (n + 1,) at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
         along_parameter = np.eye(len(start.xi))[-1] * direction
         return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
-
-    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds, where the parameter's component of the tangent changes sign, and other changes of stability."""
-        yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
-        yield from StabilityChanges(self, left, right).kinds()
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
         """Unknowns (n + 1,) of the state at the scaled parameter ``p`` near a ``guess``; raises ContinuationError."""

@@ -10,27 +10,90 @@ Two changes between neighbouring states that cancel are not seen, as where one p
 decay.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from vipetsc.case.nfrc import NfrcTable
+from vipetsc.modes.balance.harmonics import ForceSeries
+from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import NoMotionError, SpecialKind
-from vipetsc.modes.response.state import Response
-from vipetsc.modes.stability import AT_ZERO, Perturbations
-
-if TYPE_CHECKING:
-    from vipetsc.modes.response.equations import SteadyEquations
+from vipetsc.modes.response.state import Measures, Response
+from vipetsc.modes.response.turning import RangeProblem
+from vipetsc.modes.stability import AT_ZERO, Hill, Perturbations, Stability
 
 BRANCH_POINT = "branch-point"
 PERIOD_DOUBLING = "period-doubling"
 NEIMARK_SACKER = "neimark-sacker"
 
 
+# States whose stability is kept: the ends of a step, and one between them. Without special points one is enough.
+KEPT_STATES = 3
+
+
+class StatesWithStability(RangeProblem):
+    """Steady states, each given by its unknowns ``xi`` (n + 1,), whose perturbations Hill's determinant judges.
+
+    ``options`` are the section [nfrc] of the case.
+    """
+
+    def __init__(self, options: NfrcTable) -> None:
+        self.options = options
+        self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
+
+    @abstractmethod
+    def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
+        """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there."""
+
+    def stability(self, xi: np.ndarray) -> Stability:
+        """The stability of a state ``xi`` (n + 1,). The latest are kept, since neighbours on a curve are compared."""
+
+        def evaluate() -> Stability:
+            hill, series = self.hill_at(xi)
+            return hill.stability(series)
+
+        return self._stabilities.get(xi.tobytes(), evaluate)
+
+    @abstractmethod
+    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+        """The measures of the state ``xi`` (n + 1,) for its file.
+
+        Its growing ``perturbations`` are looked for unless they are given.
+        """
+
+    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
+        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
+        hill, series = self.hill_at(xi)
+        return float(hill.determinants(series, np.array([exponent]))[0].real)
+
+    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
+        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
+        hill, series = self.hill_at(xi)
+        return hill.pairs(series)
+
+    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
+        """lambda/Om of the pair of the state ``xi`` (n + 1,) near a ``guess``; raises NoMotionError without one."""
+        hill, series = self.hill_at(xi)
+        return hill.near(series, guess)
+
+    def least_growth(self, xi: np.ndarray) -> float:
+        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
+        hill, _ = self.hill_at(xi)
+        return hill.least
+
+    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
+        """Folds, where the parameter's component of the tangent changes sign, and other changes of stability."""
+        yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
+        yield from StabilityChanges(self, left, right).kinds()
+
+
 class StabilityChanges:
     """Changes of stability between two neighbouring states of a curve: those that ``nfrc.special_points`` asks for."""
 
-    def __init__(self, states: "SteadyEquations", left: Response, right: Response) -> None:
+    def __init__(self, states: "StatesWithStability", left: Response, right: Response) -> None:
         self.states = states
         self.left = left
         self.right = right
