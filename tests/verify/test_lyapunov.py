@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -9,6 +13,7 @@ from scipy.optimize import brentq
 from tests.conftest import StopAt
 from tests.verify.test_sections import IMPACT, RESTITUTION
 from vipetsc import Case, analyse, simulate
+from vipetsc.dynamics.lyapunov import LargestExponent
 
 EXPONENT = {"lyapunov": True}
 
@@ -147,3 +152,57 @@ def test_a_run_without_an_exponent_says_why():
     short = simulate(Case.from_table(EXPONENT_OF_CHAIN | {"time": EXPONENT_OF_CHAIN["time"] | {"end": 0.02}}))
     assert "lyapunov" not in short.statistics
     assert any("Lyapunov" in text and "time.end" in text for text in short.warnings)
+
+
+class Stopped:
+    """An engine of one mass that stands where it is: its ``cells`` (1, 2), and of a contact the mode and approach."""
+
+    def __init__(self, cells: list[float], mode: int, approach: float) -> None:
+        self.state = {
+            "cells": np.array([cells]),
+            "sites": np.array([(mode, approach)], [("mode", "i4"), ("approach", "f8")]),
+        }
+
+    def checkpoint(self) -> dict:
+        """Return a copy of the state."""
+        return {key: value.copy() for key, value in self.state.items()}
+
+    def restore(self, parts: list) -> None:
+        """Take the state of the only rank."""
+        (self.state,) = parts
+
+
+def compared(run: Stopped, companion: Stopped) -> LargestExponent:
+    """Return the observer after it has compared a ``companion`` with the ``run`` at 2 s, with the growth 0.5 before."""
+    observer = LargestExponent()
+    layout = SimpleNamespace(comm=MPI.COMM_SELF, cells=1, start=0, stop=1)
+    observer.setup = SimpleNamespace(engine=run, layout=layout)
+    observer.growth, observer.largest, observer.size, observer.last = [(1.0, 1.0, 0.5)], 1.0, 1e-6, 1.0
+    observer._frequency, observer._companion = 1.0, companion
+    observer._compare(run.checkpoint()["cells"], 2.0)
+    return observer
+
+
+def test_runs_are_compared_where_they_have_the_same_contacts_closed():
+    """Else the companion goes on as it is, and the growth is taken later."""
+    companion = Stopped([0.0, 1.5], 0, 0.0)
+    observer = compared(Stopped([0.0, 1.0], 1, 1.2), companion)
+    assert observer.growth == [(1.0, 1.0, 0.5)]
+    assert companion.state["cells"].tolist() == [[0.0, 1.5]]
+
+
+def test_a_closed_contact_has_its_approach_as_a_part_of_the_state():
+    """It is brought back with the state: 4e-6 beside a deviation of 8e-6 becomes 5e-7 beside one of 1e-6."""
+    companion = Stopped([0.0, 1.0 + 8e-6], 1, 1.2 + 4e-6)
+    observer = compared(Stopped([0.0, 1.0], 1, 1.2), companion)
+    assert observer.growth[-1] == pytest.approx((2.0, 1.0, np.log(8.0)), rel=1e-9)
+    assert companion.state["cells"][0, 1] - 1.0 == pytest.approx(1e-6, rel=1e-6)
+    assert companion.state["sites"]["approach"][0] - 1.2 == pytest.approx(5e-7, rel=1e-6)
+
+
+def test_a_deviation_that_vanishes_counts_with_the_smallest_of_a_double():
+    """The growth before stays, and a new deviation begins."""
+    companion = Stopped([0.0, 1.0], 0, 0.0)
+    observer = compared(Stopped([0.0, 1.0], 0, 0.0), companion)
+    assert [row[2] for row in observer.growth] == [0.5, pytest.approx(np.log(2.0**-52 / 1e-6))]
+    assert np.abs(companion.state["cells"] - [[0.0, 1.0]]).max() == pytest.approx(1e-6)
