@@ -185,7 +185,7 @@ def test_places_are_those_of_the_profile():
     springs = nonlinear_springs(chain)
     assert [*zip(springs.cell + 1, springs.number + 1, strict=True)] == sorted(TERMS)
     assert [(law.quadratic, law.cubic) for law in spring_laws(chain)] == [TERMS[key] for key in sorted(TERMS)]
-    assert springs.ends() == [(10, 11), (16, 18), (22, -1)]
+    assert springs.mass_pairs() == [(10, 11), (16, 18), (22, -1)]
     assert not chain.is_linear
     # With quadratic terms the force is not an odd function.
     assert not chain.is_odd

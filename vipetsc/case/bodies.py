@@ -10,7 +10,7 @@ from vipetsc.lattice.cell import GROUND, connected_groups
 def contact_ends(chain: Chain) -> list[tuple[int, int]]:
     """Numbers of the host and of the resonator of each site: 0 for the ground, masses from 1 on, cell by cell."""
     # The ground is the number -1 of a contact's ends.
-    return [(1 + host, 1 + resonator) for host, resonator in contacts(chain).ends()]
+    return [(1 + host, 1 + resonator) for host, resonator in contacts(chain).mass_pairs()]
 
 
 def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:

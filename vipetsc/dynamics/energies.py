@@ -20,7 +20,7 @@ from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import relative_motion
-from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, damping_powers, displacement, is_varied
+from vipetsc.dynamics.springs import CHUNK, damping_powers, is_varied, spring_energies
 
 _FINE_BITS = 52
 _FINE = 2.0**_FINE_BITS  # multiples of the finer remainder in one unit
@@ -99,44 +99,6 @@ def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energie
 
 
 @kernel
-def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
-    """Spring energies of the cells from ``first`` on: springs to the next cell, and the first one's to a left wall."""
-    shape = lattice.shape
-    n = lattice.shape.cells
-    energies[:] = 0.0
-    if is_varied(lattice):
-        add_squares(y, lattice, first, 0, lattice.stiffness, energies)
-        for i in range(energies.size):
-            energies[i] *= 0.5
-        return
-
-    for s in range(lattice.springs.size):
-        spring = lattice.springs[s]
-        if spring.start < 0:
-            moved = y[spring.end * n + first :][: energies.size]
-            for i in range(energies.size):
-                energies[i] += 0.5 * spring.stiffness * moved[i] * moved[i]
-            continue
-
-        # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
-        leaves = spring.offset == 1 and first + energies.size == n
-        inside = energies.size - leaves
-        begin = spring.start * n + first
-        end = spring.end * n + first + spring.offset
-        here = y[begin : begin + inside]
-        other = y[end : end + inside]
-
-        for i in range(inside):
-            elongation = other[i] - here[i]
-            energies[i] += 0.5 * spring.stiffness * elongation * elongation
-        if leaves and not shape.right_free:
-            elongation = displacement(y, lattice, n, spring.end) - y[spring.start * n + n - 1]
-            energies[inside] += 0.5 * spring.stiffness * elongation * elongation
-        if spring.offset == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
-            energies[0] += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
-
-
-@kernel
 def _contact_energy(site: Any, w: float) -> float:
     """Elastic energy in J of a ``SITE`` at w, beyond that of the static state where a load holds it pressed."""
     energy = elastic_energy(site.elastic, max(w - site.clearance, -w - site.clearance_minus))
@@ -155,9 +117,7 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray
         energies = room[: shape.cells - first]
         _kinetic_energies(y, lattice, first, energies)
         _add(sums, _KINETIC, energies, unit)
-        _spring_energies(y, lattice, first, energies)
-        if lattice.nonlinear.size > 0:
-            add_nonlinear_energies(y, lattice, first, energies)
+        spring_energies(y, lattice, first, energies)
         _add(sums, _SPRING, energies, unit)
 
     owned = 0

@@ -21,7 +21,7 @@ def acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mas
     """
     per_mass = inverse_mass(lattice, cell, mass)
     total = spring_acceleration(y, lattice, cell, mass) + force * per_mass
-    if lattice.nonlinear.size > 0:
+    if lattice.spring_laws.size > 0:
         total += nonlinear_force_on(y, lattice, cell, mass) * per_mass
     for i in range(lattice.drives.rows.size):
         if lattice.drives.rows[i].target == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:

@@ -22,7 +22,7 @@ def failing_place(setup: Setup) -> str:
 
     chain = setup.model.chain
     place = f"cell {fastest + 1}"
-    nearest = chain.topology.nearest(chain.sites, fastest)
+    nearest = chain.topology.nearest_index(chain.sites, fastest)
     if nearest is not None:
         place += f", nearest site {nearest + 1} in cell {chain.sites[nearest] + 1}"
     limits = _elongations_without_force(chain, fastest)

@@ -11,38 +11,31 @@ from vipetsc.dynamics.drives import DRIVE, Drives, create_drives
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import SITE_DOFS, create_site_dofs, site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
-from vipetsc.lattice import Chain
+from vipetsc.lattice import Chain, UnitCell
 from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.drive import PIECE
-from vipetsc.lattice.topology import NONE
+from vipetsc.lattice.topology import WALL
 from vipetsc.records import Record, record_type
 
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
-COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
-"""A spring as one of its masses sees it: cells to the other mass, that mass (-1: ground), N/m, the spring's number."""
-NONLINEAR = np.dtype(
-    [(name, np.int64) for name in ("mass", "offset", "other", "law", "stride")] + [("sign", np.float64)]
-)
-"""A nonlinear spring as one of its masses sees it: ``mass``, and the ``other`` mass, which is ``offset`` cells further.
+_INTEGERS = ("mass", "offset", "other", "spring", "law", "stride", "outside_u", "outside_v")
+COUPLING = np.dtype([(name, np.int64) for name in _INTEGERS] + [(name, np.float64) for name in ("sign", "stiffness")])
+"""A spring as one of its masses sees it, as ``lattice.cell.Coupling``, for a rank's cells.
 
-``other`` is -1 for the ground.
-``law`` is the number of its law in the rank's first cell, ``stride`` the step from a cell's law to the next cell's, 0
-if all have one. ``sign`` is 1 where ``mass`` is the spring's ``start`` and -1 where it is its ``end``: the elongation
-is ``sign`` times the displacement of the other mass less that of this one.
+``law`` is the number of its nonlinear part in the rank's first cell, -1 without one, and ``stride`` the step from a
+cell's law to the next cell's, 0 if all have one. ``outside_u`` and ``outside_v`` are the components of displacement and
+velocity of the other mass where it is not in the rank's cells, ``WALL``, which the ground is, too, or ``NOTHING``.
 """
-SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("offset", np.int64), ("stiffness", np.float64)])
-"""A spring of the cell: its masses, ``end`` being ``offset`` cells further and ``start`` -1 for the ground; N/m."""
 
 
 class Shape(NamedTuple):
     """Sizes and indices of a rank's part of the lattice; an index is -1 where the rank has no such thing.
 
     ``owned`` and ``ghosted`` count the state's components without and with ghosts; ``exchange`` says whether ghosts
-    must be fetched, ``paired`` whether contacts join other masses than the cell's pair. ``left_ghost`` and
-    ``right_ghost`` are the first components of the neighbouring cells; ``left_free`` and ``right_free`` say whether the
-    lattice has a free end there. ``work``, ``dissipated`` and ``damping`` are the components of the first drive's work,
-    of the energies that the first site and the first cell's dashpots have dissipated.
+    must be fetched, ``paired`` whether contacts join other masses than the cell's pair. ``work``, ``dissipated`` and
+    ``damping`` are the components of the first drive's work, of the energies that the first site and the first cell's
+    dashpots have dissipated.
     """
 
     cells: int
@@ -51,10 +44,6 @@ class Shape(NamedTuple):
     owned: int
     ghosted: int
     exchange: bool
-    left_ghost: int
-    right_ghost: int
-    left_free: bool
-    right_free: bool
     work: int
     dissipated: int
     damping: int
@@ -63,8 +52,10 @@ class Shape(NamedTuple):
 class LatticeRecord(NamedTuple):
     """A rank's part of a lattice: sizes, tables of the dtypes above, its sites and its drives.
 
+    ``couplings`` are in the order of their masses; ``spring_ends`` are their numbers in the order of the springs, each
+    spring's start before its end.
     ``site_dofs`` (site,) of dtype ``SITE_DOFS`` and ``contacts`` (site,) of dtype ``SITE`` are those of the same sites.
-    ``spring_laws`` (law,) of dtype ``SPRING_LAW`` are those that ``nonlinear`` refers to.
+    ``spring_laws`` (law,) of dtype ``SPRING_LAW`` are those that ``couplings`` refer to.
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
     ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where there are dashpots
     ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
@@ -73,11 +64,10 @@ class LatticeRecord(NamedTuple):
     shape: Shape
     masses: np.ndarray
     couplings: np.ndarray
-    springs: np.ndarray
+    spring_ends: np.ndarray
     site_dofs: np.ndarray
     contacts: np.ndarray
     drives: Drives
-    nonlinear: np.ndarray
     spring_laws: np.ndarray
     inverse_masses: np.ndarray
     grounding: np.ndarray
@@ -96,21 +86,20 @@ def create_record(model: Model, layout: Layout) -> Record:
         row["target"] = (layout.dofs + drive.mass) * layout.owned + drive.cell - layout.start
         row["inverse"] = 1 / chain.coefficients(drive.cell, drive.cell + 1).masses[0, drive.mass]
 
+    laws, laws_of_springs = _spring_laws(chain, layout)
+    couplings = _couplings(cell, layout, laws_of_springs)
     # Couplings are in the order of their masses: a mass has consecutive rows.
-    couplings = cell.couplings()
-    rows = np.searchsorted([coupling.mass for coupling in couplings], np.arange(layout.dofs + 1)).tolist()
+    rows = np.searchsorted(couplings["mass"], np.arange(layout.dofs + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
     inverse_masses, grounding, stiffness, damping = _coefficients(chain, layout)
-    nonlinear, laws = _nonlinear_couplings(chain, layout)
     lattice = LatticeRecord(
         shape=shape,
         masses=np.array(masses, MASS),
-        couplings=np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
-        springs=np.array([(s.start, s.end, s.offset, s.stiffness) for s in cell.springs], SPRING),
+        couplings=couplings,
+        spring_ends=np.lexsort((-couplings["sign"], couplings["spring"])),
         site_dofs=create_site_dofs(model, layout),
         contacts=site_records(model, layout.contacts),
         drives=drives,
-        nonlinear=nonlinear,
         spring_laws=laws,
         inverse_masses=inverse_masses,
         grounding=grounding,
@@ -127,11 +116,10 @@ def empty_record() -> LatticeRecord:
         shape=Shape(**{name: kind() for name, kind in get_type_hints(Shape).items()}),
         masses=np.zeros(0, MASS),
         couplings=np.zeros(0, COUPLING),
-        springs=np.zeros(0, SPRING),
+        spring_ends=np.zeros(0, np.int64),
         site_dofs=np.zeros(0, SITE_DOFS),
         contacts=np.zeros(0, SITE),
         drives=Drives(np.zeros(0, DRIVE), np.zeros(0, PIECE)),
-        nonlinear=np.zeros(0, NONLINEAR),
         spring_laws=np.zeros(0, SPRING_LAW),
         inverse_masses=none,
         grounding=none,
@@ -146,8 +134,6 @@ LATTICE = record_type(empty_record())
 
 def _create_shape(chain: Chain, layout: Layout) -> Shape:
     """Sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
-    left, right = layout.neighbours()
-    left_ghost, right_ghost = layout.ghost_places()
     damping = -1
     if layout.integrates_damping:
         damping = 2 * layout.dofs * layout.owned
@@ -159,40 +145,55 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
         owned=layout.size,
         ghosted=layout.size + layout.ghost_rows * len(layout.ghosts),
         exchange=layout.comm.size > 1 or layout.topology.is_ring,
-        left_ghost=left_ghost,
-        right_ghost=right_ghost,
-        left_free=left == NONE,
-        right_free=right == NONE,
         work=layout.rows * layout.owned,
         dissipated=layout.dissipated,
         damping=damping,
     )
 
 
-def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of each of a cell's springs that is nonlinear in some cell, of dtype ``NONLINEAR``, and the laws."""
+def _spring_laws(chain: Chain, layout: Layout) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
+    """Nonlinear parts of the rank's springs; by the number of each spring that has one, its first law and stride."""
     if chain.is_linear:
-        return np.zeros(0, NONLINEAR), np.zeros(0, SPRING_LAW)
+        return np.zeros(0, SPRING_LAW), {}
     # One law of each spring where cells have equal ones; else one for each cell, from that before the first one on.
     table = np.stack(chain.spring_terms(layout.start - 1, layout.stop), axis=-1)
     if np.array_equal(table, np.broadcast_to(table[:1], table.shape)):
         table = table[:1]
-    numbers = np.flatnonzero(table.any(axis=(0, 2)))
+    numbers = np.flatnonzero(table.any(axis=(0, 2))).tolist()
     per_spring = len(table)
     stride = int(per_spring > 1)
 
-    couplings = []
-    for row, number in enumerate(numbers.tolist()):
-        spring = chain.cell.springs[number]
-        own_law = row * per_spring + stride
-        if spring.start != GROUND:
-            couplings.append((spring.start, spring.offset, spring.end, own_law, stride, 1.0))
-        # The law of a spring from the cell before is stored with that cell.
-        couplings.append((spring.end, -spring.offset, spring.start, own_law - stride * spring.offset, stride, -1.0))
     laws = np.zeros(len(numbers) * per_spring, SPRING_LAW)
     for place, name in enumerate(SPRING_LAW.names or ()):
         laws[name] = table[:, numbers, place].T.ravel()
-    return np.array(couplings, NONLINEAR), laws
+    return laws, {number: (row * per_spring + stride, stride) for row, number in enumerate(numbers)}
+
+
+def _couplings(cell: UnitCell, layout: Layout, laws: dict[int, tuple[int, int]]) -> np.ndarray:
+    """The couplings (coupling,) of dtype ``COUPLING`` of a ``cell``, whose springs have the ``laws``."""
+    left_ghost, right_ghost = layout.ghost_places()
+    couplings = cell.couplings()
+    rows = np.zeros(len(couplings), COUPLING)
+    for row, coupling in zip(rows, couplings, strict=True):
+        for name in ("mass", "offset", "other", "spring", "sign", "stiffness"):
+            row[name] = getattr(coupling, name)
+
+        law, stride = laws.get(coupling.spring, (-1, 0))
+        # The law of a spring from the cell before is stored with that cell.
+        row["law"] = law + stride * min(coupling.offset, 0)
+        row["stride"] = stride
+
+        outside = right_ghost
+        if coupling.offset < 0:
+            outside = left_ghost
+        if coupling.other == GROUND:
+            outside = WALL
+        row["outside_u"] = outside
+        row["outside_v"] = outside
+        if outside >= 0:
+            row["outside_u"] += coupling.other
+            row["outside_v"] += layout.dofs + coupling.other
+    return rows
 
 
 def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
 from vipetsc.lattice import Chain, contacts
-from vipetsc.lattice.topology import NONE, WALL
+from vipetsc.lattice.topology import NOTHING, WALL
 
 LEDGER = np.dtype([("number", np.int64), ("energy", np.float64)])
 """A drive or a site, from 0, and its work or its dissipated energy in J."""
@@ -65,9 +65,9 @@ class Layout:
         self._is_own = np.isin(self.contacts, self.sites)
 
     def neighbours(self) -> tuple[int, int]:
-        """Return the cells to the left and to the right of this rank's, ``WALL`` or ``NONE``, as on an empty rank."""
+        """Return the cells next to this rank's on the left and right, ``WALL`` or ``NOTHING``, as on an empty rank."""
         if not self.owned:
-            return NONE, NONE
+            return NOTHING, NOTHING
         left, right = self.topology.neighbour([self.start, self.stop - 1], [-1, 1]).tolist()
         return left, right
 
@@ -77,10 +77,15 @@ class Layout:
         return [cell for cell in self.neighbours() if cell >= 0]
 
     def ghost_places(self) -> tuple[int, int]:
-        """Return the first components of the ghosts on the left and on the right, -1 where there is none."""
+        """Return the first components of the ghosts on the left and on the right, ``WALL`` or ``NOTHING``."""
         left, right = self.neighbours()
-        after_left = self.size + self.ghost_rows * (left >= 0)
-        return (self.size if left >= 0 else -1), (after_left if right >= 0 else -1)
+        first = self.size
+        if left >= 0:
+            left = first
+            first += self.ghost_rows
+        if right >= 0:
+            right = first
+        return left, right
 
     def components(self, masses: np.ndarray) -> np.ndarray:
         """Return where the state with its ghosts has displacement and velocity (mass, 2) of ``masses`` (mass,).

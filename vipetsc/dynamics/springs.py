@@ -1,13 +1,14 @@
 """Compiled accelerations by springs and dashpots, and the energies and powers of these.
 
 A mass m feels from each spring of the stiffness k, with a dashpot c parallel to it, the force k (u_other - u) + c
-(v_other - v), and from its dashpot to the ground -c_g v; ``spring_accelerations`` divides the sum by m. ``add_squares``
-sums k z^2, twice the energy, and c z'^2, the power, over the elongations z. The nonlinear parts of springs have
-functions of their own (``dynamics.spring_law``).
+(v_other - v), from its dashpot to the ground -c_g v, and from the nonlinear parts of springs what
+``dynamics.spring_law`` gives; ``spring_accelerations`` divides the sum of the linear parts by m. The energies are sums
+of k z^2/2 over the elongations z, the powers of c z'^2.
 
 A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
 result does not depend on the partition, to the last bit. Where all cells are alike and undamped, a mass and a spring
-have one number each; else (``is_varied``) each cell has its own, and the sums are the same.
+have one number each; else (``is_varied``) each cell has its own, and the sums are the same. Where a spring leaves the
+rank's cells, its ``COUPLING`` says whether its other end is a ghost, in a wall or nowhere.
 """
 
 from typing import Any
@@ -17,39 +18,12 @@ import numpy as np
 from vipetsc.compiled import kernel
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.spring_law import nonlinear_energy, nonlinear_force
+from vipetsc.lattice.topology import NOTHING, WALL
 
 # Cells in one pass: a pass over the springs of a mass touches a row of each of its neighbours and one of the result,
 # 4 kB each of so many cells, which stay in a first-level cache of 32 kB. Not sharp where the second level is near: 256
 # to 2048 take the same CPU time of ``ts`` at 20,000 cells, to the 7 % of its scatter, and give the same bits.
 CHUNK = 512
-
-
-@kernel
-def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall.
-
-    A ``mass`` of dofs + j stands for the velocity in m/s of mass j, which lies there in ``y`` (component,). Ghosts have
-    velocities only where there are dashpots or contacts join cells (``Layout.ghost_rows``).
-    """
-    shape = lattice.shape
-    if 0 <= cell < shape.cells:
-        return y[mass * shape.cells + cell]
-
-    # The rank's first component of the neighbouring cell; a lattice ends without one, in a wall.
-    ghost = shape.left_ghost
-    if cell >= shape.cells:
-        ghost = shape.right_ghost
-    if ghost < 0:
-        return 0.0
-    return y[ghost + mass]
-
-
-@kernel
-def _far_end(y: np.ndarray, lattice: LatticeRecord, coupling: Any, cell: int, half: int) -> float:
-    """Displacement in m of the other end of a ``coupling`` of ``cell``, with ``half`` = dofs its velocity in m/s."""
-    if coupling.other < 0:
-        return 0.0
-    return displacement(y, lattice, cell + coupling.offset, half + coupling.other)
 
 
 @kernel
@@ -67,13 +41,6 @@ def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
 
 
 @kernel
-def _is_beyond_free_end(lattice: LatticeRecord, cell: int) -> bool:
-    """Whether a ``cell`` next to the owned ones does not exist, so that no spring goes there."""
-    shape = lattice.shape
-    return (cell < 0 and shape.left_free) or (cell >= shape.cells and shape.right_free)
-
-
-@kernel
 def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
     """Where ``stiffness`` and ``damping`` have the spring of a ``coupling`` of the owned ``cell``."""
     # A spring between two cells is listed with the left one. Each spring's row of the tables therefore begins with the
@@ -83,30 +50,34 @@ def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
 
 
 @kernel
-def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Acceleration of one mass as by ``spring_acceleration``, with the cell's own numbers and dashpots."""
-    shape = lattice.shape
-    n = shape.cells
-    d = shape.dofs
-    is_damped = lattice.damping.size > 0
+def _stiffness(lattice: LatticeRecord, coupling: Any, cell: int) -> float:
+    """Stiffness in N/m of the spring of a ``coupling`` of the owned ``cell``."""
+    if is_varied(lattice):
+        return lattice.stiffness[_table_entry(lattice, coupling, cell)]
+    return coupling.stiffness
 
-    # Sum of k (u_other - u) + c (v_other - v) over the springs and the dashpots parallel to them.
-    force = 0.0
-    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
-        coupling = lattice.couplings[s]
-        other_cell = cell + coupling.offset
-        if _is_beyond_free_end(lattice, other_cell):
-            continue
-        entry = _table_entry(lattice, coupling, cell)
-        difference = _far_end(y, lattice, coupling, cell, 0) - y[mass * n + cell]
-        force += lattice.stiffness[entry] * difference
-        if is_damped:
-            rate = _far_end(y, lattice, coupling, cell, d) - y[(d + mass) * n + cell]
-            force += lattice.damping[entry] * rate
 
-    if is_damped:
-        force -= lattice.grounding[mass * n + cell] * y[(d + mass) * n + cell]
-    return force * lattice.inverse_masses[mass * n + cell]
+@kernel
+def _other_end(lattice: LatticeRecord, coupling: Any, cell: int) -> tuple[int, int]:
+    """Where the state has displacement and velocity of the other mass of a ``coupling`` of the owned ``cell``.
+
+    ``WALL`` or ``NOTHING`` where there is no mass. Ghosts have velocities only where there are dashpots or contacts
+    join cells (``Layout.ghost_rows``).
+    """
+    n = lattice.shape.cells
+    other_cell = cell + coupling.offset
+    if coupling.other >= 0 and 0 <= other_cell < n:
+        u = coupling.other * n + other_cell
+        return u, u + lattice.shape.dofs * n
+    return coupling.outside_u, coupling.outside_v
+
+
+@kernel
+def _value(y: np.ndarray, component: int) -> float:
+    """Displacement or velocity that ``y`` has at a ``component``; zero in a wall."""
+    if component < 0:
+        return 0.0
+    return y[component]
 
 
 @kernel
@@ -116,18 +87,25 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
     ``y`` (component,) is the rank's part of the state, with ghosts. The sums are those of the chunked loops, bit for
     bit.
     """
-    if is_varied(lattice):
-        return _varied_acceleration(y, lattice, cell, mass)
+    n = lattice.shape.cells
+    here = y[mass * n + cell]
+    rate = y[(lattice.shape.dofs + mass) * n + cell]
+    is_damped = lattice.damping.size > 0
 
-    here = y[mass * lattice.shape.cells + cell]
+    # Sum of k (u_other - u) + c (v_other - v) over the springs and the dashpots parallel to them.
     force = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        other_cell = cell + coupling.offset
-        if _is_beyond_free_end(lattice, other_cell):
+        u, v = _other_end(lattice, coupling, cell)
+        if u == NOTHING:
             continue
-        force += coupling.stiffness * (_far_end(y, lattice, coupling, cell, 0) - here)
-    return force * lattice.masses[mass].inverse_mass
+        force += _stiffness(lattice, coupling, cell) * (_value(y, u) - here)
+        if is_damped:
+            force += lattice.damping[_table_entry(lattice, coupling, cell)] * (_value(y, v) - rate)
+
+    if is_damped:
+        force -= lattice.grounding[mass * n + cell] * rate
+    return force * inverse_mass(lattice, cell, mass)
 
 
 @kernel
@@ -159,64 +137,62 @@ def _add_varied_ground(forces: np.ndarray, here: np.ndarray, factors: np.ndarray
 
 
 @kernel
-def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, first: int, out: np.ndarray) -> None:
-    """Accelerations of a mass in the cells from ``first`` on, whose neighbours are all owned."""
+def _add_spring(
+    forces: np.ndarray, y: np.ndarray, lattice: LatticeRecord, coupling: Any, first: int, is_damped: bool
+) -> None:
+    """Add to the ``forces`` (cell,) in N on a mass that of one of its springs, in cells from ``first`` on.
+
+    The spring is that of a ``coupling``; all neighbours of the cells are owned.
+    """
     n = lattice.shape.cells
-    count = out.size
-    is_damped = lattice.damping.size > 0
-    # Components of the state: the mass's displacements in these cells, and its velocities, all displacements later.
-    begin = mass * n + first
     velocities = lattice.shape.dofs * n
-    here = y[begin:][:count]
-    rate = y[velocities + begin :][:count]
+    here = y[coupling.mass * n + first :][: forces.size]
+    rate = y[velocities + coupling.mass * n + first :][: forces.size]
+    other = coupling.other * n + coupling.offset + first
+    is_ground = coupling.other < 0
+    if not is_varied(lattice):
+        if is_ground:
+            _add_equal_ground(forces, here, coupling.stiffness)
+        else:
+            _add_equal_springs(forces, y[other:][: forces.size], here, coupling.stiffness)
+        return
 
-    # Forces first, as sums over the springs in the cell's order.
-    out[:] = 0.0
-    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
-        coupling = lattice.couplings[s]
-        other = coupling.other * n + coupling.offset + first
-        entry = _table_entry(lattice, coupling, first)
-        if coupling.other < 0:
-            _add_varied_ground(out, here, lattice.stiffness[entry:])
-            if is_damped:
-                _add_varied_ground(out, rate, lattice.damping[entry:])
-            continue
-        _add_varied_springs(out, y[other:][:count], here, lattice.stiffness[entry:])
-        if is_damped:
-            _add_varied_springs(out, y[velocities + other :][:count], rate, lattice.damping[entry:])
-
-    if is_damped:
-        for i in range(count):
-            out[i] -= lattice.grounding[begin + i] * rate[i]
-    for i in range(count):
-        out[i] *= lattice.inverse_masses[begin + i]
+    entry = _table_entry(lattice, coupling, first)
+    if is_ground:
+        _add_varied_ground(forces, here, lattice.stiffness[entry:])
+    else:
+        _add_varied_springs(forces, y[other:][: forces.size], here, lattice.stiffness[entry:])
+    if is_damped and is_ground:
+        _add_varied_ground(forces, rate, lattice.damping[entry:])
+    elif is_damped:
+        _add_varied_springs(forces, y[velocities + other :][: forces.size], rate, lattice.damping[entry:])
 
 
 @kernel
 def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
     """Accelerations (cells,) of a mass by its springs and dashpots, in chunks of cells whose neighbours are owned."""
     n = acceleration.size
-    here = y[mass * n : (mass + 1) * n]
     row = lattice.masses[mass]
-    inverse = lattice.masses[mass].inverse_mass
+    is_damped = lattice.damping.size > 0
     for first in range(1, n - 1, CHUNK):
-        stop = min(first + CHUNK, n - 1)
-        out = acceleration[first:stop]
-        if is_varied(lattice):
-            _varied_accelerations(y, lattice, mass, first, out)
-            continue
+        out = acceleration[first : min(first + CHUNK, n - 1)]
+        begin = mass * n + first
 
-        # Forces first, as sums over the springs in the cell's order; those of a mass are equal in all cells.
+        # Forces first, as sums over the springs in the cell's order; where cells are equal, those of a mass are, too.
         out[:] = 0.0
         for s in range(row.first, row.last):
-            coupling = lattice.couplings[s]
-            if coupling.other < 0:
-                _add_equal_ground(out, here[first:stop], coupling.stiffness)
-                continue
-            others = coupling.other * n + coupling.offset
-            _add_equal_springs(out, y[others + first : others + stop], here[first:stop], coupling.stiffness)
-        for i in range(out.size):
-            out[i] *= inverse
+            _add_spring(out, y, lattice, lattice.couplings[s], first, is_damped)
+        if is_damped:
+            _add_varied_ground(out, y[lattice.shape.dofs * n + begin :][: out.size], lattice.grounding[begin:])
+
+        if is_varied(lattice):
+            inverse_masses = lattice.inverse_masses[begin:]
+            for i in range(out.size):
+                out[i] *= inverse_masses[i]
+        else:
+            inverse = row.inverse_mass
+            for i in range(out.size):
+                out[i] *= inverse
 
     # The first and the last cell have neighbours among the ghosts, or walls, or none.
     if n > 0:
@@ -226,14 +202,12 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
 
 
 @kernel
-def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> float:
-    """Elongation in m of the ``nonlinear`` spring ``s`` of a ``cell``; 0 of one beyond a free end."""
-    coupling = lattice.nonlinear[s]
-    other_cell = cell + coupling.offset
-    if _is_beyond_free_end(lattice, other_cell):
+def _elongation(y: np.ndarray, lattice: LatticeRecord, coupling: Any, cell: int) -> float:
+    """Elongation in m of the spring of a ``coupling`` of the owned ``cell``; 0 of one beyond a free end."""
+    other, _ = _other_end(lattice, coupling, cell)
+    if other == NOTHING:
         return 0.0
-    here = y[coupling.mass * lattice.shape.cells + cell]
-    return coupling.sign * (_far_end(y, lattice, coupling, cell, 0) - here)
+    return coupling.sign * (_value(y, other) - y[coupling.mass * lattice.shape.cells + cell])
 
 
 @kernel
@@ -243,68 +217,130 @@ def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: i
     ``y`` (component,) is the rank's part of the state, with ghosts.
     """
     total = 0.0
-    for s in range(lattice.nonlinear.size):
-        coupling = lattice.nonlinear[s]
-        if coupling.mass == mass:
+    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
+        coupling = lattice.couplings[s]
+        if coupling.law >= 0:
             law = lattice.spring_laws[coupling.law + coupling.stride * cell]
-            total += coupling.sign * nonlinear_force(law, _elongation(y, lattice, s, cell))
+            total += coupling.sign * nonlinear_force(law, _elongation(y, lattice, coupling, cell))
     return total
 
 
 @kernel
-def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
-    """Add energies in J of springs beyond their linear parts to ``energies`` (cell,), of the cells from ``first`` on.
+def add_nonlinear_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
+    """Add to the accelerations (cells,) of a mass those by the nonlinear parts of its springs."""
+    n = acceleration.size
+    row = lattice.masses[mass]
+    # As ``nonlinear_force_on``, but all neighbours are owned.
+    forces = np.empty(min(CHUNK, n))
+    for first in range(1, n - 1, CHUNK):
+        out = acceleration[first : min(first + CHUNK, n - 1)]
+        here = y[mass * n + first :][: out.size]
+        forces[:] = 0.0
+        for s in range(row.first, row.last):
+            coupling = lattice.couplings[s]
+            if coupling.law < 0:
+                continue
+            laws = lattice.spring_laws[coupling.law + coupling.stride * first :]
+            stride = coupling.stride
+            sign = coupling.sign
+            if coupling.other < 0:
+                for i in range(out.size):
+                    forces[i] -= nonlinear_force(laws[stride * i], here[i])
+                continue
+            other = y[coupling.other * n + coupling.offset + first :]
+            for i in range(out.size):
+                forces[i] += sign * nonlinear_force(laws[stride * i], sign * (other[i] - here[i]))
+        for i in range(out.size):
+            out[i] += forces[i] * inverse_mass(lattice, first + i, mass)
 
-    ``y`` (component,) is the rank's part of the state, with ghosts. A spring to a wall on the left is the first cell's.
-    """
-    for s in range(lattice.nonlinear.size):
-        coupling = lattice.nonlinear[s]
-        for i in range(energies.size):
-            # ``nonlinear`` has a spring twice, once for each of its masses. It counts at its start (sign +), and if it
-            # starts in the wall on the left, where no cell is, or in the ground, at its end.
-            at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
-            if coupling.sign > 0.0 or at_wall or coupling.other < 0:
-                law = lattice.spring_laws[coupling.law + coupling.stride * (first + i)]
-                energies[i] += nonlinear_energy(law, _elongation(y, lattice, s, first + i))
+    if n > 0:
+        acceleration[0] += nonlinear_force_on(y, lattice, 0, mass) * inverse_mass(lattice, 0, mass)
+    if n > 1:
+        acceleration[n - 1] += nonlinear_force_on(y, lattice, n - 1, mass) * inverse_mass(lattice, n - 1, mass)
 
 
 @kernel
-def add_squares(
-    y: np.ndarray, lattice: LatticeRecord, first: int, half: int, values: np.ndarray, sums: np.ndarray
-) -> None:
-    """Add to ``sums`` (cell,), of cells from ``first`` on, value times elongation squared of each of their springs.
+def spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
+    """Put the energies in J of the springs of the owned cells from ``first`` on into ``energies`` (cell,).
 
-    ``y`` (component,) is the rank's part of the state, with ghosts. ``values`` (spring and cell,) is the lattice's
-    table ``stiffness`` in N/m with ``half`` 0, or ``damping`` in N s/m with ``half`` = dofs: the square is then that of
-    the elongation's rate. A spring to a wall on the left is the first cell's.
+    ``y`` (component,) is the rank's part of the state, with ghosts. A spring belongs to the cell of its start. One that
+    starts on the ground or in the wall on the left belongs to that of its end.
     """
-    shape = lattice.shape
-    n = lattice.shape.cells
-    for s in range(lattice.springs.size):
-        spring = lattice.springs[s]
-        start = half + spring.start
-        end = half + spring.end
-        factors = values[s * (n + 1) + 1 + first :]
-        if spring.start < 0:
-            moved = y[end * n + first :][: sums.size]
-            for i in range(sums.size):
-                sums[i] += factors[i] * moved[i] * moved[i]
+    energies[:] = 0.0
+    for s in lattice.spring_ends:
+        _add_squares(y, lattice, lattice.couplings[s], first, False, energies)
+    for i in range(energies.size):
+        energies[i] *= 0.5
+    if lattice.spring_laws.size == 0:
+        return
+
+    for s in lattice.spring_ends:
+        coupling = lattice.couplings[s]
+        if coupling.law < 0:
             continue
+        for i in range(_cells_with(coupling, first, energies.size)):
+            law = lattice.spring_laws[coupling.law + coupling.stride * (first + i)]
+            energies[i] += nonlinear_energy(law, _elongation(y, lattice, coupling, first + i))
 
-        # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
-        leaves = spring.offset == 1 and first + sums.size == n
-        inside = sums.size - leaves
-        here = y[start * n + first :][:inside]
-        other = y[end * n + first + spring.offset :][:inside]
 
+@kernel
+def _cells_with(coupling: Any, first: int, cells: int) -> int:
+    """How many of so many ``cells`` from ``first`` on have the energy of the spring of a ``coupling``.
+
+    A spring is there twice, once for each of its masses. It counts at its start, and at its end if it starts on the
+    ground, or in the wall on the left, next to which there is the first cell.
+    """
+    if coupling.sign > 0 or coupling.other < 0:
+        return cells
+    if first == 0 and coupling.offset < 0 and coupling.outside_u == WALL:
+        return min(cells, 1)
+    return 0
+
+
+@kernel
+def _add_squares(
+    y: np.ndarray, lattice: LatticeRecord, coupling: Any, first: int, of_dashpots: bool, sums: np.ndarray
+) -> None:
+    """Add k z^2 of the spring of a ``coupling`` to the ``sums`` (cell,) of cells from ``first`` on.
+
+    If ``of_dashpots``, it is c z'^2 of the dashpot. ``y`` (component,) is the rank's part of the state, with ghosts.
+    """
+    n = lattice.shape.cells
+    half = 0
+    values = lattice.stiffness
+    outside = coupling.outside_u
+    if of_dashpots:
+        half = lattice.shape.dofs * n
+        values = lattice.damping
+        outside = coupling.outside_v
+    count = _cells_with(coupling, first, sums.size)
+    here = y[half + coupling.mass * n + first :][:count]
+
+    # The other end of a spring that leaves the rank's cells is among the ghosts, in a wall or nowhere.
+    inside = count
+    if coupling.other < 0 or coupling.offset < 0:
+        inside = 0
+    elif coupling.offset > 0 and first + count == n:
+        inside -= 1
+    other = y[half + coupling.other * n + first + coupling.offset :][:inside]
+    factor = coupling.stiffness
+    if values.size > 0:
+        factors = values[_table_entry(lattice, coupling, first) :]
         for i in range(inside):
             elongation = other[i] - here[i]
             sums[i] += factors[i] * elongation * elongation
-        if leaves and not shape.right_free:
-            elongation = displacement(y, lattice, n, end) - y[start * n + n - 1]
-            sums[inside] += factors[inside] * elongation * elongation
-        if spring.offset == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
-            sums[0] += values[s * (n + 1)] * y[end * n] * y[end * n]
+    else:
+        for i in range(inside):
+            elongation = other[i] - here[i]
+            sums[i] += factor * elongation * elongation
+
+    if outside == NOTHING:
+        return
+    for i in range(inside, count):
+        if values.size > 0:
+            factor = values[_table_entry(lattice, coupling, first + i)]
+        elongation = _value(y, outside) - here[i]
+        sums[i] += factor * elongation * elongation
 
 
 @kernel
@@ -315,13 +351,14 @@ def damping_powers(y: np.ndarray, lattice: LatticeRecord, first: int, powers: np
     """
     n = lattice.shape.cells
     d = lattice.shape.dofs
-    # A rank without cells has no first and no last one, to which ``add_squares`` would add dashpots to walls.
+    # A rank without cells has no first and no last one, with dashpots to walls.
     if n == 0:
         return
 
     # c (v_other - v)^2 of the dashpots parallel to springs, then c v^2 of those to the ground.
     powers[:] = 0.0
-    add_squares(y, lattice, first, d, lattice.damping, powers)
+    for s in lattice.spring_ends:
+        _add_squares(y, lattice, lattice.couplings[s], first, True, powers)
     for mass in range(d):
         rate = y[(d + mass) * n + first :][: powers.size]
         ground = lattice.grounding[mass * n + first :][: powers.size]

@@ -124,7 +124,7 @@ def first_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     case = tomllib.loads(run.attrs["case"])
     lattice = case["lattice"]
-    return Topology(lattice["cells"], lattice["ends"]).nearest(run["sites/cell"].values, case["drive"]["cell"])
+    return Topology(lattice["cells"], lattice["ends"]).nearest_index(run["sites/cell"].values, case["drive"]["cell"])
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:

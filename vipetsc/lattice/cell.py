@@ -66,6 +66,8 @@ class Coupling(NamedTuple):
 
     ``other`` is ``GROUND`` for a spring to the ground.
     ``stiffness`` in N/m and ``damping`` in N s/m are the spring's, ``spring`` is its number in the cell (from 0).
+    ``sign`` is 1 where ``mass`` is the spring's start and -1 where it is its end: the elongation is ``sign`` times the
+    displacement of the other mass less that of this one.
     """
 
     mass: int
@@ -74,6 +76,7 @@ class Coupling(NamedTuple):
     stiffness: float
     damping: float
     spring: int
+    sign: int
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,19 @@ class UnitCell:
         """
         ends = []
         for i, s in enumerate(self.springs):
-            for mass, offset, other in ((s.start, s.offset, s.end), (s.end, -s.offset, s.start)):
+            for sign, mass, other in ((1, s.start, s.end), (-1, s.end, s.start)):
                 if mass == GROUND:
                     continue
-                ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
+                coupling = Coupling(
+                    mass=mass,
+                    offset=sign * s.offset,
+                    other=other,
+                    stiffness=s.stiffness,
+                    damping=s.damping,
+                    spring=i,
+                    sign=sign,
+                )
+                ends.append(coupling)
         # Stable: couplings of one mass stay in the order of the springs.
         return sorted(ends, key=lambda c: c.mass)
 

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 
 from vipetsc.lattice.cell import GROUND, Spring, UnitCell
 from vipetsc.lattice.drive import Waveform
-from vipetsc.lattice.topology import NONE, WALL, Ends, Topology
+from vipetsc.lattice.topology import NOTHING, WALL, Ends, Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
 
 # Cells at most whose linear response is solved for, in 2 ms. With 200 or 800 in its place the scale of waves changes by
@@ -150,6 +150,21 @@ class Chain:
         pairs = np.array(self.pairs or [(self.cell.host, self.cell.resonator, 0)], np.int64)
         return np.broadcast_to(pairs, (len(self.sites), 3))
 
+    def resonator_cells(self, topology: Topology | None = None) -> np.ndarray:
+        """Return the cell (site,) of each site's resonator; cells follow each other as in ``topology``.
+
+        Raises ValueError where it would lie beyond an end.
+        """
+        sites = np.array(self.sites, np.int64)
+        cells = sites
+        if self.is_joined:
+            topology = topology or self.topology
+            cells = topology.neighbour(sites, self.pair_table[:, 2])
+            if topology.ends is not None and cells.min() < 0:
+                number = int(cells.argmin())
+                raise ValueError(f"site {number + 1} in cell {sites[number] + 1} has no next cell to touch")
+        return cells
+
     @property
     def is_joined(self) -> bool:
         """Whether contacts join cells."""
@@ -164,9 +179,9 @@ class Chain:
         rows = len(inverse)
         chosen = np.array(numbers, np.int64)
         sites = np.array(self.sites, np.int64)[chosen]
-        host, resonator, offset = self.pair_table[chosen].T
+        host, resonator, _ = self.pair_table[chosen].T
         inverse_host = np.where(host >= 0, inverse[sites % rows, host], 0.0)  # ground does not move
-        inverse_resonator = inverse[self.topology.neighbour(sites, offset) % rows, resonator]
+        inverse_resonator = inverse[self.resonator_cells()[chosen] % rows, resonator]
         return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
@@ -279,7 +294,7 @@ class Chain:
 
             neighbour = self.topology.neighbour(index, coupling.offset)
             inside = neighbour >= 0
-            held = neighbour != NONE  # a wall holds, and does not move
+            held = neighbour != NOTHING  # a wall holds, and does not move
             rows += [here[held] - start * d, here[inside] - start * d]
             columns += [here[held], neighbour[inside] * d + coupling.other]
             entries += [value[held], -value[inside]]

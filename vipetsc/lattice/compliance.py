@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands, waves_at
 from vipetsc.lattice.chain import Chain, Pair
-from vipetsc.lattice.elements import Elements, contacts, masses_of, unit_loads
+from vipetsc.lattice.elements import Elements, contacts, incidence, masses_of
 from vipetsc.lattice.modal_compliance import ComplianceError
-from vipetsc.lattice.topology import NONE, WALL, Topology
+from vipetsc.lattice.topology import NOTHING, WALL, Topology
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
 AT_REST = 1e-12  # a contact pair that moves less than this fraction of its cell does not move
@@ -241,7 +241,7 @@ class WaveCompliance:
         """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
         dofs = self.chain.cell.dofs
         of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        return unit_loads([*self._contacts.ends(), *of_points], masses_of(self.cells, dofs))
+        return incidence([*self._contacts.mass_pairs(), *of_points], masses_of(self.cells, dofs))
 
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
         """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""
@@ -274,7 +274,7 @@ class WaveCompliance:
         for cell in at:
             matrix[:, cell, cell] += dynamic
         beyond = self._topology.neighbour(-1)
-        if beyond == NONE:
+        if beyond == NOTHING:
             matrix[:, at[0], at[0]] -= blocks.left
             matrix[:, at[-1], at[-1]] -= blocks.right
         if beyond != WALL or self.infinite:

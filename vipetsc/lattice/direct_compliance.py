@@ -14,7 +14,7 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.elements import contacts, masses_of, unit_loads
+from vipetsc.lattice.elements import contacts, incidence, masses_of
 from vipetsc.lattice.topology import WALL
 
 # Of the orders of elimination the one that keeps its digits in a ring, see ``Chain.wave_scale``.
@@ -37,7 +37,7 @@ class DirectCompliance:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
         dofs = self.chain.cell.dofs
         of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        return unit_loads([*contacts(self.chain).ends(), *of_points], masses_of(range(self.chain.cells), dofs))
+        return incidence([*contacts(self.chain).mass_pairs(), *of_points], masses_of(range(self.chain.cells), dofs))
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.

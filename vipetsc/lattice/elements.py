@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.cell import GROUND, Spring
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.topology import NONE, WALL, Topology
+from vipetsc.lattice.topology import NOTHING, WALL, Topology
 
 
 class Elements(NamedTuple):
@@ -31,22 +31,24 @@ class Elements(NamedTuple):
         """Return cell and number of each element, both from 1, with a point between them."""
         return [f"{cell + 1}.{number + 1}" for cell, number in zip(self.cell, self.number, strict=True)]
 
-    def ends(self) -> list[tuple[int, int]]:
-        """Return start and end of each element."""
+    def mass_pairs(self) -> list[tuple[int, int]]:
+        """Return the masses at start and end of each element."""
         return list(zip(self.start.tolist(), self.end.tolist(), strict=True))
 
 
 def contacts(chain: Chain, topology: Topology | None = None) -> Elements:
-    """Return the contacts of all sites of ``chain``, in their order; its cells follow each other as in ``topology``."""
+    """Return the contacts of all sites of ``chain``, in their order; its cells follow each other as in ``topology``.
+
+    Raises ValueError for a contact with the next cell where there is none.
+    """
     sites = np.array(chain.sites, np.int64)
-    host, resonator, offset = chain.pair_table.T
+    host, resonator, _ = chain.pair_table.T
     dofs = chain.cell.dofs
-    neighbour = (topology or chain.topology).neighbour(sites, offset)
     return Elements(
         cell=sites,
         number=np.arange(len(sites)),
         start=np.where(host >= 0, sites * dofs + host, WALL),
-        end=neighbour * dofs + resonator,
+        end=chain.resonator_cells(topology) * dofs + resonator,
     )
 
 
@@ -71,7 +73,7 @@ def nonlinear_springs(chain: Chain) -> Elements:
     before = topology.neighbour(cells)
     after = topology.neighbour(cells, offset)
     # Before the first cell, too, there are springs only where one of their ends is in the lattice.
-    exists = (after != NONE) & ((before >= 0) | (after >= 0))
+    exists = (after != NOTHING) & ((before >= 0) | (after >= 0))
     dofs = chain.cell.dofs
     springs = Elements(
         cell=cells,
@@ -88,14 +90,14 @@ def spring_laws(chain: Chain) -> list[Spring]:
     return [chain.spring(*place) for place in zip(springs.cell.tolist(), springs.number.tolist(), strict=True)]
 
 
-def unit_loads(ends: Sequence[tuple[int, int]], masses: np.ndarray) -> np.ndarray:
-    """Return loads (mass, element) of 1 N at each end of elements between ``ends``: -1 at the start, 1 at the end.
+def incidence(pairs: Sequence[tuple[int, int]], masses: np.ndarray) -> np.ndarray:
+    """Return loads (mass, element) of 1 N at both ends of elements, the ``pairs``: -1 at the start, 1 at the end.
 
     Each column also picks the elongation from the displacements of ``masses`` (mass,), which are in rising order; all
     masses that the elements join are among them.
     """
-    loads = np.zeros((len(masses), len(ends)))
-    for weight, of_elements in zip((-1.0, 1.0), np.array(ends, np.int64).reshape(-1, 2).T, strict=True):
+    loads = np.zeros((len(masses), len(pairs)))
+    for weight, of_elements in zip((-1.0, 1.0), np.array(pairs, np.int64).reshape(-1, 2).T, strict=True):
         moves = np.flatnonzero(of_elements >= 0)
         loads[np.searchsorted(masses, of_elements[moves]), moves] += weight
     return loads

@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.dense_compliance import RIGID, UNMOVED
-from vipetsc.lattice.elements import Elements, contacts, masses_of, nonlinear_springs, unit_loads
+from vipetsc.lattice.elements import Elements, contacts, incidence, masses_of, nonlinear_springs
 from vipetsc.lattice.topology import WALL
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
@@ -104,8 +104,8 @@ class ModalCompliance:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
         dofs = self.chain.cell.dofs
         of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        ends = [*contacts(self.chain).ends(), *self.springs.ends(), *of_points]
-        return unit_loads(ends, masses_of(range(self.chain.cells), dofs))
+        ends = [*contacts(self.chain).mass_pairs(), *self.springs.mass_pairs(), *of_points]
+        return incidence(ends, masses_of(range(self.chain.cells), dofs))
 
     @cached_property
     def stiffness(self) -> csc_matrix:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 Ends = Literal["fixed", "free", "periodic"]
 
 WALL = -1
-NONE = -2
-_BEYOND = {"fixed": WALL, "free": NONE}
+NOTHING = -2
+_BEYOND = {"fixed": WALL, "free": NOTHING}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Topology:
         return (0,)
 
     def neighbour(self, cells: ArrayLike, offset: ArrayLike = 0) -> np.ndarray:
-        """Return the cell (...) that lies ``offset`` cells further than each of ``cells`` (...), ``WALL`` or ``NONE``.
+        """Return the cell (...) ``offset`` cells further than each of ``cells`` (...), ``WALL`` or ``NOTHING``.
 
         The ``cells`` themselves may lie beyond the ends.
         """
@@ -51,7 +51,7 @@ class Topology:
             return np.asarray(number % self.cells)
         return np.where((number >= 0) & (number < self.cells), number, _BEYOND[self.ends])
 
-    def steps(self, cells: ArrayLike, other: ArrayLike) -> np.ndarray:
+    def cells_ahead(self, cells: ArrayLike, other: ArrayLike) -> np.ndarray:
         """Return how many cells further than each of ``cells`` (...) the ``other`` is.
 
         On a ring that is never negative: one goes to higher cells, through its seam if need be.
@@ -63,10 +63,10 @@ class Topology:
 
     def distance(self, cells: ArrayLike, other: ArrayLike) -> np.ndarray:
         """Return the distance (...) in cells of each of ``cells`` (...) to ``other``; the shorter one on a ring."""
-        return np.asarray(np.minimum(np.abs(self.steps(cells, other)), np.abs(self.steps(other, cells))))
+        return np.asarray(np.minimum(np.abs(self.cells_ahead(cells, other)), np.abs(self.cells_ahead(other, cells))))
 
-    def nearest(self, cells: ArrayLike, other: int) -> int | None:
-        """Return the place, from 0, of that of ``cells`` (cell,) which is nearest to ``other``; None without cells.
+    def nearest_index(self, cells: ArrayLike, other: int) -> int | None:
+        """Return the index in ``cells`` (cell,) of the one nearest to ``other``; None without cells.
 
         The first of two at the same distance counts. The site nearest to the drive is the one that its wave meets
         first.

@@ -134,7 +134,7 @@ class System:
     def from_chain(cls, chain: Chain, stops: Sequence[Stops]) -> Self:
         """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots."""
         pairs = []
-        for (host, resonator), of_site in zip(contacts(chain).ends(), stops, strict=True):
+        for (host, resonator), of_site in zip(contacts(chain).mass_pairs(), stops, strict=True):
             pairs.append(contact_pair(None if host < 0 else host, resonator, of_site))
 
         return cls(
@@ -348,7 +348,7 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
 
 def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
     """The springs of a lattice that have more than a linear part, those to its walls among them."""
-    for (start, end), law in zip(nonlinear_springs(chain).ends(), spring_laws(chain), strict=True):
+    for (start, end), law in zip(nonlinear_springs(chain).mass_pairs(), spring_laws(chain), strict=True):
         if end >= 0:
             yield SmoothSpring(None if start < 0 else start, end, law)
         else:

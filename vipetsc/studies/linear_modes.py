@@ -111,7 +111,7 @@ def pressed_contacts(model: Model) -> list[Joint]:
     """The contacts of a ``model`` that are pressed at rest: for small motions springs of the slope of their force."""
     chain = model.chain
     joints: list[Joint] = []
-    for (host, resonator), law, stops in zip(contacts(chain).ends(), model.law_of_sites, model.gaps, strict=True):
+    for (host, resonator), law, stops in zip(contacts(chain).mass_pairs(), model.law_of_sites, model.gaps, strict=True):
         pressed = -min(stops)
         if pressed > 0:
             joints.append(Joint(host, resonator, float(law.elastic_slope(pressed))))

@@ -285,7 +285,7 @@ def _linear_table(case: Case) -> dict[str, Any]:
 def first_site_cell(case: Case) -> int:
     """Cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
-    first = Topology(case.lattice.cells, case.lattice.ends).nearest(cells, case.drive.cell)
+    first = Topology(case.lattice.cells, case.lattice.ends).nearest_index(cells, case.drive.cell)
     return 0 if first is None else int(cells[first])
 
 

@@ -42,7 +42,7 @@ class VelocityRecord:
         self.interval = field_interval(run)
         self.cells = run["cell"].values
         sites = run["sites/cell"].values
-        first = Topology(case.lattice.cells, case.lattice.ends).nearest(sites, case.drive.cell)
+        first = Topology(case.lattice.cells, case.lattice.ends).nearest_index(sites, case.drive.cell)
         self.site = None if first is None else int(sites[first])
 
         # Rounded up: a map has at most so many pixels on either side.

@@ -214,7 +214,7 @@ def create_responses(groups: Groups, tables: Record, model: Model, series: StepS
         # Columns of the target's rows in which the cells of the source lie. A ring has at least ``width`` cells: each
         # of them is in one column at most.
         leftmost = cells[targets] - series.reach
-        columns = model.chain.topology.steps(leftmost[:, None], cells[sources][:, None] + form_cells)
+        columns = model.chain.topology.cells_ahead(leftmost[:, None], cells[sources][:, None] + form_cells)
         columns = np.where((columns >= 0) & (columns < series.width), columns, series.width)
         near = np.any(columns < series.width, axis=1)
         targets = targets[near]

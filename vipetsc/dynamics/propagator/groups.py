@@ -97,7 +97,7 @@ def _fill_forms(dofs: np.ndarray, elements: Elements, lattice: Chain) -> None:
     for weight, ends in ((1.0, elements.end), (-1.0, elements.start)):
         moves = np.flatnonzero(ends >= 0)
         cells, mass = np.divmod(ends[moves], masses)
-        further = lattice.topology.steps(dofs["cell"][moves], cells)
+        further = lattice.topology.cells_ahead(dofs["cell"][moves], cells)
         dofs["form"][moves, further, mass] += weight
         dofs["last"][moves] = np.maximum(dofs["last"][moves], dofs["cell"][moves] + further)
 

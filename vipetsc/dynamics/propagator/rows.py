@@ -18,7 +18,7 @@ import numpy as np
 
 from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.topology import NONE
+from vipetsc.lattice.topology import NOTHING
 from vipetsc.lattice.variation import Coefficients
 
 # Cells whose coefficients are looked at together, some MB: a lattice of millions is not copied as a whole.
@@ -83,7 +83,7 @@ def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np
 
     # No power reaches the outermost neighbours: what np.roll carries across them is zero.
     acts = np.ones_like(exists)
-    if chain.topology.neighbour(-1) == NONE:
+    if chain.topology.neighbour(-1) == NOTHING:
         acts = exists & np.roll(exists, -1, axis=-1)
     neighbours = _Neighbourhoods(chain=chain, masses=masses[:, None], exists=exists[:, None, None], acts=acts[:, None])
 
@@ -219,7 +219,7 @@ def _matrix_bounds(
     diagonal = np.abs(ground[inner]) / masses[inner]
     circles = diagonal.copy()
     entries = np.zeros((3, chain.cell.dofs, chain.cell.dofs))
-    for mass, offset, other, _, _, spring in chain.cell.couplings():
+    for mass, offset, other, _, _, spring, _ in chain.cell.couplings():
         near = slice(1 + offset, cells + 1 + offset)
         # A spring to the cell before is stored with that cell.
         value = np.abs(springs[1 + min(offset, 0) :][:cells, spring])

@@ -23,7 +23,7 @@ from vipetsc.dynamics.lattice_record import LATTICE, LatticeRecord
 from vipetsc.dynamics.native import array_at
 from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import relative_motion
-from vipetsc.dynamics.springs import damping_powers, inverse_mass, nonlinear_force_on, spring_accelerations
+from vipetsc.dynamics.springs import add_nonlinear_accelerations, damping_powers, inverse_mass, spring_accelerations
 from vipetsc.records import Record, record_at
 
 
@@ -90,11 +90,10 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
 
     # Mass by mass: each inner loop runs over cells that lie side by side in memory.
     for mass in range(d):
-        spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
-        if lattice.nonlinear.size > 0:
-            for cell in range(n):
-                force = nonlinear_force_on(y, lattice, cell, mass)
-                f[(d + mass) * n + cell] += force * inverse_mass(lattice, cell, mass)
+        accelerations = f[(d + mass) * n : (d + mass + 1) * n]
+        spring_accelerations(y, lattice, mass, accelerations)
+        if lattice.spring_laws.size > 0:
+            add_nonlinear_accelerations(y, lattice, mass, accelerations)
 
     _add_contacts(y, f, lattice)
 

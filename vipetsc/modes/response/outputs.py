@@ -71,7 +71,7 @@ class ResponseOutputs:
         chain = compliance.chain
         self._springs: list[tuple[int, int]] = []
         if isinstance(compliance, ModalCompliance):
-            self._springs = compliance.springs.ends()
+            self._springs = compliance.springs.mass_pairs()
         self.walls: list[WallSprings] = []
         if self.wants_forces and not (case.nfrc.infinite or case.nfrc.open_ends) and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
