@@ -153,18 +153,15 @@ def run_rows(case: Case, ranks: int) -> Rows:
     free = shutil.disk_usage(".").free
 
     # Ranks on one machine divide its memory among them.
-    needed = sum(memory_needed(model, case.output, cost.engine, ranks).values())
+    needed = sum(memory_needed(model, case.output, plan.engine.name, ranks).values())
     available = memory_available() / ranks
     memory = f"{needed / 1e9:.3g} GB per rank"
     if needed > available:
         memory += f", but only {available / 1e9:.3g} GB are available"
 
-    engine = cost.engine
-    if cost.note:
-        engine += f": {cost.note}"
-    time = f"about {duration(cost.seconds)} on {counted(ranks, 'rank')}"
-    if cost.episodes:
-        time += f", {duration(cost.contacts)} of this for {float(f'{cost.episodes:.1g}'):g} contacts or more"
+    engine = plan.engine.name
+    if plan.engine.refused:
+        engine += f": {plan.engine.refused}"
 
     return [
         *lattice_rows(case),
@@ -177,7 +174,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         ("engine", engine),
         ("disk", f"{size / 2**20:.4g} MiB, twice that during the run; {free / 2**30:.4g} GiB free here"),
         ("memory", memory),
-        ("time", time),
+        ("time", f"about {duration(cost.seconds)} on {counted(ranks, 'rank')}"),
         ("faster", cost.faster),
     ]
 

@@ -13,7 +13,6 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.dynamics.propagator.groups import group_dofs, spans_cells
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
 from vipetsc.lattice import Chain, ToneBurst, nonlinear_springs
 from vipetsc.wording import counted
 
@@ -37,6 +36,11 @@ SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
 # many springs side by side these numbers choose ``ts`` somewhat early.
 SPRING_COST = 3.0  # of a nonlinear spring in a step
 PAIR_COST = 0.8  # of a nonlinear spring in a step for each one that it feels, itself among them
+# Cost of ``ts``, as fitted to the paper's lattices on one core: seconds of an accepted step of 8vr and of a mass in it,
+# and radians of the top band in a step.
+TS_STEP = 3.7e-5
+TS_MASS = 1.3e-7
+RESOLVED = 0.37
 # The series of a step is cut off at this fraction of the run's relative tolerance: the errors of 10^4 steps then add up
 # to the tolerance at most. Below the second number the rounding of a step is as large.
 SERIES_TOLERANCE = 1e-4
@@ -139,6 +143,11 @@ def spring_cost(chain: Chain, reach: int) -> float:
     cells = np.sort(nonlinear_springs(chain).cell)
     near = np.searchsorted(cells, cells + reach, "right") - np.searchsorted(cells, cells - reach, "left")
     return SPRING_COST * len(cells) + PAIR_COST * float(near.sum())
+
+
+def step_seconds(masses: int) -> float:
+    """CPU time in s of a step of ``ts`` in which so many ``masses`` move."""
+    return TS_STEP + TS_MASS * masses
 
 
 def _too_many_springs(model: Model, reach: int, radians: float) -> str | None:
