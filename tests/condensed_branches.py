@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.case.nnm import NnmTable
-from vipetsc.lattice import Chain, WaveCompliance, four_band
-from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.lattice import Chain, four_band
+from vipetsc.lattice.compliance.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
@@ -44,7 +44,7 @@ def condensed_breather(
     chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (CLEARANCE,))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
     forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
-    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
+    problem = ConservativeMotions(SeriesCompliance(chain), forces, control)
     return problem, problem.in_gap(omega, np.array([1.0]))
 
 

@@ -20,7 +20,7 @@ from vipetsc.case.resolve import build_chain
 from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band, pass_bands
-from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.lattice.compliance.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
@@ -143,7 +143,7 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
     counts = {}
     for cells in (300, 1_000_000):
         chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (CLEARANCE,))
-        compliance = CountedCompliance(WaveCompliance(chain))
+        compliance = CountedCompliance(chain)
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
         problem = ConservativeMotions(compliance, SiteForces([Stops.both(HERTZ, CLEARANCE)]), control)
         problem.in_gap(4000.0, np.array([1.0]))
@@ -159,7 +159,7 @@ def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
     # The series takes over at twice the highest frequency.
     omega = pass_bands(chain.cell)[-1].high * np.array([0.5, 2.01, 3.0, 20.0 - 1e-3j])
     exact = WaveCompliance(chain).at(omega)
-    found = SeriesCompliance(WaveCompliance(chain)).at(omega)
+    found = SeriesCompliance(chain).at(omega)
     assert found == pytest.approx(exact, rel=0, abs=1e-14 * np.abs(exact).max())
 
 
@@ -169,7 +169,7 @@ def breather_of_two_sites(signs: list[int]) -> Point:
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (CLEARANCE, CLEARANCE))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
     forces = SiteForces([Stops.both(HERTZ, CLEARANCE)] * 2)
-    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
+    problem = ConservativeMotions(SeriesCompliance(chain), forces, control)
     return problem.in_gap(4000.0, np.array(signs))
 
 

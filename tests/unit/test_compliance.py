@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
-from vipetsc.lattice.compliance import WaveCompliance
-from vipetsc.lattice.dense_compliance import DenseCompliance
+from vipetsc.lattice.compliance.by_waves import WaveCompliance
+from vipetsc.lattice.compliance.dense import DenseCompliance
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -126,7 +126,7 @@ def test_self_compliance_is_a_sum_over_bloch_waves():
 @pytest.mark.parametrize("infinite", [False, True])
 def test_the_compliance_is_reciprocal(infinite):
     """The compliance matrix is symmetric."""
-    compliance = WaveCompliance(chain_of(RICH, 90, (3, 40, 41)), infinite).at(FREQUENCIES)
+    compliance = WaveCompliance(chain_of(RICH, 90, (3, 40, 41)), infinite=infinite).at(FREQUENCIES)
     assert np.abs(compliance - compliance.swapaxes(1, 2)).max() < 1e-12 * np.abs(compliance).max()
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.rigs import TWO_MASSES, followed
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice.modal_compliance import ModalCompliance
+from vipetsc.lattice.compliance.by_modes import ModalCompliance
 from vipetsc.modes import stability
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state

@@ -56,7 +56,7 @@ def test_with_both_ends_open_the_lattice_is_endless(ends):
     """With both ends open the compliance is that of Bloch waves, in bands, gaps, at rest and for growing motions."""
     chain = Chain(CELL, 9, ends, sites=(2, 6), clearances=(1.0, 1.0))
     here = OpenCompliance(chain, ((0, 0),), open_ends=("left", "right"))
-    endless = WaveCompliance(chain, True, ((0, 0),))
+    endless = WaveCompliance(chain, ((0, 0),), infinite=True)
     omega = np.array([0.31, 0.9, 1.2, 1.6, 2.2, 3.5, 1.1 - 0.01j, -0.7 - 0.02j, -0.7])
     np.testing.assert_allclose(here.response(omega), endless.response(omega), rtol=1e-6)
     # A constant force on one mass moves an endless lattice without bound. The opposite forces of a contact do not.

@@ -9,7 +9,7 @@ from tests.one_site import prediction_case
 from vipetsc.figures.registry import draw
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance, bloch
 from vipetsc.lattice.chain import Pair
-from vipetsc.lattice.direct_compliance import DirectCompliance
+from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.lattice.ends import absorber
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import predict

@@ -5,9 +5,7 @@ What a lattice is: ``cell``, ``variation`` (cells that differ), ``topology`` (wh
 wavenumbers), ``waves`` (at given frequencies), ``damped`` (with dashpots), ``packet``. Its modes: ``modes``,
 ``inertia``. What its ends send back: ``ends``, ``sent``.
 
-Its compliance, the motion per harmonic force, has one module for each way to compute it: ``compliance`` (Bloch waves,
-equal cells without dashpots), ``moments`` (far above the bands), ``modal_compliance`` (poles, any cells),
-``open_compliance`` (ends that reflect nothing), ``direct_compliance`` (elimination), ``dense_compliance`` (few masses).
+Its ``compliance``, the motion per harmonic force, is a folder with one module for each way to compute it.
 
 Symbols throughout: displacements u, masses M, stiffness K, damping C, u = Re U exp(i omega t), omega in rad/s,
 kappa in rad per cell, and w = u_resonator - u_host of a contact. The docstring of each module has its method.
@@ -27,13 +25,14 @@ from vipetsc.lattice.bands import (
 )
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.compliance import IncidentWave, WaveCompliance
+from vipetsc.lattice.compliance.base import ComplianceError
+from vipetsc.lattice.compliance.by_modes import ModalCompliance
+from vipetsc.lattice.compliance.by_waves import IncidentWave, WaveCompliance
+from vipetsc.lattice.compliance.dense import DenseCompliance
+from vipetsc.lattice.compliance.open_ends import OpenCompliance
 from vipetsc.lattice.contact import Contact, contact_stiffness
-from vipetsc.lattice.dense_compliance import DenseCompliance
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
 from vipetsc.lattice.elements import Elements, contacts, nonlinear_springs, spring_laws
-from vipetsc.lattice.modal_compliance import ComplianceError, ModalCompliance
 from vipetsc.lattice.modes import Modes, linear_modes
-from vipetsc.lattice.open_compliance import OpenCompliance
 from vipetsc.lattice.topology import Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation

@@ -30,7 +30,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from vipetsc.case import Model
 from vipetsc.case.law import lesser_clearances
 from vipetsc.lattice import ToneBurst, WaveCompliance, Waveform, bloch
-from vipetsc.lattice.direct_compliance import DirectCompliance
+from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, self_response, unit_phase
 from vipetsc.studies.spectral_line import SpectralLine
 from vipetsc.studies.wave_losses import SentPowers, WaveLosses

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.lattice.direct_compliance import DirectCompliance
+from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.studies.rays import Rays
 from vipetsc.studies.response import TravellingWave
 from vipetsc.studies.spectral_line import SpectralLine

@@ -22,8 +22,8 @@ from vipetsc.case.nfrc.varied_key import PARAMETERS, TRIED, is_key, key_problems
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_springs, waves_at
+from vipetsc.lattice.compliance.by_modes import MOST_DOFS
 from vipetsc.lattice.contact import least_restitution
-from vipetsc.lattice.modal_compliance import MOST_DOFS
 from vipetsc.wording import distinct
 
 MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB

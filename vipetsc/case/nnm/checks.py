@@ -22,7 +22,7 @@ from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, UnitCell, nonlinear_springs, wave_bands
 from vipetsc.lattice.cell import connected_groups
-from vipetsc.lattice.modal_compliance import MOST_DOFS
+from vipetsc.lattice.compliance.by_modes import MOST_DOFS
 
 ONE_CONTACT = "the reduced model has one contact"
 

@@ -13,7 +13,7 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
-from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.lattice.compliance.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
@@ -71,7 +71,7 @@ class Condensed(NamedTuple):
             # Bloch waves are those of equal cells with contacts of the cell's pair: other lattices have all modes.
             motions = condensed_system(System.from_chain(chain, stops), options)
         else:
-            motions = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), options)
+            motions = ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), options)
         return cls(motions, chain=chain, system=None, dofs=chain.cell.dofs)
 
 
@@ -232,7 +232,7 @@ def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np
     balance = motions.balance(point.order)
     forces = balance.series(point.x, omega).forces.real
     for k in balance.orders:
-        yield _field(motions.compliance.compliance, k * omega, forces[:, k])
+        yield _field(motions.compliance, k * omega, forces[:, k])
 
 
 def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: int) -> Iterator[np.ndarray]:

@@ -86,7 +86,7 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
         return OpenCompliance(without, places, contact_springs(case), open_ends=ends)
     if needs_modes(chain) and not case.nfrc.infinite:
         return ModalCompliance(chain, places, contact_springs(case))
-    return WaveCompliance(chain, bool(case.nfrc.infinite), places)
+    return WaveCompliance(chain, places, infinite=bool(case.nfrc.infinite))
 
 
 def forces_of(case: NfrcCase, restitution: float) -> SiteForces:

@@ -5,13 +5,14 @@ The series converges where omega is above all linear modes, which lie below the 
 n cells to either side of b.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.compliance import WaveCompliance
+from vipetsc.lattice.compliance.by_waves import WaveCompliance
 
 # The series is used above FAST_FROM times the top of the bands, where each term is at most a quarter of the last: after
 # 28 terms 4^-28 is below rounding.
@@ -19,26 +20,20 @@ FAST_FROM = 2.0
 TERMS = 28
 
 
-class SeriesCompliance:
-    """Compliance of a finite lattice between its sites: by the series where it converges fast, else ``compliance``.
+@dataclass(frozen=True)
+class SeriesCompliance(WaveCompliance):
+    """Compliance of a finite lattice between its sites: by the series where it converges fast, else by waves.
 
-    Cells are equal and without dashpots, and contacts join the pair of their cell.
+    Contacts join the pair of their cell.
     """
-
-    def __init__(self, compliance: WaveCompliance) -> None:
-        self.compliance = compliance
-        self.chain = compliance.chain
-        # The highest frequency of a wave in rad/s.
-        self.highest = compliance.highest
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
         omega = np.atleast_1d(omegas)
         high = np.abs(omega) > FAST_FROM * self.highest
-        pairs = len(self.chain.sites)
-        compliance = np.zeros((len(omega), pairs, pairs), omega.dtype if np.iscomplexobj(omega) else float)
+        compliance = np.zeros((len(omega), self.pairs, self.pairs), omega.dtype if np.iscomplexobj(omega) else float)
         if not high.all():
-            compliance[~high] = self.compliance.at(omega[~high])
+            compliance[~high] = super().at(omega[~high])
         ratio = (self.highest / omega[high]) ** 2
         powers = ratio ** np.arange(1, TERMS + 1)[:, None]
         compliance[high] = -np.einsum("nij,nw->wij", self._moments, powers)

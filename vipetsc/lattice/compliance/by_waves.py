@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands, waves_at
-from vipetsc.lattice.chain import Chain, Pair
-from vipetsc.lattice.elements import Elements, contacts, incidence, masses_of
-from vipetsc.lattice.modal_compliance import ComplianceError
+from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.compliance.base import ChainCompliance, ComplianceError
+from vipetsc.lattice.elements import contacts
 from vipetsc.lattice.topology import NOTHING, WALL, Topology
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
@@ -76,17 +76,14 @@ class _Solution(NamedTuple):
 
 
 @dataclass(frozen=True)
-class WaveCompliance:
+class WaveCompliance(ChainCompliance):
     """Compliance of the sites of ``chain``, from Bloch waves; ``infinite``: its cells go on beyond both ends.
 
-    All cells are as ``chain.cell``, whose dashpots are left out. Relative displacements w = u_resonator - u_host of the
-    contact pairs follow from pairs of opposite forces, and from forces on single masses at the ``points``, which are
-    (cell, mass) from 0. At omega = 0 forces on a lattice that is free to move, as an infinite one is, must sum to zero.
+    All cells are as ``chain.cell``, whose dashpots are left out. At omega = 0 forces on a lattice that is free to move,
+    as an infinite one is, must sum to zero.
     """
 
-    chain: Chain
     infinite: bool = False
-    points: tuple[tuple[int, int], ...] = ()
 
     @cached_property
     def highest(self) -> float:
@@ -96,8 +93,8 @@ class WaveCompliance:
     @property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
-        joined = np.concatenate([self._contacts.start, self._contacts.end])
-        loaded = {*(joined[joined >= 0] // self.chain.cell.dofs).tolist(), *(cell for cell, _ in self.points)}
+        joined = [mass for pair in self._elements for mass in pair if mass != WALL]
+        loaded = {*(mass // self.chain.cell.dofs for mass in joined), *(cell for cell, _ in self.points)}
         last = self.chain.cells - 1
         loaded |= {end for end, step in ((0, -1), (last, 1)) if self._topology.neighbour(end, step) < 0}
         return sorted(loaded) or [0]
@@ -110,33 +107,28 @@ class WaveCompliance:
         return self.chain.topology
 
     @property
-    def _contacts(self) -> Elements:
-        """The contacts of all sites."""
-        return contacts(self.chain, self._topology)
+    def _elements(self) -> list[tuple[int, int]]:
+        return contacts(self.chain, self._topology).mass_pairs()
+
+    @property
+    def _loaded_cells(self) -> list[int]:
+        return self.cells
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
-
-        They lie on or below the real axis. The result is real for a finite lattice at real frequencies.
-        """
+        """Return the motions of ``ChainCompliance.response``."""
         omega, mirrored = _right_half(omegas)
-        loads = self._loads()
-        pairs = loads[:, : len(self.chain.sites)]
+        loads = self.loads
+        pairs = loads[:, : self.pairs]
         motions = pairs.T @ self._solve(omega, loads).unknowns[:, : len(loads)]
 
         if not self.infinite and np.all(omega.imag == 0):
             return np.asarray(motions.real)
         return np.where(mirrored[:, None, None], motions.conj(), motions)
 
-    def at(self, omegas: ArrayLike) -> np.ndarray:
-        """Compliance (omega, pair, pair) in m/N, see ``response``."""
-        return self.response(omegas)[:, :, : len(self.chain.sites)]
-
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
         """Displacement (cells, dofs) in m at ``cells`` (from 0); an infinite lattice has any cell, negative ones too.
 
-        ``forces`` in N are those of the pairs, which pull back (-F on the resonator, F on the host), then those on the
-        points, if there are any. Raises ValueError for a cell that the lattice does not have.
+        ``forces`` in N are as of ``signed``. Raises ValueError for a cell that the lattice does not have.
         """
         right_half, mirrored = _right_half(omega)
         given = np.asarray(forces, complex)
@@ -237,17 +229,9 @@ class WaveCompliance:
             stretches.append(Stretch(last, 0, cells[0] + self.chain.cells - cells[-1] - 1))
         return stretches
 
-    def _loads(self) -> np.ndarray:
-        """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
-        dofs = self.chain.cell.dofs
-        of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        return incidence([*self._contacts.mass_pairs(), *of_points], masses_of(self.cells, dofs))
-
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
-        """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""
-        pairs = len(self.chain.sites)
-        signed = np.concatenate([-forces[:pairs], forces[pairs:]])
-        return np.asarray(self._loads()[:, : len(forces)] @ signed)[:, None]
+        """The load (cells and dofs, 1) that ``forces``, as of ``signed``, amount to."""
+        return np.asarray(self.loads[:, : len(forces)] @ self.signed(forces))[:, None]
 
     def _solve(self, omega: np.ndarray, loads: np.ndarray) -> _Solution:
         """The lattice under ``loads`` (cells and dofs, load) at ``omega`` in rad/s, of ``_right_half``."""

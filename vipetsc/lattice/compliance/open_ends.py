@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.modal_compliance import ModalCompliance
+from vipetsc.lattice.compliance.by_modes import ModalCompliance
 
 # Imaginary part of a frequency over its size, at least. Waves then decay over 1e10 radians, and compliances change in
 # proportion: by 1e-7 of the largest for twice as much, near the edge of a band.
@@ -48,7 +48,7 @@ class OpenCompliance(ModalCompliance):
         return 0.0
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s; complex."""
+        """Return the motions of ``ChainCompliance.response``; they are complex."""
         omega = self._shifted(omegas)
         loads = self.loads
         ends = self._end_rows
@@ -64,8 +64,7 @@ class OpenCompliance(ModalCompliance):
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
         """Displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` as of ``ModalCompliance``."""
-        given = np.asarray(forces, complex)
-        signed = np.concatenate([-given[: self.pairs], given[self.pairs :]])
+        signed = self.signed(forces)
         force = self.loads[:, : len(signed)] @ signed
 
         dofs = self.chain.cell.dofs

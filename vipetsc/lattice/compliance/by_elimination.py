@@ -6,45 +6,28 @@ takes a few milliseconds, and time in proportion to the number of cells.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
-from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.elements import contacts, incidence, masses_of
-from vipetsc.lattice.topology import WALL
+from vipetsc.lattice.compliance.base import ChainCompliance
 
 # Of the orders of elimination the one that keeps its digits in a ring, see ``Chain.wave_scale``.
 ORDER = "MMD_AT_PLUS_A"
 
 
 @dataclass(frozen=True)
-class DirectCompliance:
+class DirectCompliance(ChainCompliance):
     """Compliance of the contact pairs of a finite ``chain`` whose cells may differ and have dashpots.
 
-    Relative displacements follow from pairs of opposite forces, and from forces on single masses at the ``points``,
-    which are (cell, mass) from 0.
+    Frequencies lie below the real axis, where no mode makes the matrix singular.
     """
 
-    chain: Chain
-    points: tuple[tuple[int, int], ...] = ()
-
-    @cached_property
-    def loads(self) -> np.ndarray:
-        """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
-        dofs = self.chain.cell.dofs
-        of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        return incidence([*contacts(self.chain).mass_pairs(), *of_points], masses_of(range(self.chain.cells), dofs))
-
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
-
-        They lie below the real axis, where no mode makes the matrix singular.
-        """
-        return self.motion(omegas, self.loads[:, : len(self.chain.sites)])
+        """Return the motions of ``ChainCompliance.response``; they are complex."""
+        return self.motion(omegas, self.loads[:, : self.pairs])
 
     def motion(self, omegas: ArrayLike, rows: np.ndarray) -> np.ndarray:
         """Motions (omega, row, pair and point) in m/N, picked by ``rows`` (dofs, row) as by ``loads``."""

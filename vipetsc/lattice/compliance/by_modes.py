@@ -28,10 +28,9 @@ from scipy.sparse import csc_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.dense_compliance import RIGID, UNMOVED
-from vipetsc.lattice.elements import Elements, contacts, incidence, masses_of, nonlinear_springs
-from vipetsc.lattice.topology import WALL
+from vipetsc.lattice.compliance.base import ChainCompliance, ComplianceError
+from vipetsc.lattice.compliance.dense import RIGID, UNMOVED
+from vipetsc.lattice.elements import Elements, contacts, nonlinear_springs
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
@@ -40,10 +39,6 @@ ACCURACY = 1e-8
 # Differences in a rigid motion, over its largest displacement, that are rounding: 1e-13 to 1e-6 are seen. In motions
 # that strain soft springs the differences are as large as the displacements.
 EVEN = 1e-3
-
-
-class ComplianceError(ValueError):
-    """A lattice has no compliance at a frequency, or none that its modes represent."""
 
 
 class Poles(NamedTuple):
@@ -59,19 +54,16 @@ class Poles(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ModalCompliance:
+class ModalCompliance(ChainCompliance):
     """Compliance of the contacts of a finite ``chain``, whose cells may differ and have dashpots.
 
-    Relative displacements of the contact pairs, and after them elongations of the nonlinear springs, follow from pairs
-    of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
-    ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none.
+    Elongations of the nonlinear springs are pairs, too, after those of the contacts. ``contact_springs`` are
+    stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none.
 
     Raises ComplianceError for more than ``MOST_DOFS`` masses, and where the damping is so close to critical that the
     modes do not represent the motion.
     """
 
-    chain: Chain
-    points: tuple[tuple[int, int], ...] = ()
     contact_springs: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -84,10 +76,9 @@ class ModalCompliance:
         """The nonlinear springs."""
         return nonlinear_springs(self.chain)
 
-    @property
-    def pairs(self) -> int:
-        """Number of contact pairs and of nonlinear springs."""
-        return len(self.chain.sites) + len(self.springs.cell)
+    @cached_property
+    def _elements(self) -> list[tuple[int, int]]:
+        return [*contacts(self.chain).mass_pairs(), *self.springs.mass_pairs()]
 
     @cached_property
     def slowest(self) -> float:
@@ -100,14 +91,6 @@ class ModalCompliance:
         return float(np.abs(self._poles.poles.imag).max(initial=0.0))
 
     @cached_property
-    def loads(self) -> np.ndarray:
-        """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
-        dofs = self.chain.cell.dofs
-        of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        ends = [*contacts(self.chain).mass_pairs(), *self.springs.mass_pairs(), *of_points]
-        return incidence(ends, masses_of(range(self.chain.cells), dofs))
-
-    @cached_property
     def stiffness(self) -> csc_matrix:
         """Stiffness (dofs, dofs) in N/m of the lattice, with the springs in the place of contacts."""
         stiffness = self.chain.stiffness_matrix()
@@ -116,15 +99,8 @@ class ModalCompliance:
         contacts = csc_matrix(self.loads[:, : len(self.contact_springs)])
         return (stiffness + contacts @ diags(self.contact_springs) @ contacts.T).tocsc()
 
-    def at(self, omegas: ArrayLike) -> np.ndarray:
-        """Compliance (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, on or below the real axis."""
-        return self.response(omegas)[:, :, : self.pairs]
-
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
-
-        Real for a lattice without dashpots at real frequencies.
-        """
+        """Return the motions of ``ChainCompliance.response``."""
         rows, columns, rigid_rows, rigid_columns = self._parts
         omega = np.atleast_1d(np.asarray(omegas, complex))
         out = (rows * self._gain(omega, self._moved)[:, None, :]) @ columns
@@ -136,14 +112,8 @@ class ModalCompliance:
         return np.asarray(out)
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0).
-
-        ``forces`` in N are those of the pairs, which pull back (-F on the resonator, F on the host), then those on the
-        points, if there are any.
-        """
-        given = np.asarray(forces, complex)
-        pairs = self.pairs
-        signed = np.concatenate([-given[:pairs], given[pairs:]])
+        """Displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` in N, as of ``signed``."""
+        signed = self.signed(forces)
         force = self.loads[:, : len(signed)] @ signed
 
         # Only the masses in the cells are computed: a state has a field for each of its harmonics.
