@@ -108,6 +108,15 @@ def test_the_chapter_on_the_code_names_files_and_functions_that_are_there():
     assert [name for name in names if not re.search(rf"(def|class) {name}\b|^ *{name}\b.* = ", together, re.M)] == []
 
 
+def test_the_way_of_a_run_leads_through_files_and_functions_that_are_there():
+    drawing = (ROOT / "manual/house.md").read_text(encoding="utf-8").partition("```text\n")[2].partition("```")[0]
+    stops = re.findall(r"([\w.]+)  +((?:\w+/)+\w+\.py)", drawing)
+    assert len(stops) > 20
+    for name, path in stops:
+        last = name.rpartition(".")[2]
+        assert re.search(rf"(def|class) {last}\b", (ROOT / path).read_text(encoding="utf-8")), name
+
+
 def test_no_two_classes_have_one_name():
     """A name means one thing in the whole package; a private class may repeat one."""
     places = defaultdict(list)

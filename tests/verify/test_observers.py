@@ -178,7 +178,7 @@ class Halves(Observer):
         self.sums = []
 
     def observe(self, block):
-        fields = block.samples.fields[:, : block.samples.rows(len(block))]
+        fields = block.samples.fields[:, : block.samples.recorded_rows(len(block))]
         self.sums += fields.sum(axis=(0, 2, 3)).tolist()
         if 100 in range(block.first, block.first + len(block)):
             raise RunawayError("far enough", 100 - block.first)

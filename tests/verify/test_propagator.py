@@ -347,7 +347,7 @@ def test_rows_near_an_end_turn_into_the_stencil(interval):
     interior = StepSeries(Chain(chain.cell, 200, "fixed"), interval, 1e-14).interior()
 
     r = series.reach
-    end = series.stencil(series.cut(*series.rows([r - 1]), 1 - r, 2 * r))
+    end = series.stencil(series.cut(*series.power_rows([r - 1]), 1 - r, 2 * r))
 
     # The last of the end's cells meets the wall only in its farthest entries.
     np.testing.assert_allclose(end[:, :, r:], interior[:, :, r + 1 :][:, :, :r], rtol=1e-9, atol=1e-9)
@@ -359,11 +359,11 @@ def test_rows_of_a_few_cells_are_kept():
     cells = list(range(series.chain.cells))
     assert len(cells) > KEPT
 
-    together = list(series.rows(cells))
+    together = list(series.power_rows(cells))
     for cell in (0, 3, cells[-1], 0, 3):
-        (rows,) = series.rows([cell])
+        (rows,) = series.power_rows([cell])
         np.testing.assert_array_equal(rows, together[cell])
-        (again,) = series.rows([cell])
+        (again,) = series.power_rows([cell])
         assert again is rows
         with pytest.raises(ValueError, match="read-only"):
             rows[:] = 0.0

@@ -1,9 +1,8 @@
-"""Where a run fails: the cell that moves fastest, and whether its springs can lose their force."""
+"""Where a run fails, in words."""
 
 import numpy as np
 
 from vipetsc.dynamics.observers import Setup
-from vipetsc.lattice import Chain
 
 
 def failing_place(setup: Setup) -> str:
@@ -25,23 +24,10 @@ def failing_place(setup: Setup) -> str:
     nearest = chain.topology.nearest_index(chain.sites, fastest)
     if nearest is not None:
         place += f", nearest site {nearest + 1} in cell {chain.sites[nearest] + 1}"
-    limits = _elongations_without_force(chain, fastest)
-    if limits:
-        number, z = min(limits.items(), key=lambda spring: abs(spring[1]))
-        place += f"; its spring {number + 1} no longer pulls back beyond an elongation of {z:.4g} m"
+
+    # Beyond such an elongation the force pushes the masses further apart, and nothing need hold them.
+    limits = [chain.spring(fastest, number).without_force for number in range(len(chain.cell.springs))]
+    limit = min(limits, key=abs, default=np.inf)
+    if np.isfinite(limit):
+        place += f"; its spring {limits.index(limit) + 1} no longer pulls back beyond an elongation of {limit:.4g} m"
     return place
-
-
-def _elongations_without_force(chain: Chain, cell: int) -> dict[int, float]:
-    """The elongation z in m, by the numbers of the springs of a ``cell``, at which k z + q z^2 + c z^3 first vanishes.
-
-    Beyond it the force pushes the masses further apart, and nothing need hold them. Most springs have none.
-    """
-    limits = {}
-    for number in range(len(chain.cell.springs)):
-        spring = chain.spring(cell, number)
-        roots = np.roots([spring.cubic, spring.quadratic, spring.stiffness])
-        real = roots[np.isreal(roots)].real
-        if real.size:
-            limits[number] = float(real[np.abs(real).argmin()])
-    return limits

@@ -30,7 +30,7 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
     state.ghostUpdate()
     with state.localForm() as local:
         y = local.array
-        site_dofs = meter.lattice.site_dofs
+        site_dofs = setup.engine.lattice.site_dofs
         sums = meter.sums(y)
         relative = np.array([relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))])
 

@@ -145,7 +145,7 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
         owned=layout.size,
         ghosted=layout.size + layout.ghost_rows * len(layout.ghosts),
         exchange=layout.comm.size > 1 or layout.topology.is_ring,
-        work=layout.rows * layout.owned,
+        work=layout.per_cell * layout.owned,
         dissipated=layout.dissipated,
         damping=damping,
     )

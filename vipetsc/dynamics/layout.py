@@ -30,8 +30,8 @@ class Layout:
     Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
-    numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``rows`` components, and
-    ``ghost_rows`` as a ghost. With ``dashpots`` a damped lattice is ``damped``: its ghosts have velocities, and
+    numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``per_cell`` components,
+    as a ghost ``ghost_rows``. With ``dashpots`` a damped lattice is ``damped``: its ghosts have velocities, and
     ``create_record`` has its dashpots. Where ``integrates_damping`` is true, too, each cell of it has one more
     component, the energy that its dashpots have dissipated.
     """
@@ -44,14 +44,14 @@ class Layout:
         self.topology = chain.topology
         self.damped = dashpots and chain.is_damped
         self.integrates_damping = self.damped and integrates_damping
-        self.rows = 2 * self.dofs + self.integrates_damping
+        self.per_cell = 2 * self.dofs + self.integrates_damping
         self.ghost_rows = self.dofs * (1 + (self.damped or chain.is_joined))
 
         cuts = cell_cuts(self.cells, comm.size)
         driven = np.array([drive.cell for drive in model.drives], np.int64)
         ledger_sizes, _ = np.histogram([*driven, *chain.sites], cuts)
         # Behind a rank's cells one component for each drive and site that it owns.
-        sizes = self.rows * np.diff(cuts) + ledger_sizes
+        sizes = self.per_cell * np.diff(cuts) + ledger_sizes
         self.ranges = np.array([*pairwise(cuts)])
         self.offsets = np.append(0, np.cumsum(sizes))
 
@@ -60,7 +60,7 @@ class Layout:
         self.size = int(sizes[comm.rank])
         self.sites, self.contacts = _sites_within(chain, self.start, self.stop)
         self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
-        self.dissipated = self.rows * self.owned + len(self.drives)
+        self.dissipated = self.per_cell * self.owned + len(self.drives)
         # Asked for at every change of a contact.
         self._is_own = np.isin(self.contacts, self.sites)
 
@@ -135,8 +135,8 @@ class Layout:
         """Fill this rank's part ``y`` of the state: ``cells`` (cell, 2 dofs), ``work`` in J of the first drive."""
         motion = 2 * self.dofs * self.owned
         y[:motion] = cells.T.ravel()
-        y[motion : self.rows * self.owned] = 0.0
-        y[self.rows * self.owned : self.dissipated] = np.where(np.array(self.drives) == 0, work, 0.0)
+        y[motion : self.per_cell * self.owned] = 0.0
+        y[self.per_cell * self.owned : self.dissipated] = np.where(np.array(self.drives) == 0, work, 0.0)
 
     def motion(self, y: np.ndarray) -> np.ndarray:
         """Displacements and velocities (cell, 2 dofs) of the part ``y`` of the state."""
@@ -147,10 +147,10 @@ class Layout:
 
         ``dashpots`` in J is empty where their dissipation is not integrated.
         """
-        dashpots = y[2 * self.dofs * self.owned : self.rows * self.owned].copy()
+        dashpots = y[2 * self.dofs * self.owned : self.per_cell * self.owned].copy()
         ledger = np.zeros(len(self.drives) + len(self.sites), LEDGER)
         ledger["number"] = (*self.drives, *self.sites)
-        ledger["energy"] = y[self.rows * self.owned : self.size]
+        ledger["energy"] = y[self.per_cell * self.owned : self.size]
         works, losses = np.split(ledger, [len(self.drives)])
         return {"cells": self.motion(y), "dashpots": dashpots, "work": works, "losses": losses}
 
@@ -160,7 +160,7 @@ class Layout:
         Each has the arrays of ``checkpoint``, ``cells`` (cell, 2 dofs) first. Sites that they do not name have
         dissipated nothing.
         """
-        rows = y[: self.rows * self.owned].reshape(self.rows, self.owned)
+        rows = y[: self.per_cell * self.owned].reshape(self.per_cell, self.owned)
         at = 0
         for checkpoint in checkpoints:  # one after the other: no rank holds all cells
             cells = checkpoint["cells"]
@@ -174,7 +174,7 @@ class Layout:
             at += len(cells)
 
         tables = join(checkpoints, {"work": "number", "losses": "number"})
-        y[self.rows * self.owned : self.dissipated] = tables["work"]["energy"][list(self.drives)]
+        y[self.per_cell * self.owned : self.dissipated] = tables["work"]["energy"][list(self.drives)]
         losses = tables["losses"]
         named = np.isin(self.sites, losses["number"])
         y[self.dissipated : self.size] = 0.0

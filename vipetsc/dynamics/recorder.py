@@ -1,7 +1,8 @@
 """The observer ``recorder``, which collects fields, energies and episodes and passes them to the output in chunks.
 
-An engine fills the arrays of ``room`` in place with a block of samples; ``observe`` takes note of them. Chunks have a
-bounded size, since a run may be longer than memory, and each is written once. Rank 0 gathers the parts of all ranks.
+An engine fills the arrays of ``next_samples`` in place with a block of samples; ``observe`` takes note of them. Chunks
+have a bounded size, since a run may be longer than memory, and each is written once. Rank 0 gathers the parts of all
+ranks.
 """
 
 import sys
@@ -36,7 +37,7 @@ class Recorder(Observer):
     episodes = 0
     deepest = 0.0  # indentation in m
     unsaved_samples = 0  # in chunks since the last checkpoint
-    end = np.inf  # time in s of a failure: engines finish their block, whose later part is no solution
+    last_onset = np.inf  # in s, after a failure: engines finish their block, whose later part is no solution
 
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
@@ -104,9 +105,9 @@ class Recorder(Observer):
             self._forces = np.zeros((n, sites))
         self._motion = np.zeros((n, 3, len(self._watched)))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[energy] for energy in self._energies))}
-        self._fields = self.setup.output.room(self._shape)
+        self._fields = self.setup.output.fields_of_chunk(self._shape)
 
-    def room(self, number: int, most: int) -> Samples:
+    def next_samples(self, number: int, most: int) -> Samples:
         """Arrays for the samples from ``number`` on: as many as fit in the chunk, and ``most`` at most."""
         meter = self.setup.meter
         output = self.setup.case.output
@@ -122,7 +123,7 @@ class Recorder(Observer):
             first_cell=self._first,
             every=output.every,
             stride=output.stride,
-            lattice=meter.lattice,
+            lattice=self.setup.engine.lattice,
             unit=meter.unit,
             interval=self.setup.model.sample_interval,
             forces=self._forces[here],
@@ -138,8 +139,8 @@ class Recorder(Observer):
         for energy in self._energies:
             self._kept[ENERGIES[energy]][here] = getattr(block.energies, energy)
 
-        rows = self._rows + block.samples.rows(len(block))
-        # Where the room was not contiguous in the chunk, the engine has filled a copy.
+        rows = self._rows + block.samples.recorded_rows(len(block))
+        # Where their place was not contiguous in the chunk, the engine has filled a copy.
         if not np.may_share_memory(self._fields, block.samples.fields):
             self._fields[:, self._rows : rows] = block.samples.fields[:, : rows - self._rows]
         self._number = block.first - self._held
@@ -169,7 +170,7 @@ class Recorder(Observer):
         output = self.setup.output
         episodes = self.setup.engine.take_episodes(unfinished=last)
         # Engines finish the block in which a run fails: episodes after the failure are no solution.
-        episodes = episodes[episodes["onset"] <= self.end]
+        episodes = episodes[episodes["onset"] <= self.last_onset]
 
         chunk = self._gather(episodes)
         if self._points:

@@ -48,8 +48,8 @@ class Failure(NamedTuple):
     time: float
 
 
-class Begin(NamedTuple):
-    """Readings in s, when a run begins, of the wall's clock, and of this process's CPU time."""
+class Clocks(NamedTuple):
+    """Readings in s of the wall's clock and of this process's CPU time."""
 
     wall: float
     cpu: float
@@ -166,7 +166,7 @@ class Simulation:
         output.begin(case.to_toml())
         checkpoints = output.last_state()
 
-        begin = Begin(wall=time.perf_counter(), cpu=time.process_time())
+        began = Clocks(wall=time.perf_counter(), cpu=time.process_time())
         sys.audit("vipetsc.set-up", case.name)
         with log.SET_UP, petsc_options(options_of(case)):
             kind = ENGINES[engine_choice.name]
@@ -194,7 +194,7 @@ class Simulation:
             if engine_choice.refused:
                 note["engine_note"] = engine_choice.refused
             with log.ENDING:
-                return run.finish(ended, begin, note, self.plan.warnings)
+                return run.finish(ended, began, note, self.plan.warnings)
 
 
 @contextmanager
@@ -251,8 +251,8 @@ class Run:
         total = setup.model.samples
         while self.samples < total:
             # Blocks end with multiples of their length, wherever a run is resumed.
-            room = self.longest - self.samples % self.longest
-            samples = self.recorder.room(self.samples, min(room, total - self.samples))
+            longest = self.longest - self.samples % self.longest
+            samples = self.recorder.next_samples(self.samples, min(longest, total - self.samples))
             with subnormals_as_zero():
                 filled = engine.fill(samples)
             block, failure = self._observe(samples, filled)
@@ -263,7 +263,7 @@ class Run:
             if failure:
                 # Engines go through a block in one piece: episodes may have begun after the failure. The propagator
                 # stalls within a step, at whose beginning it stands then: contacts of that step count, too.
-                self.recorder.end = failure.time + setup.model.sample_interval
+                self.recorder.last_onset = failure.time + setup.model.sample_interval
                 good = "none"
                 if self.last is not None:
                     good = f"t = {self.last:.6g} s"
@@ -317,7 +317,7 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.save_state(state)
 
-    def finish(self, ended: Ended, begin: Begin, note: dict[str, str], noticed: Sequence[str] = ()) -> Result:
+    def finish(self, ended: Ended, began: Clocks, note: dict[str, str], noticed: Sequence[str] = ()) -> Result:
         """Write the last checkpoint of a run that was stopped or can be extended, and the files of one that ended.
 
         The result warns of what was ``noticed`` before the run, too.
@@ -344,8 +344,8 @@ class Run:
         if ended.ending is Ending.BROKEN_OFF:
             warnings.append(f"the record ends at sample {self.samples} of {self.setup.model.samples}: {sentence}")
 
-        wall = time.perf_counter() - begin.wall
-        cpu = comm.allreduce(time.process_time() - begin.cpu)
+        wall = time.perf_counter() - began.wall
+        cpu = comm.allreduce(time.process_time() - began.cpu)
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
 
         about = {"status": sentence, "complete": is_complete, "statistics": statistics, "warnings": warnings}
@@ -354,7 +354,7 @@ class Run:
         # The dataset of a run in memory also has the motion of its cells at the end.
         if is_complete and isinstance(output, RunMemory):
             motions = comm.gather(self.setup.layout.motion(engine.state.array_r))
-            output.end = np.concatenate(motions) if motions else None
+            output.end_motion = np.concatenate(motions) if motions else None
         if not is_stopped:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
         return Result.from_attributes(attributes, resumable=is_stopped, folder=output.folder)

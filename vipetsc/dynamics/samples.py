@@ -47,7 +47,7 @@ class Samples(NamedTuple):
     pushes: np.ndarray
     spent: np.ndarray
 
-    def rows(self, samples: int) -> int:
+    def recorded_rows(self, samples: int) -> int:
         """How many of the first ``samples`` samples have recorded fields."""
         # The stride divides ceil(n/stride) of the numbers below n.
         return -(-(self.number + samples) // self.stride) + -self.number // self.stride

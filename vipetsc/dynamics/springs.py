@@ -137,62 +137,64 @@ def _add_varied_ground(forces: np.ndarray, here: np.ndarray, factors: np.ndarray
 
 
 @kernel
-def _add_spring(
-    forces: np.ndarray, y: np.ndarray, lattice: LatticeRecord, coupling: Any, first: int, is_damped: bool
-) -> None:
-    """Add to the ``forces`` (cell,) in N on a mass that of one of its springs, in cells from ``first`` on.
+def _add_varied_forces(forces: np.ndarray, y: np.ndarray, lattice: LatticeRecord, mass: int, first: int) -> None:
+    """Add to the ``forces`` (cell,) in N on a mass those of its springs and dashpots, in cells from ``first`` on.
 
-    The spring is that of a ``coupling``; all neighbours of the cells are owned.
+    Each cell has its own; all neighbours of the cells are owned.
     """
     n = lattice.shape.cells
     velocities = lattice.shape.dofs * n
-    here = y[coupling.mass * n + first :][: forces.size]
-    rate = y[velocities + coupling.mass * n + first :][: forces.size]
-    other = coupling.other * n + coupling.offset + first
-    is_ground = coupling.other < 0
-    if not is_varied(lattice):
-        if is_ground:
-            _add_equal_ground(forces, here, coupling.stiffness)
-        else:
-            _add_equal_springs(forces, y[other:][: forces.size], here, coupling.stiffness)
-        return
-
-    entry = _table_entry(lattice, coupling, first)
-    if is_ground:
-        _add_varied_ground(forces, here, lattice.stiffness[entry:])
-    else:
-        _add_varied_springs(forces, y[other:][: forces.size], here, lattice.stiffness[entry:])
-    if is_damped and is_ground:
-        _add_varied_ground(forces, rate, lattice.damping[entry:])
-    elif is_damped:
-        _add_varied_springs(forces, y[velocities + other :][: forces.size], rate, lattice.damping[entry:])
+    is_damped = lattice.damping.size > 0
+    begin = mass * n + first
+    here = y[begin : begin + forces.size]
+    rate = y[velocities + begin : velocities + begin + forces.size]
+    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
+        coupling = lattice.couplings[s]
+        entry = _table_entry(lattice, coupling, first)
+        if coupling.other < 0:
+            _add_varied_ground(forces, here, lattice.stiffness[entry:])
+            if is_damped:
+                _add_varied_ground(forces, rate, lattice.damping[entry:])
+            continue
+        other = coupling.other * n + coupling.offset + first
+        _add_varied_springs(forces, y[other : other + forces.size], here, lattice.stiffness[entry:])
+        if is_damped:
+            other += velocities
+            _add_varied_springs(forces, y[other : other + forces.size], rate, lattice.damping[entry:])
+    if is_damped:
+        _add_varied_ground(forces, rate, lattice.grounding[begin:])
 
 
 @kernel
 def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
     """Accelerations (cells,) of a mass by its springs and dashpots, in chunks of cells whose neighbours are owned."""
     n = acceleration.size
+    here = y[mass * n : (mass + 1) * n]
     row = lattice.masses[mass]
-    is_damped = lattice.damping.size > 0
+    inverse = lattice.masses[mass].inverse_mass
     for first in range(1, n - 1, CHUNK):
-        out = acceleration[first : min(first + CHUNK, n - 1)]
-        begin = mass * n + first
+        stop = min(first + CHUNK, n - 1)
+        out = acceleration[first:stop]
 
-        # Forces first, as sums over the springs in the cell's order; where cells are equal, those of a mass are, too.
+        # Forces first, as sums over the springs in the cell's order.
         out[:] = 0.0
-        for s in range(row.first, row.last):
-            _add_spring(out, y, lattice, lattice.couplings[s], first, is_damped)
-        if is_damped:
-            _add_varied_ground(out, y[lattice.shape.dofs * n + begin :][: out.size], lattice.grounding[begin:])
-
         if is_varied(lattice):
-            inverse_masses = lattice.inverse_masses[begin:]
+            _add_varied_forces(out, y, lattice, mass, first)
+            inverse_masses = lattice.inverse_masses[mass * n + first :]
             for i in range(out.size):
                 out[i] *= inverse_masses[i]
-        else:
-            inverse = row.inverse_mass
-            for i in range(out.size):
-                out[i] *= inverse
+            continue
+
+        # Those of a mass are equal in all cells.
+        for s in range(row.first, row.last):
+            coupling = lattice.couplings[s]
+            if coupling.other < 0:
+                _add_equal_ground(out, here[first:stop], coupling.stiffness)
+                continue
+            others = coupling.other * n + coupling.offset
+            _add_equal_springs(out, y[others + first : others + stop], here[first:stop], coupling.stiffness)
+        for i in range(out.size):
+            out[i] *= inverse
 
     # The first and the last cell have neighbours among the ghosts, or walls, or none.
     if n > 0:

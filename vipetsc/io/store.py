@@ -182,7 +182,7 @@ class RunFolder:
         """Write ``summary.json``."""
         write_text(self.folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
-    def room(self, shape: tuple[int, ...]) -> np.ndarray:
+    def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
         """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         return np.empty(shape)
 
@@ -343,7 +343,7 @@ class RunMemory:
     ----------
     states
         The parts of each checkpoint (checkpoint, rank), on all ranks.
-    end
+    end_motion
         Displacements and velocities (cell, 2 dof) at the last sample of a complete run, if the caller has set them; the
         dataset then has ``end/displacement`` and ``end/velocity``.
     """
@@ -367,7 +367,7 @@ class RunMemory:
         self.count = 0
         self._variables: dict[str, xr.Variable] | None = None
         self._attributes: Mapping[str, Any] = {}
-        self.end: np.ndarray | None = None
+        self.end_motion: np.ndarray | None = None
 
     def begin(self, case: str) -> None:
         """Make ready for a run of ``case`` (TOML)."""
@@ -392,7 +392,7 @@ class RunMemory:
             return np.empty(shape)
         return self._memory.array(shape)
 
-    def room(self, shape: tuple[int, ...]) -> np.ndarray:
+    def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
         """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         if self.comm.size > 1:
             return np.empty(shape)
@@ -403,7 +403,7 @@ class RunMemory:
         arrays = dict(chunk)
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
-        # On one rank the engine has written the fields there already, into the ``room`` that it asked for.
+        # On one rank the engine has written the fields there already, into the array that it asked for.
         if self.comm.size > 1 and fields:
             self._fields[:, rows] = fields
         self._rows = rows.stop
@@ -430,8 +430,8 @@ class RunMemory:
             large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(chunks.read_log(self))}
             recorded = self._fields[:, : self._rows].swapaxes(2, 3)
             large |= dict(zip(self.recording.fields, recorded, strict=True))
-            if self.end is not None:
-                displacement, velocity = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
+            if self.end_motion is not None:
+                displacement, velocity = np.split(self.end_motion[self.recording.given["cell"] - 1], 2, axis=1)
                 large |= {"end/displacement": displacement, "end/velocity": velocity}
             for name, values in large.items():
                 description = chunks.described(name, variables)

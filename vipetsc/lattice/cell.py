@@ -48,6 +48,15 @@ class Spring:
         """Whether the force at -z is minus that at z."""
         return self.quadratic == 0
 
+    @property
+    def without_force(self) -> float:
+        """The smallest elongation in m, of either sign, at which k z + q z^2 + c z^3 vanishes; inf if there is none."""
+        roots = np.roots([self.cubic, self.quadratic, self.stiffness])
+        real = roots[np.isreal(roots)].real
+        if not real.size:
+            return np.inf
+        return float(real[np.abs(real).argmin()])
+
     def nonlinear_force(self, z: np.ndarray) -> np.ndarray:
         """The force's part beyond k z in N, at elongations ``z`` (...) in m."""
         return np.asarray(self.quadratic * z**2 + self.cubic * z**3)

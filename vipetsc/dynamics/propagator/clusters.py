@@ -173,7 +173,7 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
 
     band = 2 * series.reach + 1
     for k in range(span):
-        for row, form, mass_rows in zip(rows, forms[:, k], series.rows(cells[:, k]), strict=True):
+        for row, form, mass_rows in zip(rows, forms[:, k], series.power_rows(cells[:, k]), strict=True):
             part = series.cut(mass_rows, -series.reach, band).astype(float)
             # The rows of a mass in the next cell lie one cell further on: where there are such, ``width`` is one more
             # than the band.

@@ -165,7 +165,7 @@ class StepSeries:
         small = float(dropped.sum(axis=(1, 2)).max())
         return self._sum_beyond(self.reach) + small + self._remainder(self.terms)
 
-    def rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
+    def power_rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
         """Rows (dof, term, dof, cell) of the masses of each of ``cells``, over all cells within ``_outermost`` of it.
 
         Near an end, cells beyond it get zeros. A cell whose reach ends before the end gets the rows that it would have

@@ -239,7 +239,7 @@ def _dense_rows(
     # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
     is_shared = series.is_interior(examples)
     tables[is_shared] = series.interior().transpose(1, 2, 0)
-    for i, rows in zip(np.flatnonzero(~is_shared), series.rows(examples[~is_shared]), strict=True):
+    for i, rows in zip(np.flatnonzero(~is_shared), series.power_rows(examples[~is_shared]), strict=True):
         tables[i] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
     numbers = np.append(table, len(examples) + np.arange(len(ends)))
     return in_fours(np.concatenate([tables, _end_rows(series, ends)])), numbers
@@ -257,7 +257,7 @@ def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarr
     reach = series.reach
     dofs = series.chain.cell.dofs
     tables = np.zeros((len(ends), 2 * dofs, 2 * reach + 1, 2 * dofs))
-    for i, rows in enumerate(series.rows([cell for _, cell in ends])):
+    for i, rows in enumerate(series.power_rows([cell for _, cell in ends])):
         begin, cell = ends[i]
         part = series.cut(rows, begin - cell, 2 * reach)
         tables[i, :, : 2 * reach] = series.stencil(part).transpose(1, 2, 0)
