@@ -6,9 +6,7 @@ the springs' stiffnesses added up on the diagonal, the columns of other ranks la
 spring by spring: they agree to rounding, and to the last bit where products and sums are exact.
 """
 
-import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -19,28 +17,21 @@ from scipy.sparse import csr_matrix, diags
 from vipetsc.case import CaseError
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.layout import cell_cuts
-from vipetsc.lattice import Chain
+from vipetsc.lattice import Chain, contacts
+from vipetsc.lattice.elements import joined_stiffness
 from vipetsc.parallel import on_every_rank
-
-
-class Joint(NamedTuple):
-    """A spring of ``stiffness`` in N/m between two rows of a lattice, cell by cell; ``host`` is -1 for the ground."""
-
-    host: int
-    resonator: int
-    stiffness: float
 
 
 class LatticeMatrices:
     """``stiffness`` in N/m and ``mass`` in kg of ``chain`` without contacts, on the ranks of ``comm``.
 
-    ``joints`` are springs in addition to those of the cells: for small motions a contact that is pressed at rest is
-    one. This rank has the cells ``start`` to ``stop``; ``rows`` counts all rows, and no squared frequency in (rad/s)^2
-    is above ``largest`` (Gershgorin's circles of M^-1 K). All ranks must call it. Raises CaseError, on all ranks, where
-    PETSc's indices do not count the rows or a rank's entries.
+    ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none:
+    for small motions a contact that is pressed at rest is one. This rank has the cells ``start`` to ``stop``; ``rows``
+    counts all rows, and no squared frequency in (rad/s)^2 is above ``largest`` (Gershgorin's circles of M^-1 K). All
+    ranks must call it. Raises CaseError, on all ranks, where PETSc's indices do not count the rows or a rank's entries.
     """
 
-    def __init__(self, chain: Chain, comm: MPI.Comm, joints: Sequence[Joint] = ()) -> None:
+    def __init__(self, chain: Chain, comm: MPI.Comm, contact_springs: Sequence[float] = ()) -> None:
         self.chain = chain
         self.comm = comm
         self.rows = chain.cells * chain.cell.dofs
@@ -48,14 +39,17 @@ class LatticeMatrices:
         # Before any assembly: a count beyond the index type would become another number without an error.
         self._check_indices()
         stiffness = on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop))
-        joined = self._joined_rows(joints)
-        if joints:
+        first_row = self.start * chain.cell.dofs
+        last_row = self.stop * chain.cell.dofs
+        by_contacts = np.zeros(last_row - first_row)
+        if contact_springs:
+            joined = joined_stiffness(contacts(chain), contact_springs, self.rows, slice(first_row, last_row))
+            by_contacts = joined.diagonal(first_row)
             stiffness = (stiffness + joined).tocsr()
         self.stiffness = self._matrix(stiffness)
 
         coefficients = chain.coefficients(self.start - 1, self.stop)
         masses = coefficients.masses[1:]
-        first_row = self.start * chain.cell.dofs
         self.mass = self._matrix(diags([masses.ravel()], [first_row], (masses.size, self.rows), format="csr"))
 
         # A row's circle reaches from 0 to twice the sum of the springs at its mass, of which negative ones only make it
@@ -65,29 +59,8 @@ class LatticeMatrices:
         for coupling in chain.cell.couplings():
             springs = coefficients.stiffness[1 + min(coupling.offset, 0) :][:owned, coupling.spring]
             reaches[:, coupling.mass] += 2 * np.maximum(springs, 0.0)
-        reaches += 2 * joined.diagonal(first_row).reshape(masses.shape)
+        reaches += 2 * by_contacts.reshape(masses.shape)
         self.largest = comm.allreduce(float(np.max(reaches / masses, initial=0.0)), MPI.MAX)
-
-    def _joined_rows(self, joints: Sequence[Joint]) -> csr_matrix:
-        """The rows (owned row, row) of the stiffness of ``joints`` that this rank has."""
-        first = self.start * self.chain.cell.dofs
-        last = self.stop * self.chain.cell.dofs
-        rows: list[int] = []
-        columns: list[int] = []
-        values: list[float] = []
-        for joint in joints:
-            # k at both ends, -k between them; the ground has no row.
-            ends = [end for end in (joint.host, joint.resonator) if end >= 0]
-            for row, column in itertools.product(ends, ends):
-                if not first <= row < last:
-                    continue
-                rows.append(row - first)
-                columns.append(column)
-                value = joint.stiffness
-                if row != column:
-                    value = -value
-                values.append(value)
-        return csr_matrix((values, (rows, columns)), shape=(last - first, self.rows))
 
     def _check_indices(self) -> None:
         """Raise CaseError on all ranks where PETSc's indices do not count all rows, or not the entries of a rank."""

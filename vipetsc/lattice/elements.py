@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_matrix, diags
 
 from vipetsc.lattice.cell import GROUND, Spring
 from vipetsc.lattice.chain import Chain
@@ -101,6 +102,17 @@ def incidence(pairs: Sequence[tuple[int, int]], masses: np.ndarray) -> np.ndarra
         moves = np.flatnonzero(of_elements >= 0)
         loads[np.searchsorted(masses, of_elements[moves]), moves] += weight
     return loads
+
+
+def joined_stiffness(elements: Elements, springs: Sequence[float], masses: int, rows: slice) -> csr_matrix:
+    """Return ``rows`` of the stiffness (masses, masses) of ``springs`` in N/m, one in the place of each element."""
+    ends = np.column_stack([elements.start, elements.end])
+    number, side = np.nonzero(ends >= 0)
+    # The weights of the masses in the elongations.
+    weights = csr_matrix((2.0 * side - 1.0, (number, ends[number, side])), shape=(len(ends), masses))
+    stiffness = (weights[:, rows].T @ diags(springs) @ weights).tocsr()
+    stiffness.eliminate_zeros()
+    return stiffness
 
 
 def masses_of(cells: ArrayLike, dofs: int) -> np.ndarray:

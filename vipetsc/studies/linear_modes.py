@@ -17,11 +17,11 @@ import xarray as xr
 from vipetsc.case import Case, CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.eigen import modes_near
-from vipetsc.dynamics.matrices import Joint, LatticeMatrices
+from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.dynamics.memory import LARGEST_MESSAGE
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
-from vipetsc.lattice import Band, Chain, contacts, wave_bands
+from vipetsc.lattice import Band, Chain, wave_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
 
@@ -107,15 +107,16 @@ def check_modes(case: Case, count: int, near: float) -> None:
         raise CaseError([Problem("--modes", count, "one rank cannot gather all shapes; request fewer modes")])
 
 
-def pressed_contacts(model: Model) -> list[Joint]:
-    """The contacts of a ``model`` that are pressed at rest: for small motions springs of the slope of their force."""
-    chain = model.chain
-    joints: list[Joint] = []
-    for (host, resonator), law, stops in zip(contacts(chain).mass_pairs(), model.law_of_sites, model.gaps, strict=True):
+def pressed_contacts(model: Model) -> list[float]:
+    """Stiffness in N/m of each contact of a ``model`` for small motions: the slope of its force, 0 if not pressed."""
+    stiffness = []
+    for law, stops in zip(model.law_of_sites, model.gaps, strict=True):
         pressed = -min(stops)
+        slope = 0.0
         if pressed > 0:
-            joints.append(Joint(host, resonator, float(law.elastic_slope(pressed))))
-    return joints
+            slope = float(law.elastic_slope(pressed))
+        stiffness.append(slope)
+    return stiffness
 
 
 def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:

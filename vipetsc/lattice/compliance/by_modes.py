@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.compliance.base import ChainCompliance, ComplianceError
 from vipetsc.lattice.compliance.dense import RIGID, UNMOVED
-from vipetsc.lattice.elements import Elements, contacts, nonlinear_springs
+from vipetsc.lattice.elements import Elements, contacts, joined_stiffness, nonlinear_springs
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
@@ -96,8 +96,8 @@ class ModalCompliance(ChainCompliance):
         stiffness = self.chain.stiffness_matrix()
         if not self.contact_springs:
             return stiffness
-        contacts = csc_matrix(self.loads[:, : len(self.contact_springs)])
-        return (stiffness + contacts @ diags(self.contact_springs) @ contacts.T).tocsc()
+        joined = joined_stiffness(contacts(self.chain), self.contact_springs, stiffness.shape[0], slice(None))
+        return (stiffness + joined).tocsc()
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Return the motions of ``ChainCompliance.response``."""

@@ -58,11 +58,11 @@ class SeriesCompliance(WaveCompliance):
             stiffness = piece.stiffness_matrix()
             moved = rows * scale
             for n in range(TERMS):
-                moments[np.ix_([n], group, group)] = rows.T @ moved
+                moments[n][np.ix_(group, group)] = rows.T @ moved
                 moved = scale * (stiffness @ moved)
         return moments
 
-    def _piece(self, group: list[int]) -> tuple[int, Chain]:
+    def _piece(self, group: np.ndarray) -> tuple[int, Chain]:
         """The first cell, and the chain, of what the series of a ``group`` of sites reaches: a cell each term."""
         chain = self.chain
         first = chain.sites[group[0]] - TERMS
@@ -75,17 +75,10 @@ class SeriesCompliance(WaveCompliance):
             last = chain.cells - 1
         return first, Chain(chain.cell, last - first + 1, chain.ends)
 
-    def _groups(self) -> list[list[int]]:
+    def _groups(self) -> list[np.ndarray]:
         """Numbers of the sites in the chain's list, together where their pieces overlap; a ring's all together."""
-        order = np.argsort(self.chain.sites, kind="stable").tolist()
+        sites = np.array(self.chain.sites)
+        order = np.argsort(sites, kind="stable")
         if self.chain.topology.is_ring:
             return [order]
-
-        groups = [[order[0]]]
-        for number in order[1:]:
-            distance = self.chain.sites[number] - self.chain.sites[groups[-1][-1]]
-            if distance <= 2 * TERMS:
-                groups[-1].append(number)
-            else:
-                groups.append([number])
-        return groups
+        return np.split(order, np.flatnonzero(np.diff(sites[order]) > 2 * TERMS) + 1)
