@@ -43,17 +43,6 @@ class Pair(NamedTuple):
         return np.asarray(w - field[..., cell, self.host])
 
 
-class Entries(NamedTuple):
-    """Entries of a matrix over all masses, in their order: ``rows``, ``columns``, ``values`` (entry,).
-
-    Entries at one place add up.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    values: np.ndarray
-
-
 @dataclass(frozen=True)
 class Chain:
     """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
@@ -266,13 +255,7 @@ class Chain:
         return (self._rows(start, stop, coefficients.damping) + ground).tocsr()
 
     def _rows(self, start: int, stop: int, values: np.ndarray) -> csr_matrix:
-        """Rows of a matrix that couples masses by springs, from ``values`` (cell, spring) of cells ``start`` - 1 on."""
-        entries = self._entries(start, stop, values)
-        shape = ((stop - start) * self.cell.dofs, self.cells * self.cell.dofs)
-        return coo_matrix((entries.values, (entries.rows, entries.columns)), shape=shape).tocsr()
-
-    def _entries(self, start: int, stop: int, values: np.ndarray) -> Entries:
-        """Entries of a matrix that couples masses by springs, from ``values`` (cell, spring) of cells ``start`` - 1 on.
+        """Rows of a matrix that couples masses by springs, from ``values`` (cell, spring) of cells ``start`` - 1 on.
 
         A spring to the next cell belongs to the cell in which it begins, hence the cell before ``start``.
         """
@@ -299,23 +282,9 @@ class Chain:
             columns += [here[held], neighbour[inside] * d + coupling.other]
             entries += [value[held], -value[inside]]
 
-        return Entries(rows=np.concatenate(rows), columns=np.concatenate(columns), values=np.concatenate(entries))
-
-    def stiffness_entries(self) -> Entries:
-        """The entries of the stiffness in N/m of all masses, for sums in another order than that of sparse matrices."""
-        return self._entries(0, self.cells, self.coefficients(-1, self.cells).stiffness)
-
-    def damping_entries(self) -> Entries:
-        """The entries of the damping in N s/m of all masses, as of ``stiffness_entries``."""
-        coefficients = self.coefficients(-1, self.cells)
-        springs = self._entries(0, self.cells, coefficients.damping)
-        ground = coefficients.grounding[1:].ravel()
-        masses = np.arange(len(ground))
-        return Entries(
-            rows=np.concatenate([springs.rows, masses]),
-            columns=np.concatenate([springs.columns, masses]),
-            values=np.concatenate([springs.values, ground]),
-        )
+        places = np.concatenate(rows), np.concatenate(columns)
+        shape = ((stop - start) * d, self.cells * d)
+        return coo_matrix((np.concatenate(entries), places), shape=shape).tocsr()
 
     def masses(self) -> np.ndarray:
         """Masses (cells dofs,) in kg of all cells, in their order."""
