@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from tests.references import recorded
+
 
 @dataclass(frozen=True)
 class Stop:
@@ -64,6 +66,26 @@ class ScipyLattice:
     stops: tuple[Stop, ...]
     force: Callable[[float], np.ndarray]
     curved: tuple[CurvedSpring, ...] = ()
+
+    def recorded_motion(
+        self, name: str, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float
+    ) -> tuple[np.ndarray, int]:
+        """Return what ``motion`` returns, from the reference ``name`` in ``tests/references``."""
+        stops = [
+            (stop.resonator, stop.host, stop.gap, stop.stiffness, stop.exponent, stop.restitution, stop.side)
+            for stop in self.stops
+        ]
+        curved = [[*spring.row, spring.quadratic, spring.cubic] for spring in self.curved]
+        forces = [self.force(t) for t in np.linspace(start, times[-1], 20)]
+        problem = (self.masses, self.stiffness, self.damping, stops, curved, forces, times[[0, -1]], len(times), u, v)
+
+        def solve() -> np.ndarray:
+            motion, impacts = self.motion(times, u, v, start)
+            # The number of impacts is a fourth quantity, the same at all times.
+            return np.concatenate([motion, np.full((1, *motion.shape[1:]), impacts)])
+
+        solution = recorded(name, problem, solve)
+        return solution[:3], int(solution[3, 0, 0])
 
     def motion(self, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float) -> tuple[np.ndarray, int]:
         """u, u' and u'' (quantity, time, mass) at ``times`` in s, and the number of impacts until the last time.

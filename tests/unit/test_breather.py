@@ -14,7 +14,6 @@ from scipy.special import ellipk
 
 from tests.condensed_branches import condensed_branch, condensed_breather
 from tests.models import CLEARANCE, four_band_contact, reduced_model
-from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.figures.registry import branch as draw
@@ -289,38 +288,3 @@ def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
     """The error for 2200 rad/s, in a gap but without a breather, names the key to change."""
     with pytest.raises(ContinuationError, match=r"no breather starts at 2200 rad/s: .*change nnm.start_frequency"):
         condensed_breather(cells=300, site=100, omega=2200.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        # The frequency lies in a pass band.
-        ("1000.0", "nnm.start_frequency"),
-        ("", "nnm.start_frequency"),
-        ("4000.0]\nstart_sites = [2", "nnm.start_sites"),
-        ("4000.0]\nharmonics = [3", "nnm.harmonics"),
-    ],
-)
-def test_bad_values_of_a_condensed_case_are_refused(change, key):
-    with pytest.raises(CaseError, match=key):
-        chain_case(change)
-
-
-@pytest.mark.parametrize(
-    ("nnm", "message"),
-    [
-        ({"method": "condensed", "start_frequency": [1600.0], "start_sites": [2]}, "site numbers from 1 to 1"),
-        ({"start_sites": [1]}, "motions that are condensed"),
-    ],
-)
-def test_start_sites_are_there_and_begin_condensed_motions(nnm, message):
-    """Start sites must exist, and belong to condensed motions."""
-    lattice = {"preset": "four-band", "cells": 14}
-    with pytest.raises(CaseError, match=message):
-        NnmCase.from_table({"lattice": lattice, "contacts": {"sites": [6]}, "nnm": {"system": "chain"} | nnm})
-
-
-@pytest.mark.parametrize("system", ["reduced", "chain"])
-def test_branches_that_are_shot_have_no_start_frequency(system):
-    with pytest.raises(CaseError, match=r"nnm.start_frequency"):
-        chain_case(cells=3, site=2, system=system)

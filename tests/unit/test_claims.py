@@ -15,13 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.unit.claim_files import measure, put_sweep
-from vipetsc.paper.cell_costs import PAPER_CELL
-from vipetsc.paper.claims import criteria as constants
 from vipetsc.paper.claims import measure_claims, write_claims
-from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
+from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, verdict
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
 from vipetsc.paper.claims.measure import measure_claim, rounded
-from vipetsc.spectra import FEWEST
 
 IDS = [f"C{number}" for number in range(1, 19)]
 
@@ -106,101 +103,7 @@ def test_a_curve_that_stays_on_its_floor_does_not_grow():
     assert np.isnan(floor.growth_ratio(10.0, 0.55))
 
 
-# The thresholds, apart from the file that the program reads: who changes one has to change both. A line is "claim |
-# quantity | comparison | threshold"; * stands for both laws.
-SPECIFIED = """
-C1 | ridge's largest distance from the optical branch | <= | 1
-C1 | loudest wavenumber's distance from 5 pi/9 | <= | 1
-C2 | contact episodes at low amplitude | <= | 0
-C2 | largest fraction of the energy that changes its wavenumber | <= | 0.01
-C3 | fraction at new wavenumbers, medium amplitude | >= | 0.1
-C3 | fraction at new wavenumbers, medium over low amplitude | >= | 10
-C3 | fraction within 2 % of the top edge from the Bloch branches | >= | 0.95
-C4 | new wavenumbers, high over medium amplitude | <= | 1
-C4 | fraction of the incident energy reflected, high amplitude | >= | 0.5
-C5 | smallest fraction in bins 7 and 8, Fourier | >= | 0.99
-C5 | smallest fraction in bins 7 and 8, wavelet | >= | 0.85
-C6 | largest error of the reconstructed kinetic energy after the drive | <= | 0.01
-C7 | floor of the normalised entropy | <= | 0.1
-C7 | fraction of configurations with an abrupt rise | of | 4 6
-C7 | fraction of configurations with the peak at 0.9 to 1.8 N | of | 4 6
-C7 | normalised entropy at 10 N behind the peak, 3 sites or more | <= | 0.17
-C7 | fraction of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
-C7 | fraction of configurations of neighbouring sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
-C8 | fraction of curves that rise, peak and fall by half | of | 30 36
-C8 | fraction of curves with adjusted R^2 >= 0.9 over 4 points or more | of | 30 36
-C9 | fraction of configurations with larger error bars from 10 N on than at the peak | of | 4 6
-C9 | fraction of configurations with larger error bars from 10 N on than without contact | of | 4 6
-C10 | lambda at the optimum of a grid of 0.1 | within | 0.05 0.15
-C10 | eta at the optimum of a grid of 0.1 | within | 0.45 0.55
-C10 | u2 and u3 out of phase on band 2 at the paper's cell (1 = yes) | >= | 1
-C11 | floor* | within | 3.1622776601683795e-05 0.00031622776601683794
-C11 | ratio of amplitudes from the floor to half the maximum* | <= | 3.1622776601683795
-C11 | maximum* | within | 0.28 0.36
-C12 | medium over low amplitude* | >= | 1
-C12 | medium over high amplitude* | >= | 1
-C13 | largest error of the mean over the record | <= | 0.01
-C13 | mean error over a period of the drive, largest of the runs | <= | 0.01
-C13 | largest fraction outside the paper's bands and gaps | <= | 0.01
-C13 | largest difference of a part's fraction from that in the space-time spectrum | <= | 0.01
-C13 | bound on the relative error of the modal energies' sum at any sample | <= | 1e-6
-C14 | maximum with one site* | within | 0.05 0.15
-C14 | maximum with one site over that with five* | <= | 1
-C14 | correlation of 15 and 30 cycles* | >= | 0.9
-C14 | ratio of the peaks' amplitudes, 15 and 30 cycles* | <= | 2
-C15 | regions* | >= | 4
-C15 | largest |d ln f / d ln E| in region I* | <= | 1e-06
-C15 | energy folds in region II* | >= | 2
-C15 | largest |multiplier| in region II* | >= | 1.001
-C15 | adjusted R^2 of the slope in region III* | >= | 0.95
-C15 | last frequency's relative distance from the limit, bilinear | <= | 0.01
-C15 | last d ln f / d ln E's distance from the 3/2 law's .1, hertz | <= | 0.01
-C16 | adjusted R^2 in region III* | >= | 0.95
-C16 | difference of the exponents* | <= | 0.2
-C16 | mean factor between transfer and slope* | <= | 2
-C17 | I: correlation of host and resonator* | <= | -0.9
-C17 | II: correlation with the motion without contact* | >= | 0.9
-C17 | III: largest fraction of energy above the driven band* | >= | 0.1
-C17 | IV: correlation of host and resonator* | >= | 0.99
-C17 | IV: fraction of energy above the driven band* | <= | 0.01
-C18 | rms of the upper bands' energy at the end, in decades* | <= | 0.06
-C18 | largest error of the dissipated fraction* | <= | 0.04
-C18 | amplitudes with contact on one side alone* | <= | 0
-"""
-
-
 CRITERIA = [(claim, criterion) for claim, spec in CLAIMS.items() for criterion in spec.criteria]
-
-
-def test_thresholds_are_those_specified():
-    """Quantities, comparisons and thresholds of all claims are those of ``SPECIFIED``, each with its source."""
-    expected = set()
-    for line in SPECIFIED.strip().splitlines():
-        claim, quantity, comparison, bounds = line.split(" | ")
-        numbers = tuple(map(float, bounds.split()))
-        threshold = numbers if len(numbers) > 1 else numbers[0]
-        for law in LAWS if quantity.endswith("*") else ("",):
-            name = quantity.replace("*", f", {law}")
-            expected.add((claim, name, comparison, threshold))
-
-    assert {(claim, c.quantity, c.comparison, c.threshold) for claim, c in CRITERIA} == expected
-    assert len(CRITERIA) == len(expected)
-    assert all(c.source for _, c in CRITERIA)
-    decisive = {(claim, c.threshold) for claim, c in CRITERIA if c.decisive}
-    assert decisive == {("C2", 0), ("C3", 0.1), ("C3", 10), ("C13", 0.01)}
-
-
-def test_constants_inside_of_quantities_are_those_specified():
-    """Constants within the definitions of quantities have these values, and Hertz's limit is that of its formula."""
-    assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE) == (0.95, 0.9)
-    assert (FEWEST, constants.SEVERAL) == (4, 3)
-    assert (constants.QUIET, constants.PEAK, constants.HIGH) == (0.1, (0.9, 1.8), 10.0)
-    assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
-    assert (constants.HALF_WIDTH, constants.NATIVE) == (0.02, (7, 8))
-    assert (PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
-    assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 3")
-    # (n - 1)/(2 (n + 1)) for the exponent n = 3/2 of Hertz's law.
-    assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == constants.HERTZ_LIMIT
 
 
 def finite(values: tuple[float, ...]) -> list[float]:

@@ -123,31 +123,6 @@ def test_samples_of_contacts_alone_have_one_linear_run():
     assert len(by_cells | by_contacts) == 4
 
 
-@pytest.mark.parametrize(
-    ("disorder", "message"),
-    [
-        ({}, "contains no quantity that scatters"),
-        ({"seed": 3}, "contains no quantity that scatters"),
-        ({"clearance": {"relative": -0.1}}, "disorder.clearance.relative = -0.1: must be greater than or equal to 0"),
-        ({"clearanc": {"relative": 0.1}}, "did you mean disorder.clearance?"),
-        ({"clearance": {"relative": 0.1, "absolute": 1e-4}}, "give either relative or absolute"),
-        ({"clearance": {}}, "give either relative or absolute"),
-        ({"clearance": {"relative": 0.9}}, "its sign must not change: use a smaller deviation, or lognormal"),
-        ({"clearance": {"relative": 0.1, "distribution": "norml"}}, "did you mean 'normal'?"),
-        ({"sites": {"relative": 0.1}}, "give `absolute`, in cells"),
-        ({"sites": {"absolute": 3.0}}, "draws contacts.sites = "),
-        ({"restitution": {"absolute": 0.25, "distribution": "uniform"}}, "draws contacts.each.restitution[1] = "),
-        ({"seed": -1, "clearance": {"relative": 0.1}}, "disorder.seed = -1"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_drawn_is_refused(disorder, message):
-    """A wrong section [disorder], or an impossible drawn number, is refused with one problem."""
-    with pytest.raises(CaseError) as error:
-        Case.from_table(BASE | {"contacts": TEN_SITES, "disorder": disorder})
-    assert message in str(error.value)
-    assert len(error.value.problems) == 1, error.value
-
-
 def test_the_clearances_of_the_two_sides_are_drawn_independently():
     """Clearances on the side w < 0 have numbers of their own, and those on the side w > 0 are as without them."""
     scatter = {"seed": 2, "clearance": {"relative": 0.05}}
@@ -243,13 +218,6 @@ def test_each_quantity_scatters_alone_about_its_values(key):
     assert 1e-5 < np.abs(ratio - 1).max() < 0.05
     others = set(nominal) - {key, "modulus", "stiffness" if key == "modulus" else ""}
     assert {name: drawn[name] for name in others} == {name: nominal[name] for name in others}
-
-
-def test_a_quantity_that_the_case_lacks_is_refused():
-    with pytest.raises(CaseError, match=r"disorder\.clearance: the case has none"):
-        draw({"sites": []}, clearance={"relative": 0.1})
-    with pytest.raises(CaseError, match=r"disorder\.modulus: the case has none"):
-        draw(TEN_SITES | {"stiffness": 1e6}, modulus={"relative": 0.1})
 
 
 SWEEP = BASE | {
@@ -377,11 +345,6 @@ def test_a_modulus_scales_the_stiffness_of_sites_with_radii_of_their_own():
     assert abs(ratio - 1) > 1e-3
     assert drawn.each.stiffness[1] == pytest.approx(ratio * plain.each.stiffness[1], rel=1e-15)
     assert drawn.stiffness == pytest.approx(ratio * plain.stiffness, rel=1e-15)
-
-
-def test_a_modulus_is_not_drawn_where_each_site_has_its_own():
-    with pytest.raises(CaseError, match=r"disorder\.modulus: the case has none"):
-        draw(TEN_SITES | {"each": {"modulus": [1e8] * 10}}, modulus={"relative": 0.1})
 
 
 def test_radii_of_the_sites_complete_the_material_of_all():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.assembly import assembled
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.lattice import Chain, UnitCell, Variation, four_band
 
 CELLS = 6
@@ -139,18 +139,3 @@ def test_rayleigh_damping_is_added_to_the_dashpots_of_a_case():
     # At the wavenumber pi the dashpot c to the next cell adds 4 c to the diagonal.
     bloch = UnitCell(cell.masses, cell.springs, 0, 1, cell.grounding).damping_matrix(np.pi)
     assert bloch == pytest.approx(np.array([[4 * 0.59 + 0.07, -0.05], [-0.05, 0.39]]))
-
-
-def test_negative_dashpots_are_refused():
-    with pytest.raises(CaseError, match=r"lattice\.damping\.mass"):
-        Case.from_table(damped_table({"damping": {"mass": -1.0}}, grounding=[-1.0]))
-
-    springs = damped_table()["lattice"]["cell"]["springs"]
-    springs[0]["damping"] = -1.0
-    for changes, key in (
-        ({"springs": springs}, r"lattice\.cell\.springs\[1\]\.damping"),
-        ({"grounding": [-1.0, 0.0]}, r"lattice\.cell\.grounding\[1\]"),
-        ({"grounding": [-1.0]}, r"lattice\.cell\.grounding"),
-    ):
-        with pytest.raises(CaseError, match=key):
-            Case.from_table(damped_table(**changes))

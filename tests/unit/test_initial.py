@@ -11,8 +11,7 @@ import xarray as xr
 from scipy.linalg import eigvalsh
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError, LawCase, Sweep
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, four_band
@@ -21,7 +20,6 @@ from vipetsc.lattice.packet import gaussian_packet
 from vipetsc.studies.linear_run import linear_case
 
 PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 2, "energy": 1e-3}
-STRUCK = {"kind": "velocity", "cell": 5, "velocity": 1.0}
 FOUR_BAND = {"preset": "four-band", "cells": 24}
 TABLE = {"name": "t", "lattice": FOUR_BAND, "contacts": {"sites": 0}}
 
@@ -164,73 +162,6 @@ def test_members_of_a_sweep_begin_in_motion():
     table = TABLE | {"initial": PACKET | {"cell": 5}, "sweep": {"initial": {"energy": [1e-3, 4e-3]}}}
     plan = Sweep.from_table(table)
     assert plan.case(1).initial.amplitude == pytest.approx(2 * plan.case(0).initial.amplitude)
-
-
-@pytest.mark.parametrize(
-    ("initial", "key", "remedy"),
-    [
-        ({"kind": "pocket"}, "initial.kind", "did you mean 'packet'"),
-        ({"kind": "mode", "energy": 1e-3}, "initial.number", "one of number and near"),
-        ({"kind": "mode", "number": 97, "energy": 1.0}, "initial.number", "has 96 modes"),
-        ({"kind": "mode", "number": 3}, "initial.amplitude", "one of amplitude and energy"),
-        ({"kind": "mode", "number": 3, "amplitude": 1e-3, "width": 3.0}, "initial.width", "does not apply"),
-        (PACKET | {"amplitude": 1e-3}, "initial.amplitude", "one of"),
-        (PACKET | {"band": 5}, "initial.band", "has 4 bands"),
-        (PACKET | {"cell": 25}, "initial.cell", "1 to 24"),
-        ({key: value for key, value in PACKET.items() if key != "width"}, "initial.width", "missing"),
-        ({"kind": "file"}, "initial.path", "missing"),
-        ({"kind": "file", "path": "nowhere.h5"}, "initial.path", "cannot be opened"),
-    ],
-)
-def test_an_initial_motion_that_cannot_be_is_refused(initial, key, remedy):
-    with pytest.raises(CaseError) as refused:
-        case_with(initial=initial)
-    assert [problem.key for problem in refused.value.problems] == [key]
-    assert remedy in str(refused.value)
-
-
-def test_a_case_needs_a_drive_or_a_motion():
-    with pytest.raises(CaseError, match="must not be zero"):
-        case_with(drive={"amplitude": 0.0})
-
-
-def test_tolerances_of_the_paper_are_for_its_drive():
-    with pytest.raises(CaseError, match=r"time\.atol"):
-        case_with(initial=PACKET, time={"atol": "paper"})
-
-
-def test_a_rigid_motion_is_no_mode_to_begin_with():
-    """The mode 1 of a free lattice, with the frequency 0, is refused as an initial motion."""
-    with pytest.raises(CaseError, match="frequency of this mode is 0"):
-        case_with(lattice=FOUR_BAND | {"ends": "free"}, initial={"kind": "mode", "number": 1, "amplitude": 1e-3})
-    # One free mass has no other mode.
-    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
-    one_mass = {"cells": 1, "ends": "free", "cell": {"masses": [1e-3], "springs": [spring]}}
-    for which in ({"number": 1}, {"near": 100.0}):
-        with pytest.raises(CaseError, match="frequency of this mode is 0"):
-            Case(lattice=one_mass, initial={"kind": "mode", "amplitude": 1e-3} | which, time={"end": 1e-2})
-
-
-def test_scattering_laws_begin_at_rest():
-    with pytest.raises(CaseError, match=r"initial\.kind"):
-        LawCase.from_table(TABLE | {"initial": PACKET, "drive": {"amplitude": 1.0}, "law": {}})
-
-
-@pytest.mark.parametrize(
-    ("initial", "search", "sentence"),
-    [
-        (PACKET, {"start": "matched"}, "there is no scattering law by which clearances could be matched"),
-        (STRUCK, {}, "masses that are struck send waves of all bands"),
-        (PACKET | {"band": 4}, {}, "the driven band is the highest of 4"),
-    ],
-)
-def test_searches_say_what_a_free_motion_does_not_have(initial, search, sentence):
-    """Searches with an initial motion refuse a matched start, bands of struck masses, and energy above the top band."""
-    contacts = {"sites": [6], "clearance": 1e-3}
-    search = {"variables": {"clearance": [1e-4, 1e-2]}} | search
-    table = TABLE | {"initial": initial, "contacts": contacts, "time": {"end": 0.1}, "optimise": search}
-    with pytest.raises(CaseError, match=sentence):
-        OptimiseCase.from_table(table)
 
 
 def put_branch(path: Path, size: float = 1e-4) -> None:

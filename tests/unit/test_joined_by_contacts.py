@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vipetsc.case import Case, CaseError, LawCase, NnmCase
+from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.bodies import bodies_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.optimise import OptimiseCase
 from vipetsc.cli.verbs.bands_verb import bands_table, without_bands
 from vipetsc.lattice import Chain, Spring, UnitCell, fastest_speed, four_band, modes_of_a_cell, wave_bands, waves_at
 from vipetsc.lattice.chain import Pair
@@ -90,30 +89,6 @@ def test_every_mass_belongs_to_the_lattice():
         assert Case.from_table(table(lattice=three, contacts=sites | {"each": each}))
 
 
-@pytest.mark.parametrize(
-    ("sections", "key", "reason"),
-    [
-        ({"drive": {"frequency": None, "band": 2, "wavenumber": 1.0}}, "drive.wavenumber", "no bands"),
-        ({"drive": {"frequency": None, "band": 2, "at": "max-group-velocity"}}, "drive.band", "no bands"),
-        ({"time": {"end": "traverse"}}, "time.end", "no bands"),
-        ({"time": {"sample_interval": "auto"}}, "time.sample_interval", "no bands"),
-        ({"time": {"sample_interval": 2e-3}}, "time.sample_interval", "its highest mode's Nyquist interval"),
-        ({"lattice": {"ends": "fixed"}, "drive": {"end": "left"}}, "drive.end", "the cell has none"),
-        ({"lattice": {"cells": 9, "absorbing": {"cells": 2, "strength": 1.0}}}, "lattice.absorbing", "no linear waves"),
-        ({"lattice": {"damping": {"loss": {"2": 0.1}}}}, "lattice.damping.loss", "no bands"),
-        ({"initial": {"kind": "mode", "number": 5, "amplitude": 1e-6}}, "initial.kind", "those of single cells"),
-        (
-            {"initial": {"kind": "packet", "band": 2, "wavenumber": 1.0, "cell": 2, "width": 1.0, "amplitude": 1e-6}},
-            "initial.kind",
-            "no waves",
-        ),
-    ],
-)
-def test_what_needs_waves_is_refused(sections, key, reason):
-    found, remedy = problem_of(Case, **sections)
-    assert found == key and reason in remedy
-
-
 def test_what_springs_within_cells_have_is_accepted():
     """Springs within cells may have dashpots and nonlinear parts, and cells may differ."""
     spring = INSIDE | {"damping": 0.1, "cubic": 1e9}
@@ -136,28 +111,6 @@ def test_a_struck_grain_has_the_faster_of_its_spring_and_its_contact(speed):
     spring = np.sqrt(5e3 / 4e-3)
     assert (contact > spring) == (speed == 1.0)
     assert case.initial.frequency == pytest.approx(max(contact, spring), rel=1e-9)
-
-
-def test_a_law_of_waves_is_none_of_contacts():
-    """A scattering law is refused where no linear wave can arrive."""
-    key, remedy = problem_of(LawCase, law={"clearance": 1e-5}, contacts=APART)
-    assert key == "lattice.cell.springs" and "no linear wave arrives" in remedy
-
-
-@pytest.mark.parametrize(
-    "objective",
-    [
-        {"measure": "upper_share_at_end"},
-        {"measure": "ibtet"},
-        {"measure": "ibtet_whole"},
-        {"measure": "band_share", "band": 1},
-        {"measure": "bands/share", "band": 1},
-    ],
-)
-def test_no_search_is_for_energies_of_bands(objective):
-    search = {"budget": 2, "variables": {"clearance": [1e-6, 1e-4]}, "objective": [objective]}
-    key, remedy = problem_of(OptimiseCase, contacts=APART, optimise=search)
-    assert key == "optimise.objective[1].measure" and "there are no bands" in remedy
 
 
 def chain_of(pairs: tuple[Pair, ...]) -> Chain:
@@ -301,9 +254,3 @@ def test_responses_are_those_of_a_pressed_chain():
     inside = {"sites": [1, 2, 3, 2], "pair": None, "next_cell": None, "precompression": None}
     each = {"pair": [[1, 1]] * 3 + [[1, 2]], "next_cell": [True] * 3 + [False], "precompression": [1e-4] * 3 + [0.0]}
     assert NfrcCase.from_table(response(contacts=inside | {"each": each}))
-
-
-@pytest.mark.parametrize("nfrc", [{"source": "wave"}, {"infinite": True}])
-def test_no_response_is_that_of_waves(nfrc):
-    with pytest.raises(CaseError, match="no linear wave travels through cells that contacts alone join"):
-        NfrcCase.from_table(response(nfrc=nfrc, contacts=APART))

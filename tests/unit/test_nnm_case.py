@@ -46,40 +46,6 @@ def test_a_case_is_written_out_and_read_back():
     assert [system.branch_name(mode) for mode in (0, 1)] == ["in-phase", "out-of-phase"]
 
 
-@pytest.mark.parametrize(
-    ("nnm", "message"),
-    [
-        ({"modes": [3]}, "2 modes"),
-        ({"system": "own"}, r"nnm.own"),
-        # A branch that is followed downwards ends at its lowest energy, which must not be that of rest.
-        ({"direction": "down"}, "lowest energy above 0"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(nnm, message):
-    """A mode that the system lacks, a system that is not given and a direction without an end are refused."""
-    with pytest.raises(CaseError, match=message):
-        NnmCase.from_table({"nnm": nnm})
-
-
-# Tables of a spring, a smooth spring and a contact between the masses 1 and 2.
-PAIR = {"start": 1, "end": 2}
-WRONG_PAIRS = {
-    "springs": PAIR | {"stiffness": 1.0},
-    "smooth": PAIR | {"cubic": 1.0},
-    "contacts": {"host": 1, "resonator": 2, "clearance": 1.0},
-}
-
-
-@pytest.mark.parametrize("key", WRONG_PAIRS)
-def test_pairs_that_are_not_in_the_system_are_named(key):
-    """A spring or contact to the second mass of a system of one mass is refused by its key."""
-    own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}], "smooth": [], "contacts": []}
-    own[key] = [*own[key], WRONG_PAIRS[key]]
-
-    with pytest.raises(CaseError, match=rf"nnm.own.{key}.*not a pair of the 1 masses"):
-        NnmCase.from_table({"nnm": {"system": "own", "own": own}})
-
-
 def test_unknowns_by_the_gap_of_a_contact_need_a_contact():
     """The chart "grazing" is refused for a system without contacts; "auto" takes another one there."""
     own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}]}
@@ -87,39 +53,6 @@ def test_unknowns_by_the_gap_of_a_contact_need_a_contact():
     with pytest.raises(CaseError, match=r"nnm\.chart = 'grazing'.*there is no contact"):
         NnmCase.from_table({"nnm": nnm | {"chart": "grazing"}})
     NnmCase.from_table({"nnm": nnm | {"chart": "auto"}})
-
-
-def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
-    """Presets have default clearances and contact stiffnesses; another cell without them is refused."""
-    springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]
-    lattice = {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}
-
-    with pytest.raises(CaseError, match=r"contacts\.clearance"):
-        NnmCase.from_table({"lattice": lattice, "contacts": {"stiffness": 1.0}})
-    with pytest.raises(CaseError, match=r"contacts\.stiffness: missing; give it or also modulus, radius, poisson"):
-        NnmCase.from_table({"lattice": lattice, "contacts": {"clearance": 0.1}})
-
-
-@pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
-@pytest.mark.parametrize(
-    ("table", "key"),
-    [
-        ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
-        ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: applies only to law"),
-        ({"contacts": {"clearance": 0.0, "side": "plus"}}, "no motion about it is linear"),
-        ({"contacts": {"each": {"law": ["bilinear", "hertz", "hertz"]}}}, "contacts.each"),
-        ({"contacts": {"pair": [2, 2]}}, r"contacts\.pair"),
-        ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
-        ({"disorder": {"seed": 1, "cells": {"mass": {"relative": 0.01}}}}, "disorder"),
-    ],
-)
-def test_what_branches_do_not_support_is_refused(nnm, table, key):
-    """Absorbing ends, stops that touch at rest and incomplete contacts are refused for every kind of system."""
-    contacts = {"sites": [2], "clearance": 1e-3} | table.get("contacts", {})
-    lattice = {"preset": "four-band", "cells": 8} | table.get("lattice", {})
-
-    with pytest.raises(CaseError, match=key):
-        NnmCase.from_table(table | {"contacts": contacts, "lattice": lattice, "nnm": nnm})
 
 
 @pytest.mark.parametrize(
@@ -138,46 +71,6 @@ def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table(table)
     assert NnmCase.from_table({"contacts": {"side": "plus"}}).gaps() == ((pytest.approx(CLEARANCE), float("inf")),)
-
-
-OWN = {
-    "masses": [1.0, 1.0],
-    "springs": [{"start": 0, "end": 1, "stiffness": 1.0}, {"start": 1, "end": 2, "stiffness": 1.0}],
-}
-FREE = {"preset": "four-band", "cells": 8, "ends": "free"}
-OPEN = OWN | {"contacts": [{"host": 1, "resonator": 2, "clearance": 0.1}]}
-TOUCHING = OWN | {"contacts": [{"host": 1, "resonator": 2, "clearance": 0.0}]}
-
-
-@pytest.mark.parametrize(
-    ("contacts", "nnm", "key"),
-    [
-        ({"each": {"pair": [[1, 2]]}}, {}, "contacts.each.pair"),
-        ({"pair": [1, 2]}, {}, "contacts.pair"),
-        (
-            {"sites": [2], "clearance": 1e-3, "side": "minus", "each": {"clearance_minus": [0.0]}},
-            {"system": "chain"},
-            "contacts.each.clearance_minus",
-        ),
-        (
-            {"sites": [2], "clearance": 1e-3, "side": "plus", "each": {"pair": [[0, 3]]}},
-            {"system": "chain", "modes": [5]},
-            "contacts.each.pair",
-        ),
-        (
-            {"sites": [2, 4], "clearance": 1e-3, "each": {"pair": [[0, 3], [1, 2]], "side": ["both", "plus"]}},
-            {"system": "chain", "modes": [5]},
-            "contacts.each.pair",
-        ),
-        ({"each": {"next_cell": [True]}}, {"system": "own", "own": OPEN}, "contacts.each.next_cell"),
-        ({"stiffness": 1.0}, {"system": "own", "own": TOUCHING}, "nnm.own.contacts"),
-    ],
-)
-def test_a_wrong_key_is_named_where_it_is_given(contacts, nnm, key):
-    """A problem of a list over the contacts has its path, and one of a clearance of [nnm.own] the path of the pair."""
-    with pytest.raises(CaseError) as error:
-        NnmCase.from_table({"contacts": contacts, "lattice": FREE, "nnm": nnm})
-    assert key in [problem.key for problem in error.value.problems]
 
 
 def test_a_lattice_that_nothing_holds_is_not_pushed():
@@ -252,22 +145,6 @@ def test_disorder_is_drawn_for_normal_modes():
     # The masses were drawn, too.
     assert not case.chain().is_uniform()
     assert NnmCase.from_toml(case.to_toml()) == case
-
-
-@pytest.mark.parametrize(
-    ("nnm", "message"),
-    [
-        ({"forced": [3]}, "no mass; there are 2"),
-        ({"forced": [1, 1]}, r"\[mass\], or in a lattice"),
-        ({"system": "chain", "forced": [9, 1]}, "4 in each of 8 cells"),
-        ({"system": "condensed", "start_frequency": [1600.0], "forced": [2]}, r"\[cell, mass\]"),
-    ],
-)
-def test_a_forced_mass_that_is_not_there_is_refused(nnm, message):
-    """A forced mass must exist: ``[mass]`` of a system, or ``[cell, mass]`` of a lattice."""
-    table = {"lattice": {"preset": "four-band", "cells": 8}, "contacts": {"sites": [2], "clearance": 1e-3}}
-    with pytest.raises(CaseError, match=message):
-        NnmCase.from_table(table | {"nnm": nnm})
 
 
 def test_beads_between_ends_without_walls_move_as_a_rigid_body():

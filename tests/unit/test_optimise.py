@@ -133,46 +133,6 @@ def plan(*changes: str) -> OptimiseCase:
     return OptimiseCase.from_table(TABLE, changes)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (["contacts.sites=0", "contacts.clearance="], "no sites"),
-        (["contacts.sites=0", "contacts.clearance=", "optimise.variables={profile=[1e-4, 1e-3]}"], "no sites"),
-        (["optimise.variables.clearance=[-1e-3, 1e-2]"], "clearance[1] = -0.001: must be greater than 0"),
-        (["optimise.variables.clearance=[1e-2, 1e-3]"], "low below high"),
-        (["optimise.objective=[{measure='band_share'}]"], "objective[1].band: missing; band_share needs a band"),
-        (["optimise.objective=[{measure='band_share', band=5}]"], "the cell has 4 bands"),
-        (["optimise.objective=[{measure='ibtet', band=2}]"], "only band_share has a band"),
-        (["optimise.objective=[{measure='band_share', band=4, part=[100.0, 200.0]}]"], "meet band 4, 3214.9-3644.8"),
-        (["optimise.objective=[{measure='ibtett'}]"], "did you mean 'ibtet'"),
-        (["optimise.objective=[]"], "optimise.objective"),
-        (["optimise.variables.clearence=[1e-3, 1e-2]"], "did you mean optimise.variables.clearance"),
-        (["optimise.variables.clearance="], "contains no quantity that varies"),
-        (["optimise.variables.profile=[1e-3, 1e-2]"], "not both"),
-        (["optimise.variables.masses.5=[1e-3, 1e-2]"], "masses are numbered from 1 to 4"),
-        (["optimise.variables.masses.01=[1e-3, 1e-2]"], "masses are numbered from 1 to 4"),
-        (["optimise.variables.springs.x=[1e3, 1e4]"], "springs are numbered from 1 to 4"),
-        (["optimise.variables.sites=[10, 11]"], "within cells 1 to 40 and have room for all 3 sites"),
-        (["optimise.variables.sites=[0, 30]"], "within cells 1 to 40"),
-        (["optimise.variables.restitution=[0.5, 1.5]"], "restitution[2] = 1.5"),
-        (["optimise.variables={restitution=[0.5, 0.9]}", "optimise.start=matched"], "let clearance or profile vary"),
-        (["optimise.samples=3"], "no [disorder]"),
-        (["disorder.clearance.relative=-0.1"], "disorder.clearance.relative = -0.1"),
-        (["contacts.sites=[50]"], "outside the lattice"),
-        (["lattice.ends=periodic", "optimise.objective=[{measure='transmitted'}]"], "the last site of a ring"),
-        (["lattice.preset=diatomic", "drive={wavenumber='5pi/9', band=2}"], "the driven band is the highest of 2"),
-        (["optimise=3"], "give the quantities that vary"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_with_a_search_is_named(changes, message):
-    """A search with one error is refused with one problem: its key, its value and a remedy."""
-    with pytest.raises(CaseError) as error:
-        plan(*changes)
-    assert message in str(error.value)
-    # Keys that depend on the wrong one are not reported.
-    assert len(error.value.problems) == 1
-
-
 def test_all_problems_come_at_once(tmp_path):
     """Two wrong variables are named in one error, by the case's own reader and by that of all verbs."""
     path = tmp_path / "bad.toml"

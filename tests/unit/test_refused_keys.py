@@ -8,11 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError, LawCase, NnmCase
+from vipetsc.case import Case, CaseError
 from vipetsc.case.case_file import sections_in
 from vipetsc.case.contacts import describe_stops
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics.propagator.step_choice import refusal
@@ -37,66 +35,11 @@ def problem_of(table: dict[str, Any], overrides: tuple[str, ...] = ()) -> tuple[
     return problem.key, problem.remedy
 
 
-@pytest.mark.parametrize(
-    ("contacts", "key"),
-    [
-        # A precompression below the clearances has no effect.
-        ({"precompression": 1e-5}, "contacts.precompression"),
-        ({"each": {"precompression": [0.0, 1e-5]}}, "contacts.each.precompression"),
-        ({"side": "plus", "clearance_minus": 1e-5}, "contacts.clearance_minus"),
-        ({"each": {"side": ["plus", "plus"], "clearance_minus": [1e-5, 1e-5]}}, "contacts.each.clearance_minus"),
-    ],
-)
-def test_a_key_of_a_stop_that_does_nothing_is_refused(contacts, key):
-    """A precompression below the clearance, or a clearance on a side without a stop, is refused."""
-    stops = {"sites": [4, 9], "clearance": 3e-5, "restitution": 1.0}
-    with pytest.raises(CaseError) as error:
-        small_case(contacts=stops | contacts)
-    assert [problem.key for problem in error.value.problems] == [key]
-
-
-@pytest.mark.parametrize(
-    ("contacts", "key"),
-    [
-        ({"each": {"pair": [[1, 2], [1, 9]]}}, "contacts.each.pair"),
-        ({"each": {"pair": [[1, 2], [3, 3]]}}, "contacts.each.pair"),
-        ({"pair": [1, 9]}, "contacts.pair"),
-        ({"sites": [4, 24], "each": {"next_cell": [False, True]}}, "contacts.each.next_cell"),
-        ({"sites": [4, 24], "next_cell": True}, "contacts.next_cell"),
-        ({"each": {"stiffness": [1e7, 1e7], "radius": [1e-3, 2e-3]}}, "contacts.each.stiffness"),
-    ],
-)
-def test_a_wrong_key_is_named_where_it_is_given(contacts, key):
-    """A problem of a list over the sites has the path of that list, not that of the key of all sites."""
-    with pytest.raises(CaseError) as error:
-        small_case(contacts={"sites": [4, 9], "clearance": 3e-5} | contacts)
-    assert [problem.key for problem in error.value.problems] == [key]
-
-
 def test_a_clearance_of_the_side_minus_is_taken_where_one_site_has_a_stop_there():
     """``clearance_minus`` is accepted if at least one site has a stop on that side."""
     case = small_case(contacts={"sites": [4, 9], "clearance": 3e-5, "clearance_minus": 1e-5,
                                 "each": {"side": ["plus", "both"]}})  # fmt: skip
     assert case.model().gaps[1] == (3e-5, 1e-5)
-
-
-def test_a_pressed_site_of_a_law_is_named_where_it_is_given():
-    """A law has no value at a site that is pressed at rest, by a key for all sites or by a list."""
-    contacts = {"sites": [6, 12], "clearance": 1e-4, "side": "plus", "restitution": 1.0}
-    for pressed, key in (({"precompression": 2e-4}, "contacts"), ({"precompression": [0.0, 2e-4]}, "contacts.each")):
-        given = pressed if key == "contacts" else {"each": pressed}
-        with pytest.raises(CaseError) as error:
-            LawCase.from_table({"lattice": {"preset": "four-band"}, "contacts": contacts | given, "law": {}})
-        assert [problem.key for problem in error.value.problems] == [f"{key}.precompression"]
-
-
-def test_a_restitution_of_steady_states_suits_the_damping_of_every_site():
-    """The damping of one site that grows without bound towards 0 bounds the restitutions of all curves from below."""
-    contacts = {"sites": [4, 9], "clearance": 3e-5, "each": {"damping": ["paper", "flores"]}}
-    table = {"lattice": {"preset": "four-band", "cells": 24}, "contacts": contacts}
-    with pytest.raises(CaseError) as error:
-        NfrcCase.from_table(table | {"nfrc": {"restitutions": [0.01, 0.5]}})
-    assert [(problem.key, problem.value) for problem in error.value.problems] == [("nfrc.restitutions", [0.01])]
 
 
 def test_what_follows_in_other_lines_of_an_override_is_refused():
@@ -116,20 +59,6 @@ def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_t
     assert case.drive.frequency == pytest.approx(3.141592653589793e5)
 
 
-@pytest.mark.parametrize("first", [{"frequency": 1000.0}, {"waveform": "impulse", "duration": 1e-4}])
-def test_a_further_drive_needs_a_wave(first):
-    """A wavenumber so small that its frequency is 0 is refused for every drive, whatever the first one is."""
-    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
-    further = [{"frequency": 900.0}, {"wavenumber": 1e-9, "band": 1}]
-    key, remedy = problem_of({
-        "lattice": {"cell": {"masses": [1e-3], "springs": [spring]}, "cells": 24},
-        "contacts": {"sites": []},
-        "drive": first | {"more": further},
-        "time": {"end": 1e-3, "sample_interval": 1e-4},
-    })  # fmt: skip
-    assert key == "drive.more[2].wavenumber" and "the frequency there is 0" in remedy
-
-
 def test_a_further_drive_may_stand():
     """A run lasts until the wave of the first drive has crossed the lattice: that of a further one need not travel."""
     standing = {"wavenumber": "pi", "band": 1}
@@ -142,25 +71,6 @@ def test_a_further_drive_may_stand():
     assert Case.from_table(table).drive.more[0].frequency > 0
     key, remedy = problem_of(table | {"drive": standing})
     assert key == "drive.wavenumber" and "never crosses" in remedy
-
-
-def test_a_burst_without_springs_needs_its_frequency():
-    table = unsprung_table() | {"drive": {"amplitude": 1.0}}
-    with pytest.raises(CaseError) as error:
-        Case.from_table(table)
-    assert {problem.key for problem in error.value.problems} == {"drive.frequency"}
-
-
-@pytest.mark.parametrize(
-    "motion",
-    [
-        {"kind": "mode", "number": 2, "amplitude": 1e-5},
-        {"kind": "packet", "band": 1, "wavenumber": 1.0, "cell": 2, "width": 1.0, "amplitude": 1e-5},
-    ],
-)
-def test_a_lattice_without_springs_begins_with_no_mode_and_no_packet(motion):
-    key, remedy = problem_of(unsprung_table(initial=motion))
-    assert key == "initial.kind" and "without springs" in remedy
 
 
 def test_stops_are_described_by_what_they_are():
@@ -223,13 +133,6 @@ def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, re
     assert reason in str(refusal(case.model()))
 
 
-def test_a_precompression_is_named_as_it_is_given():
-    """The message has the key's value, not the indentation, which is smaller by the clearance."""
-    stops = {"sites": [4], "clearance": 1e-5, "precompression": 3e-5, "side": "plus", "restitution": 0.7}
-    with pytest.raises(CaseError, match=r"contacts\.precompression = 3e-05: site 1: a precompressed contact"):
-        small_case(contacts=stops)
-
-
 def test_every_union_is_read_by_the_shape_of_its_value():
     """A union without the mark would give the errors of all of its types, with pydantic's own names in their paths."""
     waiting = list(SECTIONS.values())
@@ -261,21 +164,3 @@ def test_a_step_that_is_far_too_long_is_refused_without_an_overflow(grounding, c
     )
     assert "is too long for" in refusal(case.model())
     assert dict(run_rows(case, 1))["engine"].startswith("ts")
-
-
-@pytest.mark.parametrize(
-    ("kind", "table", "key"),
-    [
-        (NfrcCase, {"nfrc": {"range": [2.0, 1.0]}}, "nfrc.range"),
-        (NnmCase, {"nnm": {"energy": [1.0, 1.0]}}, "nnm.energy"),
-        (NnmCase, {"nnm": {"frequency": [2.0, 1.0]}}, "nnm.frequency"),
-        (OptimiseCase, {"optimise": {"variables": {"clearance": [1e-2, 1e-4]}}}, "optimise.variables.clearance"),
-        (OptimiseCase, {"optimise": {"variables": {"masses": {"1": [2.0, 1.0]}}}}, "optimise.variables.masses.1"),
-        (OptimiseCase, {"optimise": {"variables": {"restitution": [0.9, 0.1]}}}, "optimise.variables.restitution"),
-    ],
-)
-def test_the_low_end_of_a_range_is_below_the_high_one(kind, table, key):
-    """One sentence for all ranges, at the path of the range."""
-    with pytest.raises(CaseError) as caught:
-        kind.from_table(table)
-    assert {problem.key: problem.remedy for problem in caught.value.problems}[key].startswith("must be [low, high]")

@@ -168,59 +168,6 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
 
 
 @pytest.mark.parametrize(
-    ("variables", "key", "message"),
-    [
-        ({"contacts": {"restitutions": {"linear": [0.1, 0.9]}}}, "contacts.restitutions", "did you mean"),
-        ({"contacts": {"restitution": {"linear": [0.1, 1.9]}}}, "contacts.restitution", "less than or equal to 1"),
-        ({"contacts": {"restitution": {"log": [0.0, 0.9]}}}, "contacts.restitution", "linear bounds may be 0"),
-        ({"contacts": {"restitution": {"linear": [0.9, 0.1]}}}, "contacts.restitution", "low below high"),
-        ({"contacts": {"restitution": {"linear": [0.9]}}}, "contacts.restitution", "{ whole = [low, high] }"),
-        ({"contacts": {"restitution": [0.9]}}, "contacts.restitution", "two values or more"),
-        ({"contacts": {"law": ["hertz", "herz"]}}, "contacts.law", "did you mean 'hertz'"),
-        ({"drive": {"cycles": {"whole": [1.5, 3.5]}}}, "drive.cycles", "whole numbers"),
-        ({"drive": {"bandwidth": {"log": [1.0, 3.0]}}}, "drive.bandwidth", "does not apply to the waveform"),
-        ({"lattice": {"damping": {"mass": {"log": [0.1, 1.0]}}}}, "lattice.damping.mass", "has no number in the case"),
-        ({"lattice": {"cell": {"masses[3]": {"log": [0.1, 1.0]}}}}, "lattice.cell.masses[3]", "has the entries 1 to 2"),
-        ({"drive": {"cell": {"whole": [1, 25]}}}, "drive.cell", "outside the lattice"),
-        (
-            {"restitution": [0.1, 0.9], "contacts": {"restitution": {"linear": [0.1, 0.9]}}},
-            "contacts.restitution",
-            "varies by another variable",
-        ),
-        (
-            {"clearance": [1e-5, 1e-2], "contacts": {"clearance": {"log": [1e-5, 1e-2]}}},
-            "contacts.clearance",
-            "varies by another variable",
-        ),
-    ],
-)
-def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, message):
-    """A wrong variable is refused with one problem at the path of its key."""
-    with pytest.raises(CaseError) as error:
-        plan_of(variables)
-    # No other check reports the same problem or one that follows from it.
-    (problem,) = error.value.problems
-    assert problem.key == f"optimise.variables.{key}"
-    assert message in str(problem)
-
-
-def test_the_entries_of_an_empty_list_do_not_vary():
-    """A range of a list without entries is refused at the path of its key, as it has no variable."""
-    with pytest.raises(CaseError) as error:
-        plan_of({"drive": {"more": {"linear": [1.0, 2.0]}}}, drive={"more": []})
-    (problem,) = error.value.problems
-    assert problem.key == "optimise.variables.drive.more"
-    assert "empty list" in problem.remedy
-
-
-@pytest.mark.parametrize("variables", [{"restitution": [0.1, 0.9]}, {"contacts": {"restitution": [0.1, 0.9]}}])
-def test_a_key_that_the_sites_do_not_take_is_no_variable(variables):
-    """The common restitution is no variable where each site has its own, since it has no effect."""
-    with pytest.raises(CaseError, match=r"contacts\.each\.restitution, which can vary instead"):
-        plan_of(variables, contacts={"each": {"restitution": [0.5, 0.6, 0.7]}})
-
-
-@pytest.mark.parametrize(
     ("variables", "key"),
     [
         ({"clearance": [1e-8, 1e-5]}, "clearance"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vipetsc.case import Case, CaseError, LawCase
+from vipetsc.case import Case, CaseError
 
 STIFFNESS = 7.4e9
 MASS = 2.05e-3
@@ -70,32 +70,6 @@ def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
     assert driven.initial.frequency is None
 
 
-@pytest.mark.parametrize(
-    ("initial", "message"),
-    [
-        ({"cell": 1}, r"initial\.velocity: missing; kind = 'velocity' needs cell, velocity"),
-        ({"cell": 1, "velocity": 0.0}, r"initial\.velocity = 0\.0: must not be zero; give it in m/s"),
-        ({"cell": 9, "velocity": 1.0}, r"initial\.cell = 9: outside the lattice; cells are numbered from 1 to 5"),
-        ({"cell": 1, "mass": 2, "velocity": 1.0}, r"initial\.mass = 2: the cell has 1 masses"),
-        ({"cell": 1, "velocity": 1.0, "number": 2}, r"initial\.number = 2: does not apply to the kind 'velocity'"),
-        (
-            {"cell": 1, "velocity": 1.0, "more": [{"cell": 1, "velocity": 2.0}]},
-            r"initial\.more\[1\]\.cell = 1: mass 1 of this cell is given twice",
-        ),
-        (
-            {"cell": 1, "velocity": 1.0, "more": [{"cell": 6, "velocity": 2.0}]},
-            r"initial\.more\[1\]\.cell = 6: outside the lattice",
-        ),
-        ({"cell": 1, "velocity": 1.0, "more": [{"cell": 2, "speed": 2.0}]}, r"initial\.more\[1\]\.speed"),
-        ({"kind": "zero", "velocity": 1.0}, r"initial\.velocity = 1\.0: does not apply to the kind 'zero'"),
-    ],
-)
-def test_what_is_refused(initial, message):
-    """Each problem of an initial velocity has its key, its value and a remedy."""
-    with pytest.raises(CaseError, match=message):
-        beads(initial)
-
-
 def test_two_frequencies_are_refused():
     """A frequency of the initial motion beside that of a drive is refused, and accepted without a drive."""
     initial = {"cell": 1, "velocity": 1.0, "frequency": 1e4}
@@ -110,14 +84,6 @@ def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
     with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
         beads({"cell": 1, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
     assert beads({"cell": 3, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
-
-
-def test_verbs_about_waves_refuse_it():
-    """A scattering law, which needs a lattice at rest, refuses an initial motion."""
-    with pytest.raises(
-        CaseError, match=r"initial\.kind = 'velocity': the law's fractions .* in a lattice that starts at rest"
-    ):
-        LawCase.from_table({"initial": {"kind": "velocity", "cell": 1, "velocity": 1.0}, "law": {}})
 
 
 def test_a_lossy_site_is_not_at_rest_where_the_mass_of_the_next_cell_is_struck():

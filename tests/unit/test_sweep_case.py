@@ -111,35 +111,6 @@ def test_written_out_and_read_back_it_has_the_same_members():
     assert len(set(plan.ids())) == 14
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "sweep: missing"),
-        ("[sweep]\nfields = true", "contains no key that varies"),
-        ("[sweep.drive]", "contains no key that varies"),
-        ("[sweep.drive]\namplitude = { whole = [1, 3], count = 3 }", "give a list"),
-        ("[sweep.disorder]\nseed = { even = [1, 3], count = 3 }", "give a list"),
-        ("[sweep]\nfeilds = true\n[sweep.drive]\namplitude = [1.0]", "did you mean sweep.fields?"),
-        ("[sweep.drive]\namplitude = 3.0", "sweep.drive.amplitude = 3.0: give a list"),
-        ("[sweep.drive]\namplitude = []", "give a list"),
-        ("[sweep.drive]\namplitude = { log = [0, 1], count = 3 }", "must be positive"),
-        ("[sweep.drive]\namplitude = { log = [1, 2] }", "give a list"),
-        ("[sweep.drive]\namplitud = [1.0]", "did you mean drive.amplitude?"),
-        ('[sweep]\nzip = [["drive.cycles"]]\n[sweep.drive]\namplitude = [1.0]', "not among the keys that vary"),
-        (
-            '[sweep]\nzip=[["drive.cycles","drive.amplitude"]]\n[sweep.drive]\namplitude=[1.0]\ncycles=[3,4]',
-            "the same number of values",
-        ),
-        ('[sweep]\nzip=[["drive.cycles"],["drive.cycles"]]\n[sweep.drive]\ncycles=[3,4]', "in one group only"),
-    ],
-)
-def test_what_is_wrong_is_named_with_its_remedy(text, message):
-    """A section without a key that varies, or with a wrong one, is refused with its key and a remedy."""
-    with pytest.raises(CaseError) as error:
-        sweep_of(text).members()
-    assert message in str(error.value)
-
-
 def test_one_impossible_member_does_not_spoil_the_others():
     """A member outside the lattice has its problems in place of a case, and the sweep warns of them."""
     plan = sweep_of("[sweep.contacts]\nsites = [[10], [99], [20]]")
@@ -196,14 +167,6 @@ def test_many_members_are_cheap_until_one_is_asked_for():
     # No wave has the amplitude 0.
     assert plan.member(0).case is None
     assert plan.case(plan.count - 1).drive.amplitude == 1.0
-
-
-def test_a_sweep_of_more_than_a_million_members_is_refused():
-    """1001 times 1000 members are refused before one of them is resolved."""
-    amplitudes = "{ linear = [1, 2], count = 1001 }"
-    frequencies = "{ linear = [1, 2], count = 1000 }"
-    with pytest.raises(CaseError, match="has 1,001,000 members; the limit is 1,000,000"):
-        sweep_of(f"[sweep.drive]\namplitude = {amplitudes}\nfrequency = {frequencies}")
 
 
 @given(

@@ -9,8 +9,8 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import run_of, small_case, with_sections
-from vipetsc.case import Case, CaseError, LawCase
+from tests.conftest import run_of, small_case
+from vipetsc.case import Case
 from vipetsc.case.warnings import losses
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
@@ -162,14 +162,6 @@ def test_an_absorbing_end_is_found_for_the_drive():
     assert Case.from_toml(case.to_toml()) == case
 
 
-def test_an_absorbing_end_is_refused_where_it_cannot_be():
-    for wrong, key in (({"absorbing": {"end": "left"}}, "absorbing.end"), ({"ends": "periodic"}, "lattice.absorbing")):
-        with pytest.raises(CaseError, match=key):
-            small_case(lattice={"cells": 90, "absorbing": {}} | wrong, drive={"cycles": 30})
-    with pytest.raises(CaseError, match="in a gap"):
-        small_case(lattice={"cells": 90, "absorbing": {}}, drive={"frequency": 650.0})
-
-
 def test_profiles_defects_and_scatter_of_a_case():
     """Values of profiles are exact, and scattered quantities have their deviation, drawn anew for another seed only."""
     cells = {
@@ -203,19 +195,6 @@ def test_profiles_defects_and_scatter_of_a_case():
     other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
     assert np.all(other.masses[:, 0] != varied.masses[:, 0])
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
-
-
-def test_bad_profiles_are_refused_by_name():
-    profiles = {"masses[9]": [1.0], "springs[1].stiffness": [1.0], "masses[2]": {"cells": [99], "value": 1.0}}
-    profiles |= {"masses[3]": {"first": -1.0, "last": 1.0}, "masses[4]": {"cells": [1], "value": 1.0, "factor": 1.0}}
-    with pytest.raises(CaseError) as error:
-        small_case(lattice={"profiles": profiles})
-    assert sorted(p.key for p in error.value.problems) == [f'lattice.profiles."{key}"' for key in sorted(profiles)]
-    with pytest.raises(CaseError, match="either relative or absolute"):
-        small_case(disorder={"cells": {"masses[1]": {}}})
-    for kind, table in ((LawCase, {}), (Case, {"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}})):
-        with pytest.raises(CaseError, match=r"with different cells|in equal cells"):
-            kind.from_table({"lattice": {"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}}} | table)
 
 
 def test_what_differs_stands_in_the_file():
@@ -291,49 +270,3 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     # No dashpots meet the loss in both bands.
     flat = small_case(lattice={"damping": {"loss": {"1": 0.02, "2": 0.02}}})
     assert any("band 1 0.00" in sentence and "requested 0.02" in sentence for sentence in flat.warnings())
-
-
-@pytest.mark.parametrize("damping", [
-    {"loss": {}}, {"loss": {"5": 0.1}}, {"loss": {"x": 0.1}}, {"loss": {"2": -0.1}}, {"loss": {"2": 1.0}},
-    {"loss": {"2": float("nan")}}, {"loss": {"2": 0.1}, "mass": 1.0}, {"springs": [0.1] * 4}, {"loss": 0.1},
-    {"loss": {"2": 0.1}, "grounding": [0.1], "springs": [0.1] * 4},
-])  # fmt: skip
-def test_a_loss_that_cannot_be_is_refused(damping):
-    with pytest.raises(CaseError, match=r"lattice\.damping\.(loss|grounding)") as error:
-        small_case(lattice={"damping": damping})
-    assert len(error.value.problems) == 1
-
-
-# A chain that contacts alone hold together.
-BEADS = {"cell": {"masses": [1e-3]}, "cells": 20}
-TOUCHING = {"sites": [3], "stiffness": 1e6, "next_cell": True, "side": "minus", "clearance": 0.0}
-
-
-@pytest.mark.parametrize(("key", "sections"), [
-    ("disorder.cells", {"disorder": {"cells": {"grounding[1]": {"absolute": 0.1, "distribution": "lognormal"}}}}),
-    ("is 0 in all cells", {"disorder": {"cells": {"grounding[1]": {"relative": 0.1}}}}),
-    ("is 0, so that a factor", {"lattice": {"profiles": {"grounding[1]": {"cells": [3], "factor": 2.0}}}}),
-    (r"masses\[2\].last: missing; this key is needed here", {"lattice": {"profiles": {"masses[2]": {"first": 1.0}}}}),
-    (r"profiles.masses\[2\].value = nan", {"lattice": {"profiles": {"masses[2]": {"cells": [3], "value": np.nan}}}}),
-    ("at most 100000000 cells", {"lattice": {"cells": 10**12, "absorbing": {}}}),
-    ("contacts.each.pair", {"contacts": {"each": {"pair": [[1, 2]] * 4}}}),
-    ("contacts.sites.count = 0: must be greater", {"contacts": {"sites": {"first": 1, "count": 0}}}),
-    ("contacts.approach_floor = inf", {"contacts": {"approach_floor": np.inf}}),
-    ("without springs", {"lattice": BEADS | {"absorbing": {"cells": 3, "strength": 1.0}}}),
-    ("the cell has none", {"lattice": BEADS, "drive": {"end": "left"}}),
-])  # fmt: skip
-def test_nonsense_has_one_message(key, sections):
-    """Each wrong case is refused with one message, which names its key."""
-    table = {"lattice": {"preset": "four-band", "cells": 60}, "contacts": {"sites": [20, 30], "clearance": 1e-4}}
-    if sections.get("lattice", {}).get("cell"):
-        times = {
-            "time": {"end": 1e-2, "sample_interval": 1e-4},
-            "drive": {"frequency": 100.0} | sections.get("drive", {}),
-        }
-        table = {"contacts": TOUCHING}
-        sections = sections | times
-
-    with pytest.raises(CaseError, match=key) as error:
-        Case.from_table(with_sections(table, sections))
-
-    assert len(error.value.problems) == 1

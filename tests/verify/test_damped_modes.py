@@ -11,7 +11,6 @@ from scipy.special import ellipk
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import NnmCase
-from vipetsc.case.case_file import CaseError
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 
@@ -120,13 +119,3 @@ def test_a_branch_is_resumed_from_its_file(tmp_path):
     (name,) = [path.name for path in (tmp_path / "whole").glob("*.h5")]
     assert len(read_branch(tmp_path / "parts" / name).regular()) == 9
     assert_same_bits(datasets(tmp_path / "whole" / name), datasets(tmp_path / "parts" / name))
-
-
-@pytest.mark.parametrize(
-    "options, key", [({"switch": ["branch-point"]}, "nnm.switch"), ({"orbits_at": [1.0]}, "nnm.orbits_at")]
-)
-def test_keys_of_motions_without_loss_are_refused(options, key):
-    """Branch switching and stored orbits belong to the conservative modes."""
-    with pytest.raises(CaseError) as caught:
-        case_of(TWO_MASSES, **options)
-    assert [problem.key for problem in caught.value.problems] == [key]

@@ -22,12 +22,6 @@ DRIVEN = 3
 SITE = 4
 
 
-def damped_case(**sections) -> Case:
-    """A small lattice whose damping ratio is about 1 %."""
-    lattice = {"damping": {"mass": 10.0, "stiffness": 1e-5}} | sections.pop("lattice", {})
-    return small_case(lattice=lattice, **sections)
-
-
 def varied_model(ends: str, has_dashpots: bool):
     """A lattice whose cells all differ, with a contact in cell SITE and a force on the second mass of cell DRIVEN."""
     sections = {"lattice": {"cells": CELLS}, "contacts": {"sites": [SITE]}, "drive": {"cell": DRIVEN, "mass": 2}}
@@ -124,19 +118,6 @@ def test_cells_that_do_not_differ_give_the_bits_of_those_alike():
 
     assert engine.lattice.stiffness.size > 0
     assert rates[0] == rates[1]
-
-
-def test_the_ledger_closes_with_dashpots():
-    """The ledger of a damped lattice with impacts closes to 1e-9, and the energy lost in dashpots never decreases."""
-    run, result = simulated(damped_case())
-    statistics = result.statistics
-    assert statistics["episodes"] > 0
-    assert statistics["ledger_error"] < 1e-9
-
-    lost = run["energy/dissipated_by_damping"].values
-    assert np.all(np.diff(lost) >= 0)
-    assert 0.05 < lost[-1] / statistics["work"] < 0.9
-    assert statistics["dissipated_by_damping"] == lost[-1]
 
 
 def test_a_lattice_without_dashpots_has_no_loss_of_theirs():

@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from tests.conftest import simulated
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.lattice import Contact
 
 M = 1e-3  # kg
@@ -270,28 +270,3 @@ def test_with_a_loss_its_speeds_fall_geometrically(tmp_path):
     assert len(speeds) == 40
     assert speeds[1:] / speeds[:-1] == pytest.approx(np.full(39, ratio), rel=1e-8)
     assert np.diff(onsets) == pytest.approx(np.full(39, period), rel=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("contacts", "key"),
-    [
-        ({"pair": [1, 2]}, "contacts.pair"),
-        ({"pair": [1, 1], "next_cell": False}, "contacts.pair"),
-        ({"sites": [1, 4]}, "contacts.next_cell"),
-        ({"side": "both"}, "contacts.clearance"),
-        ({"precompression": 1e-6, "restitution": 0.5}, "contacts.precompression"),
-    ],
-)
-def test_what_cannot_be_joined_is_refused_with_its_key(contacts, key):
-    joined = {"stiffness": A, "next_cell": True, "side": "minus", "clearance": 0.0, "sites": [1, 2, 3]}
-    table = {
-        "lattice": {"cell": {"masses": [M]}, "cells": 4, "ends": "free"},
-        "contacts": joined | contacts,
-        "drive": {"frequency": 1e4, "cycles": 1},
-        "time": {"end": 1e-3, "samples": 11},
-    }
-
-    with pytest.raises(CaseError) as error:
-        Case.from_table(table)
-
-    assert error.value.problems[0].key == key

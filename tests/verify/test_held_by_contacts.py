@@ -9,7 +9,6 @@ import pytest
 
 from tests.rigs import after_a_period
 from tests.steady_states import motion_at
-from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, UnitCell
 from vipetsc.modes.response.over_key import KeyedCase
@@ -120,16 +119,6 @@ def test_a_lattice_that_walls_hold_has_its_own_springs_alone():
     assert not held(IN_A_CELL | PRESSED, {"cell": SPRUNG}).are_contacts_springs
 
 
-def test_what_nothing_holds_is_refused():
-    """A lattice without walls is refused if its only stop does not touch at rest, or if it is infinite."""
-    with pytest.raises(CaseError, match="a lattice that no wall holds"):
-        held({"precompression": None, "clearance": 0.1} | {"side": "plus"})
-    with pytest.raises(CaseError, match="infinite lattice without bound"):
-        held(lattice={"damping": {}}, infinite=True)
-    with pytest.raises(CaseError, match=r"nfrc\.infinite.*contacts alone join"):
-        held(BETWEEN_CELLS, {"cells": 3, "cell": GRAINS, "damping": {}}, infinite=True)
-
-
 SPRINGS = [{"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 1.0}]
 SPRUNG = {"masses": [1.0, 0.5], "springs": SPRINGS, "contact": [1, 2]}
 IN_A_CELL = {"sites": [2], "pair": [1, 2], "side": "plus", "clearance": 0.1, "precompression": None}
@@ -180,11 +169,3 @@ def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
     omega = 0.7
     found = ModalCompliance(chain).at(omega)[0, 0, 0]
     assert found == pytest.approx(1 / (0.3j * omega - omega**2) - 1 / (2 * omega**2), rel=1e-12)
-
-
-@pytest.mark.parametrize("clearance", [0.0, 0.1])
-def test_grains_that_do_not_stay_together_are_refused(clearance):
-    """Grains with contacts on one side alone are refused: the contacts' mean force pushes them apart for ever."""
-    lattice = {"cells": 3, "cell": GRAINS}
-    with pytest.raises(CaseError, match="its mean force pushes them apart"):
-        held(BETWEEN_CELLS | {"clearance": clearance, "precompression": None}, lattice)

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
-from tests.conftest import StopAt, assert_same_bits, datasets, simulated, with_sections
+from tests.conftest import datasets, simulated, with_sections
 from tests.models import CLEARANCE
 from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.dynamics import simulate
@@ -172,45 +172,6 @@ def test_a_contact_that_begins_closed_takes_the_approach_of_an_impact_without_lo
     assert data["impacts/approach_velocity"][0] == pytest.approx(speed, rel=1e-12)
     assert data["impacts/side"][0] == np.sign(w)
     assert data["impacts/loss"][0] > 0
-
-
-CLOSED = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 20, "width": 3, "amplitude": 2e-3}
-
-
-# Some of these softer contacts begin while they open, with a negative damping factor, and are therefore clipped.
-CLIPPED = {"adhesion": "clip", "restitution": 0.0, "stiffness": 1e4, "clearance": 1e-4}
-
-
-@pytest.mark.parametrize("law", [{}, CLIPPED])
-def test_the_engines_agree_from_closed_contacts_on(law):
-    """Both engines agree from closed contacts on, and keep the balance of the initial energy."""
-    contacts = {"sites": [19, 20, 21, 30], "clearance": 1e-3, "restitution": 0.7, "stiffness": 1e6} | law
-    stepped = run(moving(CLOSED, contacts=contacts, time={"engine": "ts", "end": 0.004}))
-    exact = run(moving(CLOSED, contacts=contacts, time={"engine": "propagator", "end": 0.004}))
-
-    assert (stepped["impacts/onset"] == 0).sum() >= 2
-    for each in (stepped, exact):
-        kept = each["energy/work"] - each["energy/dissipated"]
-        stored = each["energy/kinetic"] + each["energy/spring"] + each["energy/contact"]
-        assert np.abs(kept - stored).max() < 1e-9 * each["energy/work"][0]
-    u = stepped["displacement"].values
-    assert np.abs(u - exact["displacement"].values).max() < 1e-7 * np.abs(u).max()
-
-
-# The time stepper checks for a request to stop after every step, the propagator after every block of samples.
-@pytest.mark.parametrize(("engine", "looks"), [("ts", 300), ("propagator", 0)])
-def test_a_stopped_run_goes_on_to_the_same_bits(engine, looks, tmp_path):
-    case = moving(
-        CLOSED,
-        contacts={"sites": [19, 21], "clearance": 1e-3, "stiffness": 1e6, "restitution": 0.7},
-        time={"engine": engine, "end": 0.06},
-    )
-    simulate(case, tmp_path / "whole")
-
-    assert simulate(case, tmp_path / "parts", stop=StopAt(looks)).resumable
-    assert simulate(case, tmp_path / "parts").complete
-
-    assert_same_bits(datasets(tmp_path / "whole" / "run.h5"), datasets(tmp_path / "parts" / "run.h5"))
 
 
 def write_state(path: Path, u: np.ndarray, v: np.ndarray) -> None:

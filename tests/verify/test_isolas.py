@@ -18,7 +18,6 @@ from scipy.integrate import solve_ivp
 import vipetsc
 from tests.rigs import period_map, rate_of
 from tests.steady_states import CUBIC_OSCILLATOR, motion_at
-from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.endings import Ending
 from vipetsc.figures.registry import draw
@@ -160,11 +159,6 @@ def test_legends_number_isolas_beside_the_keys(curves):
     weaker = loaded[1].assign(amplitude=loaded[1]["amplitude"] / 2)
     texts = [text.replace("\u00a0", " ") for text in legend_of([*loaded, weaker])]
     assert texts == ["amplitude 0.18 N, isola 1", "amplitude 0.18 N", "amplitude 0.09 N"]
-
-
-def test_a_curve_over_the_amplitude_has_no_such_search():
-    with pytest.raises(CaseError, match="along which this curve runs itself"):
-        absorber(over="amplitude", fixed=[1.7], range=[0.1, 0.3])
 
 
 # The oscillator under a force of 0.3 N. The range of frequencies ends between its two folds, which are at 1.32 and

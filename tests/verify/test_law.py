@@ -12,9 +12,8 @@ import pytest
 import xarray as xr
 
 from tests.conftest import run_of
-from tests.models import THREE_MASS_CELL
 from tests.one_site import COARSE, LATTICES, law_case
-from vipetsc.case import Case, CaseError, LawCase
+from vipetsc.case import Case, LawCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
@@ -306,42 +305,6 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     law.mean.upper[:] = 0
     with pytest.raises(ValueError, match="no energy to bands above"):
         law.matched()
-
-
-@pytest.mark.parametrize(
-    ("sections", "expected"),
-    [
-        ({"law": {"largest": 0.5}}, "law.largest = 0.5: must be greater than 1"),
-        ({"law": {"sampels": 3}}, "did you mean law.samples?"),
-        ({"law": {"clearance": -1.0}}, "law.clearance"),
-        ({"law": {"jitter": 0.7}}, "law.jitter"),
-        ({"drive": {"frequency": 1800.0}}, "lies in no pass band"),
-        ({"law": {"settle": 1000.0}}, "too slow to wait for"),
-        ({"law": {"distance": 20}}, "law.distance = 20: the burst must end before"),
-        (
-            {"lattice": {"cell": THREE_MASS_CELL}, "contacts": {"stiffness": 1e6, "clearance": None}},
-            "law.clearance: missing",
-        ),
-        ({"lattice": {"cell": THREE_MASS_CELL}, "contacts": {"clearance": 1e-3}}, "contacts.stiffness: missing"),
-    ],
-)
-def test_nonsense_is_one_message(sections, expected):
-    contacts = {"sites": 0}
-    drive = {}
-    if "cell" in sections.get("lattice", {}):
-        # Only presets have sites and a drive of their own.
-        contacts["sites"] = []
-        drive = {"band": 2, "at": "max-group-velocity"}
-    for name, value in sections.get("contacts", {}).items():
-        if value is not None:
-            contacts[name] = value
-    table = {"lattice": {"preset": "four-band"}, "drive": drive} | sections | {"contacts": contacts}
-
-    with pytest.raises(CaseError) as error:
-        LawCase.from_table(table)
-
-    assert expected in str(error.value)
-    assert len(error.value.problems) == 1
 
 
 def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path):

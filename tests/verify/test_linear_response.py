@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.rigs import TWO_MASSES
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.main import main
 from vipetsc.figures.response_outputs import response_outputs
@@ -126,17 +125,3 @@ def test_the_linear_response_lies_behind_a_nonlinear_one(tmp_path):
             assert np.abs(states / here - 1)[~free].max() > 0.02
         figure = response_outputs([tmp_path / "out" / f"branch-{curve.attrs['name']}.h5"])
         assert all("linear" in axes.get_legend_handles_labels()[1] for axes in figure.axes)
-
-
-@pytest.mark.parametrize(
-    "changes, key",
-    [
-        ({"output": {}}, "output.points"),
-        ({"nfrc": OVER | {"subharmonic": 3, "isolas": 1}}, "nfrc.subharmonic"),
-        ({"nfrc": {"source": "wave", "range": [0.4, 2.6]}}, "nfrc.source"),
-    ],
-)
-def test_a_linear_lattice_has_nothing_else_to_follow(changes, key):
-    """Names the key that asks for a motion which a linear lattice does not have."""
-    with pytest.raises(CaseError, match=key):
-        NfrcCase.from_table(table(**changes))

@@ -11,8 +11,6 @@ from scipy.integrate import quad, solve_ivp
 
 from vipetsc.case import Case
 from vipetsc.case.case_file import CaseError
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.predict import PredictCase
 from vipetsc.dynamics import simulate
 from vipetsc.lattice.drive import Drive, joined
 
@@ -225,12 +223,3 @@ def test_other_records_are_refused(drive, key, tmp_path, monkeypatch):
     given["drive"] = {name: value for name, value in given["drive"].items() if value is not None}
     with pytest.raises(CaseError, match=key):
         Case.from_table(given)
-
-
-@pytest.mark.parametrize("kind, section", [(NfrcCase, "nfrc"), (PredictCase, "predict")])
-def test_studies_of_springs_refuse_damped_walls(kind, section):
-    """A steady state and a composed wave are those by springs."""
-    keys = {"nfrc": {"source": "force", "range": [10.0, 90.0], "fixed": [1e-3]}, "predict": {"amplitudes": [1.0]}}
-    given = table({"waveform": "burst", "frequency": 50.0}, **{section: keys[section]})
-    with pytest.raises(CaseError, match=r"drive\.end.*dashpots"):
-        kind.from_table(given)

@@ -395,25 +395,6 @@ def test_sweeps_jump_between_stable_states():
     assert swept(downwards, start=8) == [8, 7, 6, 5, 0]
 
 
-@pytest.mark.parametrize(
-    ("nfrc", "key"),
-    [
-        ({"range": [1.0, 0.5]}, "nfrc.range"),
-        ({"infinite": False}, "nfrc.infinite"),
-        ({"over": "frequency", "range": [900.0, 1000.0]}, "nfrc.fixed"),
-        ({"fixed": [650.0]}, "nfrc.fixed"),  # in a gap
-        ({"band": 1}, "nfrc.fixed"),
-        ({"smallest_step": 1.0}, "nfrc.smallest_step"),
-        ({"harmonic": 3}, "nfrc.harmonic"),
-    ],
-)
-def test_bad_input_names_its_key(nfrc, key):
-    with pytest.raises(CaseError) as error:
-        nfrc_case(**nfrc)
-
-    assert [problem.key for problem in error.value.problems] == [key]
-
-
 def test_a_lattice_without_sites_needs_points_and_validate_reads_the_section(tmp_path):
     """A linear lattice has no incident wave to scatter, and its response is that of named masses."""
     with pytest.raises(CaseError, match=r"(?s)nfrc\.source.*output\.points"):

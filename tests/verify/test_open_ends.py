@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.verify.test_rig import TEN_CELLS, rounded_cell
-from vipetsc.case import CaseError
+from tests.verify.test_rig import rounded_cell
 from vipetsc.case.absorbing import reflected_at, sections_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import (
@@ -115,21 +114,3 @@ def test_states_are_those_of_the_endless_lattice():
     assert here.episodes > 0
     np.testing.assert_allclose(here.harmonics, endless.harmonics, atol=1e-7)
     assert here.unstable == endless.unstable
-
-
-@pytest.mark.parametrize(
-    ("table", "key"),
-    [
-        (absorbing(source="wave", over="amplitude"), "nfrc.open_ends"),
-        (SMOOTH, "nfrc.open_ends"),
-        (TEN_CELLS | {"nfrc": TEN_CELLS["nfrc"] | {"open_ends": True}}, "nfrc.open_ends"),
-        (
-            absorbing() | {"drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 0.7, "end": "left"}},
-            "drive.end",
-        ),
-    ],
-)
-def test_ends_that_cannot_be_open_are_refused(table, key):
-    with pytest.raises(CaseError) as caught:
-        NfrcCase.from_table(table)
-    assert key in [problem.key for problem in caught.value.problems]

@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, with_sections
+from tests.conftest import datasets, with_sections
 from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
@@ -155,18 +155,6 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     assert Case.load(folder / "best.toml").lattice.cell.springs[1].damping == found["parameter"][best, 1]
 
 
-@pytest.mark.slow
-def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
-    plan, folder, _ = searched
-    records = (folder / "optimum-runs.jsonl").read_bytes()
-    (tmp_path / "case.toml").write_bytes((folder / "case.toml").read_bytes())
-    # The file of records is cut in the middle, as a kill may leave it.
-    (tmp_path / "optimum-runs-0.jsonl").write_bytes(records[: len(records) // 2])
-    run_search(plan, tmp_path, MPI.COMM_SELF, resume=True)
-    assert_same_bits(datasets(tmp_path / "optimum.h5"), datasets(folder / "optimum.h5"))
-    assert (tmp_path / "best.toml").read_text() == (folder / "best.toml").read_text()
-
-
 def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
     """A search by responses without runs has pictures of the responses and the objective alone."""
     _, folder, _ = searched
@@ -247,9 +235,3 @@ def test_what_is_wrong_with_a_measure_of_responses_is_named(objective, nfrc, key
     (problem,) = raised.value.problems
     assert sentence in str(problem)
     assert problem.key == (f"optimise.objective[1].{key}" if key else "nfrc.fixed")
-
-
-def test_responses_of_a_case_that_begins_in_motion_are_refused():
-    """Responses of a case with a motion at t = 0 are refused: steady states do not depend on it."""
-    with pytest.raises(CaseError, match="whatever the motion at t = 0"):
-        OptimiseCase.from_table(TABLE | {"initial": {"kind": "mode", "number": 1, "amplitude": 1e-3}})

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import errno
-import io
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
-from vipetsc.dynamics.recorder import Recorder
 from vipetsc.io import chunks
 from vipetsc.io.atomic import StoredArrays, read_arrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
@@ -130,40 +125,6 @@ def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
 
 
-@pytest.mark.parametrize(("number", "after"), [(errno.EMFILE, 0), (errno.EIO, 1), (errno.ESTALE, 2), (errno.ENOSPC, 5)])
-def test_a_run_that_cannot_be_written_names_its_file_and_can_be_resumed(folder, monkeypatch, number, after):
-    """A call of the system that fails is one error with the file and the reason; the same command then completes."""
-    case = small_case(time={"end": 0.01})
-    opened = Path.open
-    left = after
-
-    class Failing(io.FileIO):
-        def write(self, data):
-            nonlocal left
-            left -= 1
-            if left < 0:
-                raise OSError(number, os.strerror(number))
-            return super().write(data)
-
-    def failing(path, *arguments, **options):
-        if not path.name.startswith(".run.h5"):
-            return opened(path, *arguments, **options)
-        if not after:
-            raise OSError(number, os.strerror(number))
-        return Failing(path, "w+")
-
-    with monkeypatch.context() as context:
-        context.setattr(Path, "open", failing)
-        with pytest.raises(OSError, match=rf"run\.h5 could not be written: {os.strerror(number)}") as caught:
-            simulate(case, folder / "run")
-    assert caught.value.errno == number
-    assert {path.name for path in (folder / "run").iterdir()} == {"case.toml", "parts"}
-
-    assert simulate(case, folder / "run").complete
-    simulate(case, folder / "straight")
-    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
-
-
 def test_episodes_stand_in_the_order_of_their_onsets():
     """Episodes from ranks and chunks are sorted by their onsets, and by their sites where onsets are equal."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
@@ -232,36 +193,6 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
     assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
     assert np.isnan(cut["impacts/separation"]).any()
     assert result.statistics["episodes"] == expected.sum()
-
-
-def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch):
-    """Engines get contiguous arrays for any block of samples, and the size of blocks does not change the record.
-
-    Kernels would be compiled again for arrays that are not contiguous.
-    """
-    rooms = []
-    room = Recorder.room
-
-    def watched(*arguments):
-        rooms.append(room(*arguments))
-        return rooms[-1]
-
-    monkeypatch.setattr(Recorder, "room", watched)
-    case = small_case(time={"end": 0.004, "engine": "propagator"}, output={"stride": 2})
-
-    # The first run has one block of all 21 samples, the second has four blocks of at most six.
-    monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 1_000_000)
-    whole = run_of(case)
-    monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 6)
-    blocks = run_of(case)
-
-    assert len(rooms) == 1 + 4
-    assert all(samples.fields.flags.c_contiguous for samples in rooms)
-    for name in ("displacement", "velocity", "field_time"):
-        values = whole[name].values
-        assert len(values) == 11
-        assert values[-1].any()
-        assert values.tobytes() == blocks[name].values.tobytes(), name
 
 
 def test_runs_in_a_common_memory_have_the_bits_of_runs_in_their_own():

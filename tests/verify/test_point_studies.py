@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import run_of, search_table, with_sections
-from vipetsc.case import Case, CaseError, Sweep
+from vipetsc.case import Case, Sweep
 from vipetsc.case.optimise import OptimiseCase, measures_of_runs
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
@@ -158,43 +158,6 @@ def test_a_search_takes_measures_of_points_and_keeps_to_its_constraints(searched
     assert optimum["front"].values.tolist() == [feasible[np.argmin(optimum["value"].values[feasible, 0])]]
     assert "designs meet the constraints" in summary
     assert Case.load(folder / "best.toml").output.points[1].name == "tip"
-
-
-@pytest.mark.parametrize(
-    ("objective", "sentence"),
-    [
-        ({"measure": "peak_velocity/tp"}, "did you mean 'peak_velocity/tip'?"),
-        ({"measure": "steady_velocity/tip"}, "a burst becomes no steady vibration"),
-        ({"measure": "band_transmission/base-tip"}, "needs a band, 1 to 4"),
-        ({"measure": "band_transmission/base-tip", "band": 5}, "the cell has 4 bands"),
-        ({"measure": "peak_velocity/tip", "band": 1}, "has no bands"),
-        ({"measure": "entropy/history"}, "is not a measure of this case"),
-    ],
-)
-def test_measures_that_a_case_has_not_are_one_problem(objective, sentence):
-    table = search_table(24, [8], output={"points": [{"name": "base", "cell": 2}, {"name": "tip", "cell": 16}]})
-    table["output"]["transmission"] = [["base", "tip"]]
-    table["optimise"] |= {"objective": [objective]}
-    with pytest.raises(CaseError) as raised:
-        OptimiseCase.from_table(table)
-    (problem,) = raised.value.problems
-    assert sentence in str(problem)
-    assert problem.key.startswith("optimise.objective[1]")
-
-
-@pytest.mark.parametrize(
-    ("constraint", "sentence"),
-    [
-        ({"measure": "largest_force"}, "has no bound"),
-        ({"measure": "largest_force", "at_least": 2.0, "at_most": 1.0}, "is above at_most"),
-    ],
-)
-def test_constraints_need_bounds_that_can_be_met(constraint, sentence):
-    table = search_table(24, [8])
-    table["optimise"] |= {"constraint": [constraint]}
-    with pytest.raises(CaseError) as raised:
-        OptimiseCase.from_table(table)
-    assert sentence in str(raised.value.problems[0])
 
 
 def test_a_measure_of_unknown_power_is_not_scaled(tmp_path, monkeypatch):

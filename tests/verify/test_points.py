@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.io import export
@@ -316,22 +316,3 @@ def test_export_writes_histories_forces_and_numbers(tmp_path):
     assert "band_transmission/c1m1-c6m2 band 2" in numbers.index
     summary = json.loads((tmp_path / "summary.json").read_text())["measures"]
     assert summary["peak_velocity/c6m2"] == np.abs(velocity).max()
-
-
-@pytest.mark.parametrize(
-    ("output", "sentence"),
-    [
-        ({"points": [{"name": "a", "cell": 25}]}, "output.points[1].cell = 25: the lattice has the cells 1 to 24"),
-        ({"points": [{"name": "a", "cell": 2, "mass": 5}]}, "output.points[1].mass = 5: a cell has the masses 1 to 4"),
-        ({"points": [{"name": "a", "cell": 2}] * 2}, "output.points[2].name = 'a': names another point"),
-        ({"points": [{"name": "a b", "cell": 2}], "transmission": [["a", "b"]]}, "output.points[1].name"),
-        ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "b"]]}, "b: no point of that name"),
-        ({"transmission": [["a", "b"]]}, "a, b: no point of that name in output.points; there are none"),
-        ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "a"]]}, "names one point twice"),
-    ],
-)
-def test_points_that_are_not_there_are_one_problem(output, sentence):
-    with pytest.raises(CaseError) as raised:
-        small_case(output=output)
-    (problem,) = raised.value.problems
-    assert sentence in str(problem)

@@ -303,18 +303,6 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
         np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
 
 
-@pytest.mark.parametrize(
-    ("drive", "reason"),
-    [
-        (CHIRP | {"bandwidth": 900.0, "ramp": 0.01}, "in one band and within 30% of its main frequency"),
-        ({"waveform": "harmonic"}, "a wave that ends; give drive.duration"),
-    ],
-)
-def test_a_wave_without_an_amplitude_of_one_frequency_is_not_predicted(drive, reason):
-    with pytest.raises(CaseError, match=reason):
-        pulse_case(drive)
-
-
 @pytest.mark.slow
 def test_a_chirp_is_predicted_as_simulated(tmp_path):
     data = predict(pulse_case(CHIRP, contacts={"restitution": 0.7}, predict={"amplitudes": [50.0, 120.0]}), tmp_path)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import StopAt, assert_same_bits, datasets, simulated, small_case
+from tests.conftest import StopAt, datasets, simulated, small_case
 from tests.models import THREE_MASS_CELL
 from vipetsc.case import Case
 from vipetsc.contact.law import create_contacts
@@ -108,121 +108,6 @@ def test_a_linear_run_is_the_modal_solution(ends, lattice, drive, time):
     assert result.statistics["ledger_error"] < 1e-12
 
 
-def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> dict:
-    """Assert that both engines give the same run, up to a relative ``velocity`` and an ``onset`` in s.
-
-    Returns the propagator's statistics.
-    """
-    # The stepper's tolerance is far below the default, so that the difference is the propagator's error.
-    theirs, stepped = simulated(with_engine(case, "ts", rtol=1e-12))
-    ours, result = simulated(with_engine(case, "propagator"))
-
-    assert result.statistics["engine"] == "propagator"
-    # Counts come first, since arrays of different numbers of contacts cannot be compared.
-    for name in ("episodes", "switches", "floored", "clipped"):
-        assert result.statistics[name] == stepped.statistics[name], name
-
-    for name in ("site", "side"):
-        np.testing.assert_array_equal(ours[f"impacts/{name}"], theirs[f"impacts/{name}"])
-    for name in ("onset", "separation"):
-        np.testing.assert_allclose(ours[f"impacts/{name}"], theirs[f"impacts/{name}"], rtol=0, atol=onset)
-    for name in ("force", "loss", "indentation", "approach_velocity"):
-        values = theirs[f"impacts/{name}"].values
-        largest = np.abs(values).max()
-        # Grazing contacts have small values with large relative errors.
-        np.testing.assert_allclose(ours[f"impacts/{name}"], values, rtol=1e-4, atol=1e-6 * largest)
-
-    exact = theirs["velocity"].values
-    assert relative(ours["velocity"].values - exact, exact) < velocity
-
-    work = theirs["energy/work"].values.max()
-    energies = [name for name in theirs if name.startswith("energy/")]
-    for name in energies:
-        np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-7 * work)
-
-    assert result.statistics["ledger_error"] < 1e-9
-    return result.statistics
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lattice", "contacts", "drive", "time"),
-    [
-        ({}, {}, {}, {}),
-        ({}, {"law": "bilinear", "restitution": 1.0}, {}, {"end": 0.03}),
-        ({"reading": "printed"}, {"restitution": 0.4}, {"amplitude": 60.0}, {}),
-        ({"ends": "free"}, {"law": "bilinear", "sites": [6, 7, 12, 13, 16, 17]}, {}, {"end": 0.04}),
-        ({"ends": "periodic"}, {"sites": [1, 2, 24]}, {}, {"end": 0.04}),
-        ({}, {"sites": [1, 2, 24], "clearance": 5e-4}, {}, {"end": 0.06}),
-        ({"ends": "free"}, {"sites": [1, 24]}, {"cell": 24, "mass": 3}, {"end": 0.05}),
-        ({}, {"restitution": 0.0, "adhesion": "clip"}, {}, {}),
-        ({}, {"restitution": 0.0, "approach_floor": 0.3}, {}, {}),
-        ({}, {}, {}, {"sample_interval": 8e-4}),
-        ({"cells": 7}, {"sites": [4]}, {"amplitude": 1000.0}, {"end": 0.03}),
-        ({"damping": {"mass": 10.0, "stiffness": 5e-6}}, {"sites": [6, 7, 12]}, {"amplitude": 40.0}, {}),
-    ],
-)
-def test_agrees_with_the_time_stepper(lattice, contacts, drive, time):
-    """Both engines give the same motion, impacts and energies, for many ends, laws, losses, drives and intervals."""
-    case = small_case(lattice=lattice, contacts=contacts, drive=drive, time=time)
-
-    # The runs have contacts, and are not linear.
-    assert assert_engines_agree(case)["episodes"] > 5
-
-
-JOINED = {"pair": [1, 1], "next_cell": True}
-PRESSED = JOINED | {"side": "minus", "clearance": 0.0, "precompression": 1e-4, "restitution": 1.0}
-DASHPOTS = {"mass": 10.0, "stiffness": 5e-6}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lattice", "contacts"),
-    [
-        ({"ends": "periodic", "damping": DASHPOTS}, JOINED | {"sites": [3, 24], "clearance": 5e-5}),
-        ({}, {"sites": [1, 2], "pair": [0, 1], "side": "plus", "restitution": 0.7}),
-        ({"ends": "free"}, {"sites": [6, 6, 7], "each": {"pair": [[2, 3], [3, 4], [1, 4]]}}),
-        ({}, PRESSED | {"sites": [5, 6, 23]}),
-        ({}, {"clearance": 1e-3, "clearance_minus": 5e-5}),
-    ],
-)
-def test_agrees_on_contacts_of_any_pair(lattice, contacts):
-    """Both engines agree on contacts within a cell, between cells, across a ring's joint and with the ground.
-
-    Some contacts are pressed at rest or have unequal stops.
-    """
-    case = small_case(lattice=lattice, contacts=contacts)
-
-    assert assert_engines_agree(case, velocity=1e-8)["episodes"] >= 3
-
-
-@pytest.mark.slow
-def test_agrees_on_other_cells():
-    """Both engines agree on a diatomic lattice and on cells of three masses."""
-    diatomic = {
-        "lattice": {"preset": "diatomic", "cells": 31},
-        "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
-        "drive": {"amplitude": 40.0, "cycles": 10, "cell": 16, "mass": 2},
-        "time": {"end": 0.05},
-    }
-    own = {
-        "lattice": {"cells": 40, "cell": THREE_MASS_CELL},
-        "contacts": {"stiffness": 5e6, "restitution": 0.8, "sites": [10, 15, 20], "clearance": 2e-4},
-        "drive": {"amplitude": 8.0, "cycles": 20, "band": 2, "at": "max-group-velocity"},
-        "time": {"end": 0.1},
-    }
-
-    # These runs have more impacts than the small case, which magnify differences further.
-    for table in (diatomic, own):
-        assert assert_engines_agree(Case.from_table(table), velocity=1e-6, onset=1e-8)["episodes"] > 20
-
-
-@pytest.mark.slow
-def test_agrees_on_half_of_the_builtin_run():
-    """Both engines agree on the built-in run up to 0.44 s."""
-    assert assert_engines_agree(Case.load(None, ["time.end=0.44"]))["episodes"] > 80
-
-
 @pytest.mark.slow
 def test_the_builtin_run_takes_the_steps_it_needs():
     """The built-in run takes one step from each sample to the next, and few substeps."""
@@ -271,27 +156,6 @@ def test_auto_takes_it_where_it_suits():
 
     assert result.statistics["engine"] == "propagator"
     assert "engine_note" not in result.statistics
-
-
-@pytest.mark.parametrize(
-    ("looks", "contacts", "damping"), [(0, {}, {}), (2, {}, {}), (4, {}, {"mass": 10.0}), (3, PRESSED, {})]
-)
-def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts, damping):
-    """A run that is stopped between blocks of samples is resumed to the bits and counts of the whole run."""
-    # The run of 251 samples has six blocks of at most 49 samples, and can stop between them.
-    monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
-    # One site is at the driven end, one stands alone, and two are neighbours, whose contacts are solved together.
-    sites = {"sites": [1, 6, 12, 13]}
-    case = small_case(time={"engine": "propagator"}, contacts=sites | contacts, lattice={"damping": damping or None})
-    straight = simulate(case, folder / "straight")
-
-    assert simulate(case, folder / "stopped", stop=StopAt(looks)).resumable
-    resumed = simulate(case, folder / "stopped", resume=True)
-
-    assert resumed.complete
-    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "stopped" / "run.h5"))
-    for name in ("steps", "substeps", "episodes", "switches"):
-        assert resumed.statistics[name] == straight.statistics[name], name
 
 
 def test_a_run_with_its_last_sample_is_not_stopped(folder):

@@ -9,8 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, simulated, small_case
-from tests.mpi.test_drives import InParts
+from tests.conftest import simulated, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.plan import choose_engine
@@ -47,16 +46,6 @@ def difference(case: Case) -> float:
     return float(np.abs(exact - motion(case, "ts")).max() / np.abs(exact).max())
 
 
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_both_engines_agree(ends):
-    """Both engines give the same motion with nonlinear springs in a few cells, which differs from the linear one."""
-    case = sprung(lattice={"ends": ends})
-    assert difference(case) < 1e-9
-    assert (
-        np.abs(motion(case, "propagator") - motion(sprung({"ends": ends, "profiles": None}), "propagator")).max() > 1e-6
-    )
-
-
 @pytest.mark.parametrize("quadratic", [0.0, 2e6])
 def test_the_left_wall_has_the_spring_of_the_reference_cell(quadratic):
     """The spring to the left wall is that of the reference cell, nonlinear even if profiles make all others linear.
@@ -76,19 +65,6 @@ def test_the_left_wall_has_the_spring_of_the_reference_cell(quadratic):
     assert difference(case) < 1e-9
 
 
-def test_both_engines_agree_in_unlike_cells_with_dashpots_and_stops():
-    """Engines agree in cells that differ, with nonlinear springs, dashpots and stops, and their ledgers close."""
-    lattice = {
-        "profiles": SPRINGS | {"masses[2]": {"first": 2e-3, "last": 3e-3}},
-        "damping": {"mass": 30.0, "stiffness": 1e-6},
-    }
-    contacts = {"sites": [12, 13], "clearance": 5e-5, "restitution": 0.7}
-    case = sprung(lattice=lattice, contacts=contacts)
-    run, _ = simulated(case)
-    assert len(run["impacts/site"]) > 2
-    assert difference(case) < 1e-7
-
-
 def test_a_spring_that_is_hardly_stretched_is_linear():
     """A nonlinear spring with a tiny elongation gives the bits of a linear one, without additional substeps.
 
@@ -101,16 +77,6 @@ def test_a_spring_that_is_hardly_stretched_is_linear():
     linear, plain = simulated(sprung(lattice={"profiles": None}, **weak))
     assert nonlinear["displacement"].values.tobytes() == linear["displacement"].values.tobytes()
     assert result.statistics["substeps"] == plain.statistics["substeps"]
-
-
-def test_a_run_goes_on_after_a_stop(folder):
-    case = sprung(contacts={"sites": [12], "clearance": 5e-5})
-    straight = simulate(case, folder / "straight", observers=[InParts])
-    assert simulate(case, folder / "stopped", stop=StopAt(9), observers=[InParts]).resumable
-    assert simulate(case, folder / "stopped", resume=True, observers=[InParts]).complete
-    assert_same_bits(datasets(folder / "straight/run.h5"), datasets(folder / "stopped/run.h5"))
-    assert len(datasets(folder / "straight/run.h5")["impacts/site"]) > 0
-    assert straight.complete
 
 
 def test_a_spring_that_tears_off_stalls_the_run():

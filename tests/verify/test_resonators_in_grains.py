@@ -108,19 +108,6 @@ def test_a_struck_chain_is_that_of_an_independent_solver(engine, clearance, cell
     assert np.abs(expected[-1, 1]).min() > 1e-5 * STRUCK
 
 
-def test_both_engines_lose_the_same_in_the_same_impacts():
-    """Both engines have the same impacts of lossy grains, with the same losses."""
-    lossy = {"clearance": 2e-6, "restitution": 0.8}
-    first, second = (run_of(grains(engine, contacts=lossy)) for engine in ("ts", "propagator"))
-    assert len(first["impacts/onset"]) == len(second["impacts/onset"]) >= 5
-    for name in ("onset", "approach_velocity", "loss"):
-        expected = first[f"impacts/{name}"].values
-        assert second[f"impacts/{name}"].values == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
-    assert first["energy/dissipated"].values[-1] > 0.05 * first["energy/work"].values[0]
-    u, expected_u = (run["displacement"].values for run in (second, first))
-    assert np.abs(u - expected_u).max() < 1e-7 * np.abs(expected_u).max()
-
-
 FINE = {"end": 2e-4, "sample_interval": 4e-7}
 
 

@@ -13,7 +13,6 @@ import xarray as xr
 
 import vipetsc
 from tests.rigs import TWO_MASSES
-from vipetsc.case import CaseError
 from vipetsc.case.case_file import put
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
@@ -145,25 +144,6 @@ def test_what_follows_from_a_key_is_that_of_each_member():
     assert first == pytest.approx(0.1)
     assert 0 < second < 0.1
     assert [curve.name for curve in losses.every_curve()] == ["damping-no-1-r1-0.2", "damping-no-2-r1-0.2"]
-
-
-@pytest.mark.parametrize(
-    ("family", "key", "reason"),
-    [
-        ({}, "nfrc.family", "give keys of the case"),
-        ({"time": {"end": [1.0, 2.0]}}, "nfrc.family.time.end", "only keys of lattice, contacts"),
-        ({"contacts": {"clearance": 0.3}}, "nfrc.family.contacts.clearance", "give a list of values"),
-        ({"contacts": {"clearance": [0.3, -0.1]}}, "contacts.clearance", "with contacts.clearance = -0.1"),
-        ({"lattice.cell.masses[2]": [1.0, 2.0]}, "lattice.cell.masses[2]", "entries 1 to 1"),
-        ({"contacts": {"gap": [1.0, 2.0]}}, "contacts.gap", "unknown key"),
-        ({MASS: {"linear": [1.0, 2.0], "count": 2000}}, "nfrc.family", "more than 1000"),
-    ],
-)
-def test_what_no_family_has_is_refused_with_its_reason(family, key, reason):
-    with pytest.raises(CaseError, match="problem") as caught:
-        family_case(family)
-    assert caught.value.problems[0].key == key
-    assert reason in caught.value.problems[0].remedy
 
 
 def test_a_path_leads_to_an_entry_of_a_list():

@@ -17,7 +17,6 @@ from tests.rigs import OUTPUT, TWO_MASSES, followed, rate_of
 from tests.steady_states import motion_at, nfrc_case
 from tests.verify.test_smooth_springs import DUFFING
 from vipetsc.case import Case
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.io.export import write_curves
@@ -193,12 +192,6 @@ def test_a_case_without_output_has_none(tmp_path):
     with vipetsc.open(path) as data:
         assert not OUTPUTS.keys() & data.variables.keys()
     assert [picture.stem.partition("-")[0] for picture in draw("branches", [tmp_path / "rig"])] == ["branch"]
-
-
-def test_a_point_outside_is_refused():
-    output = {"points": [{"name": "tip", "cell": 3}]}
-    with pytest.raises(CaseError, match="the lattice has the cells 1 to 2"):
-        NfrcCase.from_table(TWO_MASSES | {"output": output})
 
 
 def test_harmonics_are_those_of_a_run_a_quarter_of_a_period_earlier(tmp_path):

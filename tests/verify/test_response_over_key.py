@@ -12,7 +12,6 @@ import pytest
 import vipetsc
 from tests.rigs import TWO_MASSES, period_map
 from tests.steady_states import motion_at
-from vipetsc.case import CaseError
 from vipetsc.case.case_file import put
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
@@ -175,23 +174,3 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     assert NfrcCase.from_toml(more.to_toml()) == more
     (resumed,) = follow_all(more, parts, MPI.COMM_SELF, resume=True)
     assert [point.xi.tolist() for point in resumed.points] == [point.xi.tolist() for point in at_once.points]
-
-
-@pytest.mark.parametrize(
-    ("key", "changes", "where", "reason"),
-    [
-        ("clearance", {}, "nfrc.over", "path of a key"),
-        ("drive.amplitude", {}, "nfrc.over", "only keys of lattice, contacts, disorder"),
-        ("contacts.clearance", {"fixed": []}, "nfrc.fixed", "give the amplitudes"),
-        ("contacts.clearance", {"range": [0.2, 0.1]}, "nfrc.range", "must be [low, high]"),
-        ("contacts.clearnce", {}, "contacts.clearnce", "contacts.clearance"),
-        ("contacts.restitution", {"restitutions": [1.0], "range": [0.5, 1.0]}, "nfrc.restitutions", "varies along"),
-        ("contacts.restitution", {"range": [0.5, 1.5]}, "contacts.restitution", "with contacts.restitution = 1.5"),
-        ("lattice.cells", {"range": [2.0, 5.0]}, "lattice.cells", "with lattice.cells"),
-    ],
-)
-def test_keys_that_do_not_vary_along_a_curve_are_refused(key, changes, where, reason):
-    with pytest.raises(CaseError) as caught:
-        over(key, 0.1, 0.2, **changes)
-    assert where in [problem.key for problem in caught.value.problems]
-    assert any(reason in problem.remedy for problem in caught.value.problems)

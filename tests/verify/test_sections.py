@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from vipetsc import Case, CaseError, Sweep
+from vipetsc import Case, Sweep
 from vipetsc.dynamics.run import simulate
 from vipetsc.figures.sections import sections_of
 from vipetsc.io.read import open_ensemble, open_run, whole_members
@@ -97,29 +97,13 @@ def test_a_longer_member_keeps_whole_samples_a_period(tmp_path):
                 assert case.time.end * omega / (2 * np.pi) == pytest.approx(round(case.time.end * omega / 2 / np.pi))
 
 
-def test_members_follow_one_another_along_numbers():
-    """A last axis without an order, a sweep without fields, and an invalid member are refused by the key."""
+def test_an_invalid_member_of_runs_that_follow_one_another_is_refused():
+    """The next run cannot begin where it would have ended."""
     invalid = Sweep.from_table(
         IMPACT | {"sweep": {"follow": "up", "fields": True, "drive": {"amplitude": [1.0, 1e300]}}}
     )
     with pytest.raises(CaseError, match=r"drive\.amplitude = 1e"):
         invalid.tried()
-    for sweep, word in (
-        ({"fields": True, "drive": {"frequency": [2.2, 2.3]}, "contacts": {"law": ["bilinear", "hertz"]}}, "last axis"),
-        ({"drive": {"frequency": [2.2, 2.3]}}, "sweep.fields"),
-    ):
-        with pytest.raises(CaseError, match=f"sweep.follow.*{word}"):
-            Sweep.from_table(IMPACT | {"sweep": {"follow": "up"} | sweep})
-
-
-@pytest.mark.parametrize(
-    ("changes", "key"), [({"sample_interval": 0.01}, "samples_per_period"), ({"samples": 100}, "samples_per_period")]
-)
-def test_samples_are_counted_in_one_way(changes, key):
-    """Samples by the period exclude an interval and a number of samples."""
-    with pytest.raises(CaseError) as refused:
-        Case.from_table(IMPACT | {"time": IMPACT["time"] | changes})
-    assert any(key in problem.key for problem in refused.value.problems)
 
 
 def test_the_spectrum_of_a_sine_has_its_amplitude():

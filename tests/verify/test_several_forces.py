@@ -10,7 +10,6 @@ import pytest
 from tests.conftest import with_sections
 from tests.rigs import OUTPUT, TWO_MASSES, after_a_period
 from tests.steady_states import motion_at
-from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.response.condensation import driven_points
 from vipetsc.modes.response.state import Response
@@ -95,29 +94,3 @@ def test_states_with_contact_repeat_themselves_in_time(drives):
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
     # The error is that of the harmonics that are left out.
     assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()
-
-
-@pytest.mark.parametrize(
-    ("drives", "nfrc", "key", "sentence"),
-    [
-        ((FORCE, BEYOND | {"frequency": 2.0}), {}, "drive.more[1].frequency", "repeats itself with one period"),
-        (
-            (FORCE, {"waveform": "impulse", "amplitude": 1.0, "duration": 0.5, "cell": 2}),
-            {},
-            "drive.more[1].waveform",
-            "under a sine",
-        ),
-    ],
-)
-def test_drives_without_a_common_period_are_refused(drives, nfrc, key, sentence):
-    with pytest.raises(CaseError) as caught:
-        rig(*drives, **nfrc)
-    (problem,) = caught.value.problems
-    assert problem.key == key
-    assert sentence in problem.remedy
-
-
-def test_an_incident_wave_acts_alone():
-    more = [{"amplitude": 1.0, "frequency": 1500.0, "cell": 5}]
-    with pytest.raises(CaseError, match="a wave that is incident acts alone"):
-        NfrcCase.from_table({"nfrc": {"range": [0.9, 1.1]}, "drive": {"more": more}})

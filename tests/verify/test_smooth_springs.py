@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.rigs import OUTPUT, TWO_MASSES, followed, period_map
+from tests.rigs import OUTPUT, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
@@ -224,27 +224,3 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
     with pytest.raises(CaseError, match="begin at another value"):
         from_zero = DUFFING["nfrc"] | options | {"range": [0.0, 0.5]}
         NfrcCase.from_table(DUFFING | {"contacts": STOP, "nfrc": from_zero})
-
-
-@pytest.mark.parametrize(
-    ("changes", "key", "reason"),
-    [
-        ({"nfrc": {"source": "wave", "range": [0.5, 1.0]}}, "nfrc.source", "changes its shape as it travels"),
-        ({"nfrc": DUFFING["nfrc"] | {"harmonics": 2000}}, "nfrc.harmonics", "unknown harmonics"),
-        ({"lattice": TWO_MASSES["lattice"]}, "output.points", "name the masses"),
-    ],
-)
-def test_refusals(changes, key, reason):
-    """A wave, too many unknowns, and a linear lattice of which no mass is named are refused with their reasons."""
-    table = chain_of(2, {"cubic": 1.0})
-    if "source" in changes.get("nfrc", {}) and changes["nfrc"]["source"] == "wave":
-        table = table | {"lattice": {name: value for name, value in table["lattice"].items() if name != "damping"}}
-        table["contacts"] = {"law": "bilinear", "stiffness": 1.0, "sites": [1], "clearance": 0.1, "restitution": 1.0}
-        table["lattice"]["cell"] = table["lattice"]["cell"] | {"masses": [1.0, 1.0], "contact": [1, 2]}
-        link = {"start": 1, "end": 2, "stiffness": 1.0}
-        table["lattice"]["cell"]["springs"] = [*table["lattice"]["cell"]["springs"], link]
-        table["drive"] = {"frequency": 0.5, "amplitude": 0.1}
-    with pytest.raises(CaseError) as caught:
-        NfrcCase.from_table(table | changes)
-    assert key in [problem.key for problem in caught.value.problems]
-    assert any(reason in problem.remedy for problem in caught.value.problems)

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from tests.conftest import run_of
 from tests.rigs import after_a_period
 from tests.steady_states import motion_at
-from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase
+from vipetsc.case import Case, NnmCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.dynamics import simulate
 from vipetsc.identification.motion import SampledModel
@@ -245,37 +245,12 @@ def test_scattered_coefficients_are_drawn_cell_by_cell():
 
 
 WALL = {"waveform": "harmonic", "amplitude": 1e-4, "frequency": 900.0, "end": "right"}
-SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
-
-
-@pytest.mark.parametrize(
-    ("kind", "sections", "key", "reason"),
-    [
-        (Case, {"drive": WALL, "initial": None}, "drive.end", "quadratic and cubic in cell 12"),
-        (LawCase, {"law": {}, "initial": None}, 'lattice.profiles."springs[2].quadratic"', "depend on amplitude"),
-        (NnmCase, {"nnm": {"system": "reduced"}}, 'lattice.profiles."springs[2].quadratic"', "has no such half"),
-    ],
-)
-def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):
-    """Verbs and drives that need linear springs refuse nonlinear ones, and name the key."""
-    table = TABLE | {"contacts": SITES} | sections
-    # Each verb's case reads sections of its own. Others are left out, since they would be a problem by themselves.
-    readable = {name: value for name, value in table.items() if value is not None and name in kind.keywords()}
-    with pytest.raises(CaseError) as caught:
-        kind.from_table(readable)
-    problems = [problem for problem in caught.value.problems if problem.key == key]
-    assert any(reason in problem.remedy for problem in problems), caught.value.problems
 
 
 def test_a_right_wall_moves_a_linear_spring():
     """A right wall with a linear spring may move, whatever springs there are elsewhere."""
     profiles = {"springs[1].cubic": {"cells": [9], "value": 1e10}}
     assert Case.from_table(TABLE | {"drive": WALL, "initial": {}, "lattice": TABLE["lattice"] | {"profiles": profiles}})
-
-
-def test_a_wrong_name_is_answered_with_the_names_that_there_are():
-    with pytest.raises(CaseError, match=r"springs\[1\]\.cubic"):
-        changed(lattice={"profiles": {"springs[3].cubic": {"cells": [6], "value": 4e9}}})
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.follow import follow_all
 
@@ -80,13 +79,3 @@ def test_motions_close_after_three_periods_and_have_their_stability():
         assert point.measured.unstable == growing
         numbers.add(growing)
     assert numbers == {0, 1}
-
-
-@pytest.mark.parametrize(
-    "options, key", [({"harmonics": 2}, "nfrc.harmonics"), ({"subharmonic": 2, "symmetric": True}, "nfrc.symmetric")]
-)
-def test_impossible_harmonics_are_refused(options, key):
-    """The drive must be among the harmonics, and two periods are not symmetric."""
-    with pytest.raises(CaseError) as caught:
-        duffing(0.05, range=[3.1, 3.6], **options)
-    assert [problem.key for problem in caught.value.problems] == [key]

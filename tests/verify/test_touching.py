@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from tests.conftest import simulated
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 
@@ -153,19 +153,6 @@ def test_touching_beads_of_two_masses_are_those_of_an_independent_solver(engine)
     assert difference(run, expected) < 1e-8
 
 
-@pytest.mark.slow
-def test_engines_log_the_same_impacts_of_a_stop_without_clearance():
-    """Both engines log the same impacts of a stop without clearance.
-
-    The tiny front of the wave, which the engines resolve differently below all tolerances, makes no impact.
-    """
-    runs = [run_complete(sprung_case(engine)) for engine in ("ts", "propagator")]
-    first, second = ({name: run[f"impacts/{name}"].values for name in ("onset", "indentation")} for run in runs)
-    assert len(first["onset"]) == len(second["onset"]) > 5
-    assert first["onset"] == pytest.approx(second["onset"], abs=1e-9)
-    assert first["indentation"] == pytest.approx(second["indentation"], rel=1e-6)
-
-
 def test_the_front_of_a_wave_is_no_impact_on_a_stop_with_loss():
     """Both engines log one impact, from rest: the front of a strike 6 and 16 cells away, 1e-26 m/s or less, is none.
 
@@ -183,27 +170,6 @@ def test_the_front_of_a_wave_is_no_impact_on_a_stop_with_loss():
     first, second = runs
     assert first["impacts/onset"].values == pytest.approx(second["impacts/onset"].values, rel=1e-6)
     assert first["impacts/indentation"].values == pytest.approx(second["impacts/indentation"].values, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_with_a_floor_a_touching_stop_dissipates_alike_in_both_engines():
-    lossy = {"restitution": 0.7, "approach_floor": 0.5}
-    runs = [run_complete(sprung_case(engine, **lossy)) for engine in ("ts", "propagator")]
-    found, expected = (run["displacement"].values for run in runs)
-    assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
-    # Displacements alone would not show a loss that is recorded wrongly.
-    losses = [run["energy/dissipated"].values[-1] for run in runs]
-    assert losses[0] > 0 and losses[0] == pytest.approx(losses[1], rel=1e-6)
-
-
-@pytest.mark.parametrize("each", [{}, {"each": {"restitution": [0.7]}}])
-def test_a_loss_in_a_contact_that_touches_at_rest_is_refused(each):
-    lossy: dict[str, object] = each or {"restitution": 0.7}
-    with pytest.raises(CaseError) as error:
-        sprung_case(**lossy)
-    [problem] = error.value.problems
-    assert problem.key == ("contacts.each.restitution" if each else "contacts.restitution")
-    assert "touches its stop at rest" in problem.remedy and "approach_floor" in problem.remedy
 
 
 def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():

@@ -10,7 +10,6 @@ import pytest
 from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from tests.verify.test_one_mass import ONE_MASS
-from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -94,14 +93,6 @@ def test_hertzian_stops_that_touch_beside_one_that_does_not():
     assert {episode.pair for episode in states.balance.series(point.xi[:-1] * states.clearance, 1.4).episodes} == {0, 1}
     error, _ = error_of_a_period(states, point)
     assert error < 1e-3
-
-
-def test_a_wave_is_refused():
-    """A stop that touches at rest is refused under a wave, whose amplitude is counted in clearances."""
-    contacts = {"sites": [10], "clearance": 0.0, "side": "plus", "restitution": 1.0}
-    with pytest.raises(CaseError, match="counts in clearances") as caught:
-        NfrcCase.from_table({"lattice": {"preset": "four-band", "cells": 30}, "contacts": contacts, "nfrc": {}})
-    assert [problem.key for problem in caught.value.problems] == ["nfrc.source"]
 
 
 def test_a_lattice_without_damping_has_a_state_between_its_resonances():

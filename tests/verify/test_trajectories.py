@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -202,44 +201,6 @@ def test_work_of_the_linear_diatomic_case():
     assert result.statistics["work"] == pytest.approx(left.sum(), rel=1e-6)
 
 
-# For each preset a clearance that its waves reach, and a duration in s with several impacts.
-PRESETS = {"four-band": {"clearance": 2e-3, "end": 0.07}, "diatomic": {"clearance": 2e-4, "end": 0.06}}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["hertz", "bilinear"])
-@pytest.mark.parametrize("restitution", [1.0, 0.7])
-@pytest.mark.parametrize(
-    ("preset", "amplitude"), [("four-band", 1e-3), ("four-band", 30), ("four-band", 1000), ("diatomic", 200)]
-)
-def test_ledger_closes(preset, amplitude, law, restitution):
-    """Work less dissipated energy is what the lattice holds, to 1e-8 of the work at every sample."""
-    setting = PRESETS[preset]
-    table = {
-        "lattice": {"preset": preset, "cells": 24},
-        "contacts": {"sites": [10, 20], "clearance": setting["clearance"], "law": law, "restitution": restitution},
-        "drive": {"amplitude": amplitude, "cycles": 8},
-        "time": {"end": setting["end"]},
-    }
-    run, result = simulated(Case.from_table(table))
-
-    work = run["energy/work"].values
-    dissipated = run["energy/dissipated"].values
-    held = run["energy/kinetic"].values + run["energy/spring"].values + run["energy/contact"].values
-    residual = np.abs(work - dissipated - held)
-    assert residual.max() <= 1e-8 * work.max()
-    # Relative to the present work the residual may be larger where the burst begins or takes its work back.
-    assert (residual[1:] <= 1e-8 * work[1:]).mean() > 0.99
-
-    has_contact = amplitude > 1
-    assert (result.statistics["episodes"] > 0) == has_contact
-    assert (dissipated[-1] > 0) == (has_contact and restitution < 1)
-    if restitution == 1:
-        assert result.statistics["pulled"] == 0
-    by_site = run["energy/dissipated_by_site"].values
-    np.testing.assert_allclose(by_site.sum(axis=1), dissipated, rtol=1e-12, atol=1e-300)
-
-
 @pytest.mark.slow
 def test_tolerance_keeps_its_promise():
     """A hundredth of the tolerance lowers the error by ten or more; 1e-10 leaves less than 1e-6."""
@@ -279,67 +240,6 @@ def test_every_method_samples_exactly(folder, exact, method, rtol):
     assert simulate(case, folder / "stopped", stop=StopAt(150)).resumable
     assert simulate(case, folder / "stopped").complete
     assert_same_bits(straight, datasets(folder / "stopped" / "run.h5"))
-
-
-def test_doubling_the_amplitude_doubles_a_linear_run_bit_for_bit():
-    """Tolerances scale with the drive, so that a run without contact takes the same steps at any amplitude."""
-    once = run_of(small_case(drive={"amplitude": 0.001}))
-    twice = run_of(small_case(drive={"amplitude": 0.002}))
-
-    assert len(once["impacts/site"]) == 0
-    # At the tail of the front velocities are subnormal numbers, whose doubling rounds.
-    np.testing.assert_allclose(2 * once["velocity"].values, twice["velocity"].values, rtol=0, atol=1e-300)
-    np.testing.assert_array_equal(4 * once["energy/work"].values, twice["energy/work"].values)
-
-
-MIRRORED_CELLS = 20
-MIRRORED_MASSES = [0.005, 0.0025, 0.003, 0.004]
-# Each spring has its start, end and stiffness, and whether the end is in the next cell.
-MIRRORED_SPRINGS = [(4, 1, 2e4, True), (1, 2, 1e4, False), (2, 4, 1e4, False), (2, 3, 1e3, False)]
-
-
-def mirror_table() -> dict[str, Any]:
-    """The table of a lattice of four different masses a cell that is driven at its left end."""
-    springs = [
-        {"start": start, "end": end, "stiffness": stiffness, "next_cell": next_cell}
-        for start, end, stiffness, next_cell in MIRRORED_SPRINGS
-    ]
-    cell = {"masses": MIRRORED_MASSES, "springs": springs, "contact": [2, 3]}
-    return {
-        "lattice": {"cells": MIRRORED_CELLS, "cell": cell},
-        "contacts": {"stiffness": 5e6, "restitution": 0.7, "sites": [5, 11], "clearance": [1.0e-4, 1.5e-4]},
-        "drive": {"amplitude": 20.0, "cycles": 6, "frequency": 1000.0, "cell": 1, "mass": 1},
-        "time": {"end": 0.05},
-    }
-
-
-def mirrored_table() -> dict[str, Any]:
-    """The table of the same lattice with left and right exchanged: masses and cells count from the other end."""
-    table = mirror_table()
-    last = len(MIRRORED_MASSES) + 1
-    springs = []
-    for start, end, stiffness, next_cell in MIRRORED_SPRINGS:
-        if next_cell:
-            # Counted from the right, the end of a spring to the next cell comes before its start.
-            start, end = end, start
-        springs.append({"start": last - start, "end": last - end, "stiffness": stiffness, "next_cell": next_cell})
-
-    table["lattice"]["cell"] = {"masses": MIRRORED_MASSES[::-1], "springs": springs, "contact": [last - 2, last - 3]}
-    table["contacts"]["sites"] = [MIRRORED_CELLS + 1 - site for site in reversed(table["contacts"]["sites"])]
-    table["contacts"]["clearance"].reverse()
-    table["drive"] |= {"cell": MIRRORED_CELLS, "mass": last - 1}
-    return table
-
-
-@pytest.mark.slow
-def test_a_mirrored_lattice_gives_the_mirrored_answer():
-    """A lattice with left and right exchanged, its drive and sites included, moves as the mirror image."""
-    straight = run_of(Case.from_table(mirror_table()))
-    mirrored = run_of(Case.from_table(mirrored_table()))
-
-    assert len(straight["impacts/site"]) > 5
-    velocity = straight["velocity"].values
-    assert relative(velocity - mirrored["velocity"].values[:, ::-1, ::-1], velocity) < 1e-7
 
 
 @pytest.mark.slow

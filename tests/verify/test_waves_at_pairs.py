@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 from tests.conftest import run_of
 from tests.models import TWO_MASS_CELL
 from tests.steady_states import first_harmonic
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, Spring, UnitCell, WaveCompliance
 from vipetsc.lattice.chain import Pair
@@ -172,27 +172,3 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
     motions = (u[:, 0, 1], u[:, 3, 0] - u[:, 2, 0])
     found = [first_harmonic(motion, samples) for motion in motions]
     assert found == pytest.approx(np.abs(measures.harmonics[:, 1]).tolist(), rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("lattice", "nfrc"),
-    [
-        ({}, {}),
-        ({}, {"source": "force", "infinite": True}),
-        ({"ends": "free"}, {"source": "force"}),
-        ({"ends": "periodic"}, {"source": "force"}),
-        ({"absorbing": {"cells": 8, "strength": 1.0, "end": "both"}}, {"source": "force", "open_ends": True}),
-    ],
-)
-def test_the_ground_does_not_push_a_lattice_without_walls(lattice, nfrc):
-    """A one-sided stop of the ground is refused in lattices without walls, which alone could balance its mean force."""
-    case = wave_case(GROUND)
-    table = case.model_dump(by_alias=True, exclude_none=True)
-    table["contacts"] |= {"side": "plus"}
-    table["lattice"] |= lattice
-    table["drive"]["cell"] = 12
-    table["nfrc"] = {"range": [0.9, 1.6]} | nfrc
-    with pytest.raises(CaseError) as caught:
-        NfrcCase.from_table(table)
-    assert [problem.key for problem in caught.value.problems] == ["contacts.pair"]
-    assert "mean force" in caught.value.problems[0].remedy
