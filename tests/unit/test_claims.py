@@ -1,4 +1,4 @@
-"""Verdicts on the paper's claims follow from numbers and thresholds, and the thresholds are those listed here."""
+"""Verdicts on the paper's claims follow from numbers and thresholds, on either side of each threshold."""
 
 import errno
 import json

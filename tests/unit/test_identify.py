@@ -14,7 +14,7 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.identify import IdentifyCase, RecordTable, SensorTable, read_measured
 from vipetsc.io import tables
 from vipetsc.studies.further_sensor import _further_sensor
-from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples, parameter_lines
+from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
@@ -306,36 +306,6 @@ def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
     assert values["starts/valley"].tolist() == valleys
     assert values["starts/value"][:, 0] == pytest.approx([50.0, 10.0, np.nan, 12.5], nan_ok=True)
     assert values["starts/deviance"] == pytest.approx([30.0, 0.0, np.nan, 1.0], nan_ok=True)
-
-
-def test_columns_of_the_printed_table_stand_below_their_headings():
-    """Columns start or end with their headings for names, values and intervals of any length."""
-    columns = {
-        "parameter": ["clearance_minus 1+2+3+12", "restitution", "cubic", "clearance 4"],
-        "value": [-1.234567e-10, 0.7, -9.876543e10, 1e-3],
-        "standard_error": [1.2e-12, 0.013, np.nan, np.nan],
-        "interval_low": [-1.234567e-10, 0.68, np.nan, np.nan],
-        "interval_high": [-1.134567e-10, 0.72, np.nan, np.nan],
-        "determined": [1, 1, 0, 0],
-        "at_bound": [0, 0, 0, 0],
-        "at_least": [np.nan, np.nan, np.nan, 2.5e-3],
-        "unit": ["m", "1", "N/m^3", "m"],
-    }
-    data = xr.Dataset({name: ("parameter", values) for name, values in columns.items() if name != "parameter"})
-    lines = parameter_lines(data.assign_coords(parameter=columns["parameter"]), confidence=0.95)
-
-    heading = lines[0]
-    texts = ["clearance_minus 1+2+3+12", "restitution", "cubic", "clearance 4"]
-    intervals = ["-1.234567e-10 to -1.134567e-10", "0.68 to 0.72", "not determined", "at least 0.0025"]
-    assert [line.index(text) for line, text in zip(lines[1:], texts, strict=True)] == [heading.index("parameter")] * 4
-    places = [line.index(text) for line, text in zip(lines[1:], intervals, strict=True)]
-    assert places == [heading.index("95 % interval")] * 4
-    assert {line.rindex(" ") for line in lines} == {heading.index(" unit")}
-    # Numbers end where their headings end.
-    ends = [lines[1].index("-1.234567e-10") + len("-1.234567e-10"), lines[2].index("0.7 ") + len("0.7")]
-    assert ends == [heading.index("value") + len("value")] * 2
-    ends = [lines[1].index("1.2e-12") + len("1.2e-12"), lines[2].index("0.013") + len("0.013")]
-    assert ends == [heading.index("error") + len("error")] * 2
 
 
 def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_path):
