@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from vipetsc import Case, Sweep
+from vipetsc.case import CaseError
 from vipetsc.dynamics.run import simulate
 from vipetsc.figures.sections import sections_of
 from vipetsc.io.read import open_ensemble, open_run, whole_members
