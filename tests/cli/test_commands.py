@@ -144,7 +144,7 @@ def test_what_follows_from_a_case_is_shown(in_process, desk, command):
 
 
 def test_everything_wrong_with_a_case_is_said_at_once(in_process, tmp_path):
-    """Every wrong key and value is named once, and nothing is written; ``tests/mpi/test_refusals.py`` has two ranks."""
+    """Every wrong key and value is named once, and nothing is written."""
     path = tmp_path / "bad.toml"
     path.write_text(
         '[lattice]\npreset = "fourband"\ncels = 3\n[contacts]\nsites = [3, 3, 400]\n'

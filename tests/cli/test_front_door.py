@@ -13,7 +13,7 @@ from mpi4py import MPI
 import h5py
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified, set_words
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
 from vipetsc.cli.verbs.doctor_verb import doctor_table
 
 SMALL = """
@@ -60,6 +60,12 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, with_
     pictures = {p.name for p in (tmp_path / "out" / "figures").glob("*.png")}
     wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures
+
+    # What one rank finds in a folder is sent to the others.
+    if ranks:
+        drawn = on_ranks(ranks, "plot", tmp_path / "out", "--movie", "--format", "gif", "--width", "320")
+        assert drawn.returncode == 0, drawn.stderr
+        assert list((tmp_path / "out/figures").glob("movie-*.gif"))
 
     # The rest concerns files only, and two pictures are enough for it.
     if not ranks:
@@ -156,14 +162,6 @@ def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
         assert not (tmp_path / "none" / "modes.h5").exists()
 
 
-@pytest.mark.mpirun
-def test_doctor(vipetsc):
-    """``doctor`` on two ranks finds no problem with this installation."""
-    ended = vipetsc(2, "doctor")
-    assert ended.returncode == 0, ended.stdout
-    assert "no problems" in ended.stdout
-
-
 def test_doctor_without_slepc_names_the_package(monkeypatch):
     """Without SLEPc the installation is healthy and the package to install is named; with it, its version is shown."""
     monkeypatch.setitem(sys.modules, "slepc4py", None)
@@ -181,27 +179,6 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
     assert ended.returncode == 0, ended.stderr
     assert "TSFunctionEval" in ended.stdout
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["statistics"]["method"] == "5dp"
-
-
-@pytest.mark.mpirun
-def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path):
-    """A run that grows without bound ends with 1; its status names the time, the place and the last good sample."""
-    out = tmp_path / "out"
-    # Explicit Euler steps of constant length add energy to an oscillation.
-    euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none", "-ts_dt", "1e-5")
-    changes = set_words("lattice.cells=40", "contacts.sites=[10]", "time.end=0.5")
-
-    ended = vipetsc(2, "run", "--out", out, *changes, *QUICK, *euler)
-
-    assert ended.returncode == 1, ended.stdout + ended.stderr
-    status = json.loads((out / "summary.json").read_text())["status"]
-    for text in ("diverges", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
-        assert text in status
-
-    # Samples up to the last good one are kept, and none of those that grew without bound.
-    run = datasets(out / "run.h5")
-    assert 1 < len(run["time"]) < 2500
-    assert all(abs(run["velocity"][k]).max() < 1e3 for k in range(len(run["time"])))
 
 
 # A limit on the size of files stands for a full disk: a write beyond it fails.

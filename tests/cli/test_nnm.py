@@ -41,16 +41,3 @@ def test_a_branch_leaves_its_files_and_its_picture(in_process, case, tmp_path):
         "branch-out-of-phase.csv",
         "figures/branch-out-of-phase.png",
     }
-
-
-@pytest.mark.mpirun
-def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
-    """A branch whose steps become too short ends with exit code 1 and the key to change; its points are in the file."""
-    out = tmp_path / "out"
-
-    # With this smallest step the branch cannot pass its fold.
-    done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
-
-    assert done.returncode == 1
-    assert "change nnm.smallest_step" in done.stdout
-    assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5

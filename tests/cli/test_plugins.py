@@ -13,7 +13,6 @@ import jsonschema
 import numpy as np
 import pytest
 
-from tests.conftest import set_words
 from tests.manual_modules import CHAPTER, write_modules
 from vipetsc import Case, CaseError, Sweep, open, plugins, sweep
 from vipetsc.case.keys import json_schema
@@ -53,9 +52,6 @@ parameters = {{ delay = 0.01 }}
 end = 0.03
 engine = "propagator"
 """
-
-# One of the tests calls mpirun; in the same process as that one the others find the run made and its law compiled.
-pytestmark = pytest.mark.mpirun
 
 
 @pytest.fixture(scope="module")
@@ -323,13 +319,6 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
     # The compiled kernel uses the parameter: changes grow with it, and are far above rounding.
     assert abs(hardened / linear - 1) > abs(little / linear - 1) > 1e-4
     assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
-
-
-def test_two_ranks_have_the_bits_of_one(folder, out, tmp_path, on_ranks):
-    """The registered law, compiled on each of two ranks, gives the same bits as on one rank."""
-    on_ranks(2, "run", folder / "case.toml", "--out", tmp_path / "two", *set_words("output.figures=false"))
-    with open(out / "run.h5") as one, open(tmp_path / "two/run.h5") as two:
-        assert np.array_equal(one["velocity"], two["velocity"])
 
 
 PLAIN = """

@@ -101,15 +101,3 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
         assert "run.h5 cannot be opened as a run: another program has it open for writing" in ended.stderr, verb
         assert "is not a run" not in ended.stderr, verb
     assert json.loads((out / "summary.json").read_text())["complete"]
-
-
-@pytest.mark.mpirun
-def test_ranks_agree_on_what_is_drawn(vipetsc, tmp_path):
-    """Pictures and a movie of a run on two ranks: what one rank finds in a folder is sent to the other."""
-    case = tmp_path / "case.toml"
-    case.write_text(RUN)
-    out = tmp_path / "out"
-    assert vipetsc(2, "run", case, "--out", out).returncode == 0
-    again = vipetsc(2, "plot", out, "--movie", "--format", "gif", "--width", "320")
-    assert again.returncode == 0, again.stderr
-    assert list((out / "figures").glob("movie-*.gif"))

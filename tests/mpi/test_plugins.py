@@ -1,4 +1,4 @@
-"""A module that only one rank cannot import ends all ranks, and so does a mistake in a measure of a sweep."""
+"""Modules of users on several ranks: the same bits; what one rank cannot import, and mistakes in measures, end all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from mpi4py import MPI
 
 import pytest
 
-from vipetsc.case import Sweep
+from tests.cli.test_plugins import CASE as CASE_OF_ALL_PARTS
+from tests.manual_modules import write_modules
+from tests.mpi.test_partition import runs_alike
+from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
 from vipetsc.register import PartError
 from vipetsc.studies.ensemble import FAILED
@@ -65,6 +68,16 @@ def test_a_module_that_fails_on_one_rank_ends_all(folder, failing, verb, capfd):
     assert "cannot be imported: OSError: this rank cannot read its table" in messages[0]
     assert ("on rank 1: cannot" in messages[0]) == (failing == 1)
     assert not is_left
+
+
+@pytest.mark.parallel([2])
+def test_two_ranks_have_the_bits_of_one(folder):
+    """The law of a module, compiled on each of two ranks, gives the same bits as on one rank."""
+    if MPI.COMM_WORLD.rank == 0:
+        write_modules(folder)
+        (folder / "case.toml").write_text(CASE_OF_ALL_PARTS)
+    MPI.COMM_WORLD.Barrier()
+    runs_alike(folder, Case.load(folder / "case.toml"))
 
 
 MEASURE = """

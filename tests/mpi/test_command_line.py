@@ -1,16 +1,31 @@
-"""Bad input on two ranks: each problem is printed once, all ranks return 2, and nothing is written."""
+"""The command line on two ranks: what is printed once, what all ranks return, and what is left after a failure."""
 
 from __future__ import annotations
+
+import json
 
 from mpi4py import MPI
 
 import h5py
+import numpy as np
 import pytest
 import tomli_w
 
 from tests.conftest import search_table, set_words
 from vipetsc.cli.main import main
 
+FOLDED = """
+[lattice]
+preset = "four-band"
+reading = "printed"
+[contacts]
+law = "bilinear"
+modulus = 1e8
+[nnm]
+modes = [2]
+energy = [0.0, 1.0]
+locate_grazing = false
+"""
 # For each verb: wrong changes of its case, and sentences that the message must contain.
 REFUSED = {
     "design": (
@@ -65,3 +80,48 @@ def test_a_file_that_is_no_branch_is_refused(folder, capfd):
 
     assert printed.count("is not a branch") == 1
     assert "Traceback" not in printed
+
+
+@pytest.mark.parallel([2])
+def test_doctor_finds_no_problem_here(capfd):
+    """``doctor`` finds no problem with this installation on either rank."""
+    comm = MPI.COMM_WORLD
+    assert comm.allgather(main(["doctor"])) == [0, 0]
+    assert ("no problems" in capfd.readouterr().out) == (comm.rank == 0)
+
+
+@pytest.mark.parallel([2])
+def test_a_branch_that_fails_names_the_key_to_change_and_keeps_its_points(folder, capfd):
+    """With a smallest step that cannot pass a fold the exit code is 1, and the points are in the file."""
+    comm = MPI.COMM_WORLD
+    if comm.rank == 0:
+        (folder / "case.toml").write_text(FOLDED)
+    comm.Barrier()
+    words = ["nnm", str(folder / "case.toml"), "--out", str(folder / "out")]
+    code = main([*words, *set_words("nnm.smallest_step=1e-3", "output.figures=false")])
+    printed = comm.allgather(capfd.readouterr().out)
+    rows = comm.bcast((folder / "out/branch-out-of-phase.csv").read_text().splitlines())
+
+    assert comm.allgather(code) == [1, 1]
+    assert "nnm.smallest_step" in printed[0]
+    assert len(rows) > 5
+
+
+@pytest.mark.parallel([2])
+def test_an_unstable_run_ends_with_its_place_and_last_good_sample(folder, capfd):
+    """A run that grows without bound ends with 1; its status names the place, and good samples are kept."""
+    comm = MPI.COMM_WORLD
+    # Explicit Euler steps of constant length add energy to an oscillation.
+    euler = {"ts_rk_type": "1fe", "ts_adapt_type": "none", "ts_dt": "1e-5"}
+    changes = set_words("lattice.cells=40", "contacts.sites=[10]", "time.end=0.5", "output.figures=false")
+    code = main(["run", "--out", str(folder / "out"), *changes], euler)
+    assert comm.allgather(code) == [1, 1]
+    comm.Barrier()
+    status = comm.bcast(json.loads((folder / "out/summary.json").read_text())["status"])
+    for text in ("diverges", "site 1 in cell 10", "last good sample"):
+        assert text in status
+
+    with h5py.File(folder / "out/run.h5") as file:
+        velocity = file["velocity"][...]
+    assert 1 < len(velocity) < 2500
+    assert np.abs(velocity).max() < 1e3
