@@ -100,15 +100,15 @@ def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
     assert "--force repeats the run" in cut.stderr
 
 
-def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
+def test_no_verb_is_the_builtin_case(in_process, tmp_path):
     """Without a verb the built-in case is run; another case is refused until --force replaces the run."""
-    ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
+    ended = in_process("--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
 
     other = in_process("--set", "time.end=0.02", *QUICK, cwd=tmp_path)
     assert other.returncode == 2
-    assert "time.end = 0.01 there, 0.02 here; go on from its end with --extend" in other.stderr
+    assert "time.end" in other.stderr and "--extend" in other.stderr
 
     forced = in_process("--set", "time.end=0.02", *QUICK, "--force", cwd=tmp_path)
     assert forced.returncode == 0, forced.stderr

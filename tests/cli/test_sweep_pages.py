@@ -98,15 +98,6 @@ def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ibtet", "work", "bands_modal_energy"])
-def test_a_measure_asked_for_by_name_is_drawn_alone(burst, name):
-    """``plot --fig`` draws only the page of the named measure, also of one that has no page by default."""
-    assert main(["plot", str(burst), "--fig", name]) == 0
-    (picture,) = drawn(burst)
-    assert picture.startswith(f"{name}-over-contacts.clearance")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -421,8 +421,8 @@ def test_samples_of_bands_are_those_of_the_bands():
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", [0, 1, 2, 3])
 @pytest.mark.parametrize("words", [0, 1, 2])
-def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path):
-    """Every page is saved in both formats, and names of pages contain every key."""
+def test_every_combination_of_keys_is_drawn(numbers, words):
+    """Names of pages contain every key, and differ."""
     axes = [AMPLITUDES, CLEARANCES, THREE][:numbers] + [LAWS, SITES][:words]
     if not axes:
         return
@@ -431,9 +431,7 @@ def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path
     assert len(set(stems)) == len(stems) >= 3
     for stem, axis in product(stems, axes):
         assert all(path in stem for path in axis)
-    figure = next(measure_pages(ensemble, "bands/share")).draw()
-    for suffix in ("png", "pdf"):
-        assert save(figure, tmp_path / f"page.{suffix}").stat().st_size > 100
+    assert next(measure_pages(ensemble, "bands/share")).draw().axes
 
 
 def test_roles_do_not_depend_on_equal_sizes():
