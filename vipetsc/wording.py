@@ -69,6 +69,12 @@ def capitalised(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def key_words(path: str) -> str:
+    """Return the words for the ``path`` of a key within a sentence: "drive amplitude" for "drive.amplitude"."""
+    name = key_name(path)
+    return name[:1].lower() + name[1:]
+
+
 def with_unit(name: str, unit: str) -> str:
     """A ``name`` with its ``unit`` in brackets, as "time (s)"; without one where the unit is "1" or empty."""
     if unit in ("", "1"):

@@ -127,9 +127,9 @@ def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
     np.testing.assert_allclose(low.get_ydata(), 0.01 * np.arange(1, 7))
     np.testing.assert_allclose(high.get_ydata(), 0.01 * np.arange(7, 13))
     assert to_hex(low.get_color()) != to_hex(high.get_color())
-    assert legend(figure) == ["contacts.restitution 0.3", "contacts.restitution 0.9"]
+    assert legend(figure) == ["contact restitution 0.3", "contact restitution 0.9"]
     assert "for each contact restitution" in title(figure)
-    assert "largest (ring): 0.12 at contacts.restitution 0.9, drive.amplitude 32 N" in title(figure)
+    assert "largest (ring): 0.12 at contact restitution 0.9, drive amplitude 32 N" in title(figure)
 
 
 def test_the_ring_is_at_the_largest_value():
@@ -169,10 +169,10 @@ def test_a_map_over_falling_values_shows_each_at_its_place():
 def test_words_and_lists_are_curves_and_panels_with_their_values():
     figure = only(ensemble_of(LAWS, SITES, RESTITUTIONS, AMPLITUDES))
     assert len(panels(figure)) == 2
-    assert legend(figure)[0] == "contacts.sites [9], contacts.restitution 0.3"
+    assert legend(figure)[0] == "contact sites [9], contact restitution 0.3"
     assert [axes.get_title(loc="left") for axes in panels(figure)] == [
-        "(a) contacts.law hertz",
-        "(b) contacts.law bilinear",
+        "(a) contact law hertz",
+        "(b) contact law bilinear",
     ]
 
 
@@ -187,11 +187,11 @@ def test_categories_alone_are_ticks():
 def test_keys_that_vary_together_are_named_together():
     together = {"contacts.sites": [[9], [9, 20], [9]], "drive.cycles": [4, 4, 6]}
     figure = only(ensemble_of(together, AMPLITUDES))
-    assert legend(figure)[1] == "contacts.sites [9, 20], drive.cycles 4"
+    assert legend(figure)[1] == "contact sites [9, 20], drive cycles 4"
     # Keys in a zip are one axis, whose curves need the values of both.
     pairs = {"drive.frequency": [900.0, 1000.0, 1100.0], "drive.cycles": [3, 4, 5]}
     labels = [text.translate(BLANKS) for text in legend(only(ensemble_of(pairs, AMPLITUDES)))]
-    assert labels[1] == "drive.frequency 1000 rad/s, drive.cycles 4"
+    assert labels[1] == "drive frequency 1000 rad/s, drive cycles 4"
 
 
 def test_what_does_not_vary_stands_nowhere():
@@ -213,7 +213,7 @@ def test_many_keys_are_panels_and_pages_each_with_a_name_of_its_own():
     # Maps of cells over amplitude: two laws and four clearances are panels, four numbers of cycles pages.
     assert len(figures) == 4
     assert {len(panels(figure)) for figure in figures.values()} == {8}
-    assert "drive.cycles 3" in title(next(iter(figures.values())))
+    assert "drive cycles 3" in title(next(iter(figures.values())))
 
 
 def test_a_study_of_too_many_pages_is_cut_through_its_largest_value():
@@ -307,7 +307,7 @@ def test_members_that_failed_are_gaps_and_counted():
 def test_a_value_that_is_not_finite_is_no_largest():
     ensemble = ensemble_of(AMPLITUDES)
     ensemble["ibtet"][0] = np.inf
-    assert "largest (ring): 0.06 at drive.amplitude 32 N" in title(only(ensemble))
+    assert "largest (ring): 0.06 at drive amplitude 32 N" in title(only(ensemble))
 
 
 def test_what_cannot_be_drawn_has_a_reason():
@@ -397,7 +397,7 @@ def test_scales_follow_the_spacing():
 def test_a_lattice_of_one_band_has_its_page():
     ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES, parts=2)
     figure = only(ensemble, "bands/share")
-    assert legend(figure) == ["contacts.restitution 0.3", "contacts.restitution 0.9"]
+    assert legend(figure) == ["contact restitution 0.3", "contact restitution 0.9"]
     np.testing.assert_allclose(curves(panels(figure)[0])[0].get_ydata(), ensemble["bands/share"][0, :, 1])
 
     without = ensemble_of(AMPLITUDES, parts=1)

@@ -67,7 +67,7 @@ def test_files_and_legends_name_the_keys(family):
             curves.append(data.load())
     assert json.loads(curves[0].attrs["family"]) == {"contacts.clearance": 0.7, MASS: 1.0}
     legend = [text.replace("\u00a0", " ") for text in legend_of(curves)]
-    assert legend[0] == "contacts.clearance 0.7 m, lattice.cell.masses[1] 1 kg"
+    assert legend[0] == "contact clearance 0.7 m, lattice cell masses[1] 1 kg"
     assert len(set(legend)) == 4
     assert unit_of("lattice.cell.springs[1].stiffness", {}) == "N/m"
 

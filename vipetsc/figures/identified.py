@@ -182,6 +182,8 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     misfit, course, *starts = figure.subplots(1, columns)
     windows = identified["window"].values
     misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
+    # Room for these numbers.
+    misfit.margins(y=0.15)
     # The number of contact episodes in each window stands at the foot of the panel.
     for number, impacts in zip(windows, identified["windows/impacts"].values, strict=True):
         misfit.annotate(str(impacts), (number, 0.02), xycoords=("data", "axes fraction"), fontsize=5, ha="center")

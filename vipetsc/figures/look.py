@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from vipetsc.figures.log_ticks import log_ticks
-from vipetsc.wording import key_name, nearest
+from vipetsc.wording import key_name, key_words, nearest
 
 LETTER_OF_PANEL = re.compile(r"\([a-z](\.[ivx]+)?\)")
 AMPLITUDES = ("m", "m/s", "m/s²", "m/s^2", "N")  # units of which a level is 20 log10 of the value
@@ -89,7 +89,7 @@ class Look:
         replaced = set()
         for text, label in self.labels.items():
             # A picture shows a key of a case by its name.
-            for sought in (text, key_name(text)):
+            for sought in (text, key_name(text), key_words(text)):
                 if _replace_texts(figure, partial(_replaced, sought=sought, label=label)):
                     replaced.add(text)
         return replaced

@@ -30,7 +30,7 @@ from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
-from vipetsc.wording import capitalised, with_unit
+from vipetsc.wording import capitalised, key_words, with_unit
 
 MOST_PAGES = 12  # of a measure, as many as a reader turns over; of more only the one with the largest value is drawn
 BAND = "band"  # the first word in the names of those parts of the frequency axis that are pass bands
@@ -373,9 +373,9 @@ def _lines_of(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]
     """Return the lines of a page: the ``title``, what is compared on the page, and what values are left out."""
     heading, *further = title
     lines = [heading]
-    compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
+    compared = [key for axis in (*roles.panels, *roles.curves) for key in axis.keys]
     if compared:
-        lines.append(f"for each {compared[:1].lower()}{compared[1:]}")
+        lines.append(f"for each {joined([with_unit(key_words(key.path), key.unit) for key in compared])}")
     lines += further
 
     if measure.samples:

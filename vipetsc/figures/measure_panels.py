@@ -22,7 +22,7 @@ from vipetsc.wording import key_name
 MARKERS = "os^Dv*"  # of curves, in their order
 SINGLE = 4.8  # width in inches of a page with one panel
 LETTERS = 17  # letters of a page's title that fit into an inch
-BAR_LETTERS = 40  # of a line beside a colour bar
+BELOW = 0.4  # inches that the ticks and the label below a panel take
 PANEL_LETTERS = 15  # letters of a panel's title on an inch; fewer, since titles side by side must not touch
 LEGEND_LETTERS = 17  # letters of a legend that fit into an inch
 MOST_COLUMNS = 4  # columns of panels
@@ -108,8 +108,8 @@ class MeasurePage:
         if rows > 1:
             height = 0.3 + 1.75 * rows
         above = 0.15 * len(heading)
-        # A label in the middle of the page's left edge ends below the title, and as far from the lower edge.
-        self.label_height = height - above
+        # A label in the middle of the page's left edge ends below the title, and above the label of the other axis.
+        self.label_height = height - above - BELOW
         height += above
         strip = self._legend_height()
         self.figure = style.new_figure(self.width, height + strip)
@@ -275,7 +275,9 @@ def draw_maps(
     ticks: dict[str, Any] = {}
     if isinstance(norm, LogNorm):
         ticks = {"ticks": log_ticks(norm.vmin, norm.vmax), "format": "%g"}
-    colour_bar(image, page.panels, "\n".join(wrap(page.label, BAR_LETTERS)), extend="neither", **ticks)
+    colour_bar(
+        image, page.panels, "\n".join(wrap(page.label, int(LETTERS * page.label_height))), extend="neither", **ticks
+    )
     return page.figure
 
 

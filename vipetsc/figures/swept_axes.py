@@ -10,7 +10,7 @@ import xarray as xr
 
 from vipetsc.case.keys import unit_of
 from vipetsc.io.read import axes as axes_of
-from vipetsc.wording import key_name, with_unit
+from vipetsc.wording import key_name, key_words, with_unit
 
 FEW_TOGETHER = 6  # values up to which keys that vary together are categories; of more they are numbers
 FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction: 5 degrees of phase
@@ -53,9 +53,9 @@ class SweptKey(NamedTuple):
 
     @property
     def texts(self) -> list[str]:
-        """The path with each value and its unit: ``drive.amplitude 24.3 N``."""
+        """The words for the key with each value and its unit: ``drive amplitude 24.3 N``."""
         unit = f"{NO_BREAK}{self.unit}" if self.unit else ""
-        return [f"{self.path} {text}{unit}" for text in self.value_texts]
+        return [f"{key_words(self.path)} {text}{unit}" for text in self.value_texts]
 
 
 def _number_texts(values: np.ndarray) -> list[str]:
