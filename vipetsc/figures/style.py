@@ -23,7 +23,8 @@ from vipetsc.io.atomic import atomic_write
 
 COLUMN = 3.4  # width of one journal column in inches
 PAGE = 7.0  # width of two
-NOTE = 0.165  # height in inches that a line of a note takes in the strip below a picture
+NOTE = 0.165  # height in inches that a note of one line takes in the strip below a picture
+NOTE_LINE = 0.12  # height that each further line takes: 1.2 times that of letters of 7 pt
 LETTERS = 19  # letters of a note that fit into an inch of its width
 HEADING_LETTERS = 15  # letters of a heading that fit into an inch
 COMPRESSION = 3  # of a PNG, from 1 to 9: files are 4 % larger than with 6, with which a picture takes a sixth longer
@@ -197,7 +198,7 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
 
     options: dict[str, Any] = {}
     if lines:
-        options["bbox_inches"] = Bbox([[0, -NOTE * len(lines)], [width, height]])
+        options["bbox_inches"] = Bbox([[0, -NOTE - NOTE_LINE * (len(lines) - 1)], [width, height]])
         # With such a box ``savefig`` keeps all axes in the frames that they have now.
         apply_aspects(figure)
     if path.suffix == ".png":
