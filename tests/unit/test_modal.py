@@ -136,20 +136,6 @@ def test_modes_of_equal_masses_are_those_of_the_formula(ends):
         assert np.abs(found.vectors.T @ found.vectors - np.eye(cells)).max() < 1e-12
 
 
-def test_modes_that_inverse_iteration_misses_are_those_of_a_dense_solution(monkeypatch):
-    """Vectors that are not finite, as those that are not orthonormal, are replaced by those of a dense solution."""
-    chain = Chain(CELLS["diatomic"], 21)
-    exact = linear_modes(chain)
-    modes._modes.cache_clear()
-    squared = exact.frequency**2
-    for vectors in (np.full_like(exact.vectors, np.nan), np.ones_like(exact.vectors)):
-        with monkeypatch.context() as patch:
-            patch.setattr(modes, "_near_diagonal", lambda matrix, vectors=vectors: (squared, vectors))
-            found = linear_modes(chain)
-        modes._modes.cache_clear()
-        assert np.abs(np.abs(found.vectors.T @ exact.vectors) - np.eye(len(squared))).max() < 1e-10
-
-
 def test_chains_that_differ_in_contacts_alone_share_their_modes():
     """Modes are computed once for chains that differ in contacts alone."""
     chain = Chain(CELLS["diatomic"], 20)

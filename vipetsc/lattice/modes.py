@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh, eigvals_banded, lapack
+from scipy.linalg import eig_banded, eigh, lapack
 from scipy.sparse import csc_matrix, diags
 
 from vipetsc.lattice.bands import bloch
@@ -24,11 +24,7 @@ from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Drive
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size has 128 MB
-# Modes nearer than this fraction of the largest Om^2 are orthogonalised one by one. Of 300 four-band cells the norm of
-# random fields in all modes errs by 1e-15 with a tenth, half or twice of it as well, at the same CPU time.
-CLOSE = 1e-3
 EPS = float(np.finfo(float).eps)
-ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are accepted
 AT_REST = 1e-13  # squared frequencies below this fraction of the largest are those of a rigid translation
 # Inverse iterations; few, since the shift is an eigenvalue to rounding. One leaves errors of 2e-12, two of 1e-15, in a
 # fifth less of CPU time than three, which leave room for eigenvalues that are less exact; six take half as much again.
@@ -102,8 +98,8 @@ class Modes:
 def linear_modes(chain: Chain) -> Modes:
     """The modes of ``chain`` with linear springs alone, without its sites and dashpots, computed once.
 
-    1200 DoFs take about a second and 12 MB. Raises ValueError for a lattice of more than ``MOST_DOFS`` whose cells
-    differ: its modes are no waves.
+    1200 DoFs take a quarter of a second, 4000 a quarter of a minute. Raises ValueError for a lattice of more than
+    ``MOST_DOFS`` whose cells differ: its modes are no waves.
     """
     return _modes(replace(chain.linearised(), sites=(), clearances=()))
 
@@ -120,16 +116,11 @@ def _modes(chain: Chain) -> Modes:
         raise ValueError(f"modes of {chain.cells} cells that differ, with more than {MOST_DOFS} masses")
 
     matrix = _scaled(chain)
-    if ring or matrix.shape == (1, 1):
+    if ring:
         squared, vectors = eigh(matrix.toarray(), driver="evr")
     else:
-        squared, vectors = _near_diagonal(matrix)
-    # The norm of two random fields shows whether inverse iteration has left modes that are not orthogonal.
-    x = np.random.default_rng(0).standard_normal((2, len(squared)))
-    norm = np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1)
-    # Not "any > ORTHONORMAL", which is false for NaN.
-    if not np.all(np.abs(norm - 1) <= ORTHONORMAL):
-        squared, vectors = eigh(matrix.toarray(), driver="evr")
+        band = _band(matrix)
+        squared, vectors = eig_banded(band[2 * (len(band) // 3) :], lower=True)
 
     squared[squared < AT_REST * squared[-1]] = 0.0  # free ends
     return Modes(
@@ -227,10 +218,12 @@ def _standing_shape(chain: Chain, number: int) -> np.ndarray:
     root = 1 / np.sqrt(chain.masses())
     # A hair above the eigenvalue, so that the shifted matrix can be inverted.
     shift = mode_frequency(chain, number) ** 2 + 4 * EPS * _spectrum_counter(chain).top
-    shifted = _BandFactor(band, shift)
+    width = len(band) // 3
+    band[2 * width] -= shift
+    factor, pivots, _ = lapack.dgbtrf(band, width, width, overwrite_ab=True)
     x = np.random.default_rng(number).standard_normal(len(root))
     for _ in range(ITERATIONS):
-        x = shifted.solve(x)
+        x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
         x /= np.linalg.norm(x)
     return (x * root).reshape(chain.cells, -1)
 
@@ -271,60 +264,6 @@ def _band(matrix: csc_matrix) -> np.ndarray:
         first = max(k, 0)
         band[2 * width - k, first : first + len(diagonal)] = diagonal
     return band
-
-
-class _BandFactor:
-    """LU factors of ``band`` - ``shift``, of a matrix as ``_band`` lays it out; ``band`` itself is overwritten.
-
-    If the result ``is_singular``, the shift being an eigenvalue to the last bit, nothing can be solved with it.
-    """
-
-    def __init__(self, band: np.ndarray, shift: float) -> None:
-        self._width = len(band) // 3
-        band[2 * self._width] -= shift
-        self._factor, self._pivots, zero_pivot = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
-        self.is_singular = zero_pivot > 0
-
-    def solve(self, x: np.ndarray) -> np.ndarray:
-        """The solution (n,) for the right-hand side ``x``."""
-        solution, _ = lapack.dgbtrs(self._factor, self._width, self._width, x, self._pivots)
-        return solution
-
-
-def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues, lowest first, and vectors of a symmetric banded ``matrix``, by inverse iteration.
-
-    Vectors of eigenvalues closer than ``CLOSE`` are orthogonalised against one another, which does not ensure that all
-    are: the caller has to check. It takes a fifth of the time of a dense solution.
-    """
-    n = matrix.shape[0]
-    band = _band(matrix)
-    squared = eigvals_banded(band[2 * (len(band) // 3) :], lower=True)
-    vectors = np.zeros((n, n), order="F")
-    noise = np.random.default_rng(1).standard_normal((n, n))
-
-    first = 0  # of the vectors that are close to the one that is sought
-    shift = -np.inf
-    for j, value in enumerate(squared):
-        first += int(np.searchsorted(squared[first:j], value - CLOSE * squared[-1]))
-        close = vectors[:, first:j]
-        # Equal eigenvalues get shifts apart, or inverse iteration would give the same vector again.
-        shift = max(value, shift + 4 * EPS * squared[-1])
-        shifted = _BandFactor(band.copy(order="F"), shift)
-        # As happens in chains of equal masses. A shift that is off by some roundings serves as well.
-        while shifted.is_singular:
-            shift += 4 * EPS * squared[-1]
-            shifted = _BandFactor(band.copy(order="F"), shift)
-
-        x = noise[j]
-        for _ in range(ITERATIONS):
-            x = shifted.solve(x)
-            x /= np.linalg.norm(x)
-            for _ in range(2):  # once is not enough where little of x is left
-                x -= close @ (close.T @ x)
-                x /= np.linalg.norm(x)
-        vectors[:, j] = x
-    return squared, vectors
 
 
 def _wavenumbers(vectors: np.ndarray, chain: Chain) -> np.ndarray:
