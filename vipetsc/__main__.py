@@ -5,11 +5,14 @@ import logging
 import os
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
-from vipetsc.process import end_on_request
+from vipetsc.process import end_on_request, launched_rank
 
 # Libraries that must be built for the machine's MPI, so that setting up the package does not install them.
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"
+# What one process answers: verbs that only look at a case or at the program, and its version.
+LOOKING = "completion", "examples", "manual", "schema", "validate", "--version"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,20 +40,24 @@ def main(arguments: list[str] | None = None) -> int:
 
     arguments = sys.argv[1:] if arguments is None else arguments
     end = arguments.index("--") if "--" in arguments else len(arguments)
+    needs_ranks = not only_looks_at(arguments[:end]) or launched_rank() is not None or gives_petsc_options(arguments)
+    if needs_ranks:
+        import petsc4py
 
-    import petsc4py
-
-    # PETSc's handlers of signals would end the process at once; ours end a run at its next step, with a checkpoint.
-    petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
-    from petsc4py import PETSc
+        # PETSc's handlers of signals would end the process at once; ours end a run at its next step, with a checkpoint.
+        petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
 
     try:
-        from vipetsc.parallel import install_abort_hook
+        from vipetsc.parallel import ALONE, install_abort_hook
 
+        ranks = ALONE
+        if needs_ranks:
+            from mpi4py import MPI
+
+            ranks = MPI.COMM_WORLD
         # Before a rank can fail: one that raises alone would leave the others waiting for ever.
-        install_abort_hook()
+        install_abort_hook(ranks)
 
-        from vipetsc.case.schema import only_looks
         from vipetsc.cli.main import main as run_verb
     except ImportError as error:
         # One of the package's own modules that cannot be imported is a defect, and wants its traceback.
@@ -60,13 +67,38 @@ def main(arguments: list[str] | None = None) -> int:
         logging.getLogger("vipetsc").critical("vipetsc: %s; %s", error, remedy)
         return 2
 
-    # Options that a result may depend on become part of the case.
+    options = {}
+    if needs_ranks:
+        options = options_of_results()
+    return run_verb(arguments[:end], options, ranks)
+
+
+def only_looks_at(arguments: list[str]) -> bool:
+    """Whether a verb only looks at a case or at the program, or help is asked for: one process does it, without MPI.
+
+    To start MPI and PETSc takes half a second.
+    """
+    asks_for_help = "-h" in arguments or "--help" in arguments
+    return asks_for_help or (bool(arguments) and arguments[0] in LOOKING)
+
+
+def gives_petsc_options(arguments: list[str]) -> bool:
+    """Whether options for PETSc are given: behind ``--``, in the environment or in a file that PETSc reads."""
+    files = Path.home() / ".petscrc", Path(".petscrc"), Path("petscrc")
+    return "--" in arguments or "PETSC_OPTIONS" in os.environ or any(file.exists() for file in files)
+
+
+def options_of_results() -> dict[str, str]:
+    """Take from PETSc's database the options that a result may depend on: they become part of the case."""
+    from petsc4py import PETSc
+
+    from vipetsc.case.schema import only_looks
+
     database = PETSc.Options()
     options = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
     for name in options:
         database.delValue(name)
-
-    return run_verb(arguments[:end], options)
+    return options
 
 
 def _open_closed_streams() -> None:

@@ -1,4 +1,8 @@
-"""Ranks that work, fail and end together."""
+"""Ranks that work, fail and end together.
+
+MPI is imported where it is needed, here and in verbs: the import starts it, which takes a fifth of a second, and verbs
+that only look at a case or at the program run without it, in a process that is `ALONE`.
+"""
 
 import logging
 import os
@@ -10,24 +14,39 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NamedTuple, Self, TypeVar, cast
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 
 from vipetsc.process import STOP_SIGNALS, end_now
 from vipetsc.wording import of_system
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 
-def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
-    """Let a rank that raises end all ranks, with one message; otherwise the others wait for it for ever.
+class OneProcess:
+    """A process without MPI, where a communicator is asked for: the functions here send no message from one rank."""
 
-    The front door calls it; a script that starts ranks of its own may.
+    rank = 0
+    size = 1
+
+
+ALONE = cast("MPI.Comm", OneProcess())
+
+
+def install_abort_hook(comm: "MPI.Comm | None" = None) -> None:
+    """Let a rank that raises end all ranks of ``comm``, by default all there are, with one message.
+
+    Otherwise the others wait for it for ever. The front door calls it; a script that starts ranks of its own may.
     """
+    if comm is None:
+        from mpi4py import MPI
+
+        comm = MPI.COMM_WORLD
 
     def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
         if comm.rank and getattr(error, "from_root", False):
@@ -51,7 +70,7 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
     sys.excepthook = hook
 
 
-def wait_for_all(comm: MPI.Comm) -> None:
+def wait_for_all(comm: "MPI.Comm") -> None:
     """Wait for all ranks of ``comm``, asleep after a millisecond: those that still work need the cores."""
     barrier = comm.Ibarrier()
     begin = time.monotonic()
@@ -61,8 +80,10 @@ def wait_for_all(comm: MPI.Comm) -> None:
             time.sleep(1e-3)
 
 
-def all_meet(comm: MPI.Comm, patience: float) -> bool:
+def all_meet(comm: "MPI.Comm", patience: float) -> bool:
     """Whether all ranks of ``comm`` call this within ``patience`` s: one that was killed never does."""
+    if comm.size == 1:
+        return True
     barrier = comm.Ibarrier()
     deadline = time.monotonic() + patience
     while not barrier.Test():
@@ -72,15 +93,17 @@ def all_meet(comm: MPI.Comm, patience: float) -> bool:
     return True
 
 
-def on_one_machine(comm: MPI.Comm) -> bool:
+def on_one_machine(comm: "MPI.Comm") -> bool:
     """Whether all ranks of ``comm`` are on one machine, and see its temporary folders; all must call it."""
+    from mpi4py import MPI
+
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
     size = machine.size
     machine.Free()
     return bool(comm.allreduce(size == comm.size, MPI.LAND))
 
 
-def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
+def on_root(comm: "MPI.Comm", function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
     # A rank alone keeps the value as it is: a copy of a case, as messages make, would be resolved again.
     if comm.size == 1:
@@ -92,9 +115,11 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     return _value_or_raise(comm.bcast(attempt))
 
 
-def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
+def on_every_rank(comm: "MPI.Comm", function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
     attempt = _attempt(function)
+    if comm.size == 1:
+        return _value_or_raise(attempt)
     wait_for_all(comm)
     errors = [error for error in comm.allgather(_sendable(attempt).error) if error is not None]
     if not errors:
@@ -105,7 +130,7 @@ def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     return _value_or_raise(agreed)
 
 
-def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
+def divided(comm: "MPI.Comm", jobs: Sequence[Callable[[], T]]) -> list[T]:
     """The values of all ``jobs``, of which each rank computes every ``comm.size``-th, on all ranks.
 
     What the first job that fails raises is raised on all. All ranks must call it with the same number of jobs.
@@ -118,10 +143,12 @@ def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
     return [_value_or_raise(attempts[number]) for number in range(len(jobs))]
 
 
-def smallest(comm: MPI.Comm, *numbers: float) -> list[float]:
+def smallest(comm: "MPI.Comm", *numbers: float) -> list[float]:
     """The smallest value that each of the ``numbers`` has on any rank, in one reduction; all ranks must call it."""
     if comm.size == 1:
         return [*numbers]
+    from mpi4py import MPI
+
     reduced = np.array(numbers)
     comm.Allreduce(MPI.IN_PLACE, reduced, MPI.MIN)
     return [float(number) for number in reduced]
@@ -173,14 +200,18 @@ def _value_or_raise(attempt: _Attempt) -> Any:
 class SharedCounter:
     """A count that all ranks of ``comm`` draw from, one-sided: no rank has to wait on another to hand out work."""
 
-    def __init__(self, comm: MPI.Comm) -> None:
-        self._window = MPI.Win.Allocate(8 if comm.rank == 0 else 0, 8, comm=cast(MPI.Intracomm, comm))
+    def __init__(self, comm: "MPI.Comm") -> None:
+        from mpi4py import MPI
+
+        self._window = MPI.Win.Allocate(8 if comm.rank == 0 else 0, 8, comm=cast("MPI.Intracomm", comm))
         if comm.rank == 0:
             np.frombuffer(self._window.tomemory(), np.int64)[:] = 0  # type: ignore[call-overload]
         comm.Barrier()
 
     def draw(self, step: int = 1) -> int:
         """The count before ``step`` is added to it."""
+        from mpi4py import MPI
+
         value = np.empty(1, np.int64)
         added = np.array([step], np.int64)
         self._window.Lock(0, MPI.LOCK_SHARED)
@@ -194,7 +225,7 @@ class SharedCounter:
 
     @classmethod
     @contextmanager
-    def within(cls, comm: MPI.Comm) -> Iterator[Self]:
+    def within(cls, comm: "MPI.Comm") -> Iterator[Self]:
         """A counter for a block that all ranks leave together; one that leaves alone by an error must not wait."""
         counter = cls(comm)
         try:
@@ -224,11 +255,13 @@ class StopRequest:
     requested = False
     _is_listening = False
 
-    def agreed(self, comm: MPI.Comm) -> bool:
+    def agreed(self, comm: "MPI.Comm") -> bool:
         """Return whether any rank of ``comm`` got a request; all must call it."""
-        return bool(comm.allreduce(self.requested, MPI.LOR))
+        if comm.size == 1:
+            return self.requested
+        return any(comm.allgather(self.requested))
 
-    def check(self, comm: MPI.Comm) -> None:
+    def check(self, comm: "MPI.Comm") -> None:
         """Raise StoppedError on all ranks of ``comm`` if any got a request; all must call it."""
         if self.agreed(comm):
             raise StoppedError("stopped on request; the same command continues")

@@ -12,7 +12,17 @@ import pytest
 pytestmark = pytest.mark.parallel(1)
 
 # The import of each of these takes a tenth of a second or more.
-HEAVY = {"matplotlib", "numba", "pandas", "scipy.interpolate", "scipy.optimize", "xarray"}
+HEAVY = {
+    "h5py",
+    "matplotlib",
+    "mpi4py.MPI",
+    "numba",
+    "pandas",
+    "petsc4py.PETSc",
+    "scipy.interpolate",
+    "scipy.optimize",
+    "xarray",
+}
 CASE = Path("runs/examples/three-mass.toml")
 
 # One process calls several commands, and reports the loaded modules after each of them.
@@ -46,16 +56,17 @@ def loaded_by(*commands: tuple[object, ...]) -> list[set[str]]:
 
 
 def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_kernels(tmp_path):
-    """Help, schema and manual load none of the libraries, ``validate`` at most scipy.optimize, ``bands`` no numba.
+    """Help, schema, manual and examples load none of the libraries, ``validate`` at most scipy.optimize.
 
-    A search refines the bands. ``validate`` estimates the cost of a run from its steps, without the engines' kernels.
+    None of them starts MPI or PETSc. A search refines the bands. ``validate`` estimates the cost of a run from its
+    steps, without the engines' kernels, which ``bands`` does not load either.
     """
-    nothing = [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts")]
+    nothing = [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts"), ("examples",)]
     loaded = loaded_by(*nothing, ("validate", CASE), ("bands", CASE, "--out", tmp_path))
-    assert loaded[:4] == [set()] * 4
-    assert loaded[4] <= {"scipy.optimize"}
+    assert loaded[:5] == [set()] * 5
+    assert loaded[5] <= {"scipy.optimize"}
     # The module that draws bands also draws runs, and must not load kernels.
-    assert "numba" not in loaded[5]
+    assert "numba" not in loaded[6]
 
 
 def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kernels(tmp_path):

@@ -19,7 +19,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures.style import save
-from vipetsc.io.atomic import StoredArrays, atomic_write, remove_abandoned, save_arrays, write_text
+from vipetsc.io.atomic import atomic_write, remove_abandoned, write_text
+from vipetsc.io.hdf5 import StoredArrays, save_arrays
 from vipetsc.io.lock import FolderError, locked
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_ensemble, open_run

@@ -19,7 +19,7 @@ from vipetsc.dynamics import energies, run
 from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.memory import check_numbers
+from vipetsc.dynamics.memory import check_scalars
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.io.store import RunMemory
@@ -263,4 +263,4 @@ def test_the_sum_over_ranks_does_not_depend_on_their_order_nor_number(ranks):
 def test_a_petsc_of_other_numbers_is_refused_before_it_runs(scalar):
     """Compiled code reads the states of PETSc as real doubles."""
     with pytest.raises(CaseError, match="double precision"):
-        check_numbers(small_case().model(), scalar)
+        check_scalars(scalar)

@@ -11,8 +11,8 @@ from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.io import chunks
-from vipetsc.io.atomic import StoredArrays, read_arrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
+from vipetsc.io.hdf5 import StoredArrays, read_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.store import FieldMemory, RunMemory
 

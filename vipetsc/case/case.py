@@ -256,6 +256,13 @@ class Case(CaseFile):
         return [self]
 
     @property
+    def petsc_options(self) -> dict[str, str]:
+        """The PETSc options of the case by name, without the leading dash."""
+        if self.petsc is None:
+            return {}
+        return self.petsc.model_dump()
+
+    @property
     def wants_pictures(self) -> bool:
         """Whether the results are drawn, ``output.figures``."""
         return self.output.figures
@@ -267,13 +274,10 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """Warnings of settings that are allowed but probably unintended."""
-        options: Table = {}
-        if self.petsc:
-            options = self.petsc.model_extra or {}
         return [
             *unit_warnings(self.drive, self.model().chain),
             *loss_warnings(self.lattice),
-            *warnings_of(self.model(), self.output, options),
+            *warnings_of(self.model(), self.output, self.petsc_options),
         ]
 
 

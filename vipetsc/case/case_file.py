@@ -232,6 +232,11 @@ class CaseFile(Section):
         return []
 
     @property
+    def petsc_options(self) -> dict[str, str]:
+        """The PETSc options of the case by name, without the leading dash."""
+        return {}
+
+    @property
     def wants_pictures(self) -> bool:
         """Whether the results are drawn."""
         return True

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import h5py
 import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
@@ -156,6 +155,8 @@ def _read(path: Path, samples: Table) -> np.ndarray:
 
 def _rows(path: Path, samples: Table) -> np.ndarray:
     """Rows (sample, 2) of time and value as the file has them, and as ``_read`` raises."""
+    import h5py
+
     dataset = samples.get("dataset")
     columns = samples.get("columns")
     rate = samples.get("rate")

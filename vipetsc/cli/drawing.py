@@ -8,8 +8,6 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mpi4py import MPI
-
 from vipetsc.cli.messages import echo, echo_warnings
 from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.folder import FolderError
@@ -17,6 +15,8 @@ from vipetsc.io.kinds import BRANCHES, SWEEP, ResultKind
 from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from vipetsc.figures.look import Look
     from vipetsc.figures.style import LeftOut
 
@@ -44,7 +44,7 @@ class Pictures:
 def draw_pictures(
     pictures: Pictures,
     folders: Sequence[Path],
-    comm: MPI.Comm,
+    comm: "MPI.Comm",
     names: list[str] | None = None,
     formats: tuple[str, ...] = ("png",),
     afresh: bool = True,
@@ -98,7 +98,7 @@ def draw_pictures(
     return sorted(path for paths in comm.gather(drawn_here) or [] for path in paths)
 
 
-def report(pictures: Pictures, comm: MPI.Comm, sentences: Sequence[str]) -> None:
+def report(pictures: Pictures, comm: "MPI.Comm", sentences: Sequence[str]) -> None:
     """Print ``sentences`` about pictures that are left out, on rank 0."""
     for sentence in sentences:
         if pictures.kind == SWEEP:

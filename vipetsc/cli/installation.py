@@ -6,14 +6,15 @@ import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vipetsc.case import CaseError
 from vipetsc.io.extras import OLDEST
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py"
 # Environment variables in which Open MPI, MPICH and their relatives write the number of processes.
@@ -74,7 +75,7 @@ class Check(NamedTuple):
         return "; ".join(filter(None, (self.value, remark)))
 
 
-def checks(comm: MPI.Comm) -> list[Check]:
+def checks(comm: "MPI.Comm") -> list[Check]:
     """All checks of the machine; all ranks must call it."""
     return [
         *map(check_package, PACKAGES),

@@ -4,9 +4,7 @@ import argparse
 import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any, NoReturn, TextIO
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import vipetsc
 from vipetsc.case import CaseError, Problem
@@ -15,9 +13,12 @@ from vipetsc.cli.messages import code_of, discard, echo, reporting
 from vipetsc.cli.verb import BAD_INPUT, FAILED, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError, is_of_file_system
-from vipetsc.parallel import StoppedError, StopRequest, StudyError, all_meet, on_root
+from vipetsc.parallel import ALONE, StoppedError, StopRequest, StudyError, all_meet, on_root
 from vipetsc.register import PartError
 from vipetsc.wording import nearest
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 # s within which all ranks that were stopped must meet. If one of them was killed they never do, and the launcher kills
 # the others within this time.
@@ -26,13 +27,14 @@ ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that prints on rank 0 only, keeps its ``error_in_print``, and ends all ranks together."""
+    """An argument parser that prints on rank 0 of ``comm`` only, keeps its ``error_in_print``, and ends all ranks."""
 
+    comm: "MPI.Comm" = ALONE
     error_in_print: OSError | None = None
 
     def say(self, text: str, stream: TextIO | None) -> None:
         """Print ``text`` to a ``stream`` on rank 0; to none if that was closed, for which Python has None."""
-        if MPI.COMM_WORLD.rank != 0 or stream is None:
+        if self.comm.rank != 0 or stream is None:
             return
         try:
             print(text, end="", file=stream, flush=True)
@@ -52,7 +54,7 @@ class Parser(argparse.ArgumentParser):
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with ``status``; if that is 0, with the code of a failure to print the help."""
         self.say(message or "", sys.stderr)
-        sys.exit(status or on_root(MPI.COMM_WORLD, lambda: code_of("stdout", self.error_in_print)))
+        sys.exit(status or on_root(self.comm, lambda: code_of("stdout", self.error_in_print)))
 
 
 class ShowVersion(argparse.Action):
@@ -65,13 +67,20 @@ class ShowVersion(argparse.Action):
         parser.exit()
 
 
-def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
-    """Run the verb named in ``arguments`` on all ranks, with ``petsc`` options in its case; returns the exit code."""
+def main(arguments: list[str], petsc: Mapping[str, str] | None = None, comm: "MPI.Comm | None" = None) -> int:
+    """Run the verb named in ``arguments`` on all ranks of ``comm``, by default all that there are.
+
+    ``petsc`` are options for its case. Returns the exit code.
+    """
+    if comm is None:
+        from mpi4py import MPI
+
+        comm = MPI.COMM_WORLD
     has_verb = bool(arguments) and (arguments[0] in ABOUT_THE_PROGRAM or not arguments[0].startswith("-"))
     if not has_verb:
         arguments = ["run", *arguments]  # of the built-in case
 
-    parser = _parser(called=arguments[0])
+    parser = _parser(called=arguments[0], comm=comm)
     try:
         " ".join(arguments).encode()
     except UnicodeEncodeError:
@@ -82,13 +91,13 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
-        with reporting(MPI.COMM_WORLD, options, is_answer) as outputs:
-            code = _call(options, petsc or {})
+        with reporting(comm, options, is_answer) as outputs:
+            code = _call(options, petsc or {}, comm)
             # Rank 0 prints for all, and all end with one code.
-            lost = on_root(MPI.COMM_WORLD, lambda: [code_of(output.title, output.error) for output in outputs])
+            lost = on_root(comm, lambda: [code_of(output.title, output.error) for output in outputs])
     except FolderError as error:
         # The file of --log cannot be written, so that nothing else is set up to report it.
-        if MPI.COMM_WORLD.rank == 0:
+        if comm.rank == 0:
             print(f"vipetsc: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
@@ -106,8 +115,8 @@ def _without_verb(word: str) -> str:
     return f"{word!r} is not a verb; {listed}"
 
 
-def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
-    """Call the verb, listen for requests to stop, and report invalid input; returns the exit code."""
+def _call(options: argparse.Namespace, petsc: Mapping[str, str], comm: "MPI.Comm") -> int:
+    """Call the verb on all ranks, listen for requests to stop, and report invalid input; returns the exit code."""
     verb = VERBS[options.verb]
     try:
         # Refused rather than ignored: a result is that of its case file, which would not name these options.
@@ -122,47 +131,48 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
 
         # A verb that never looks at the request has nothing to save, and is ended by the signal at once.
         with StopRequest().listening() as stop, nullcontext() if verb.is_stoppable else stop.at_once():
-            return int(verb.call(options, MPI.COMM_WORLD, stop))
+            return int(verb.call(options, comm, stop))
 
     except ResultFileError as error:
         text = f"vipetsc: {error}"
         if is_of_file_system(error):
-            echo(MPI.COMM_WORLD, f"{text}; after the cause is removed, the same command continues", sys.stderr)
+            echo(comm, f"{text}; after the cause is removed, the same command continues", sys.stderr)
             return FAILED
         if hasattr(options, "force"):
             text += "; move it away, or start again with --force"
-        echo(MPI.COMM_WORLD, text, sys.stderr)
+        echo(comm, text, sys.stderr)
         return BAD_INPUT
     except (CaseError, FolderError, PartError) as error:
         # Every rank gets here: bad input is found on one rank and raised on all.
-        echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
+        echo(comm, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
     except StudyError as error:
-        echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
+        echo(comm, f"vipetsc: {error}", sys.stderr)
         return FAILED
     except StoppedError as error:
         # A launcher also asks the other ranks to stop when one was killed. Then they do not all meet, and no message
         # claims that somebody asked for it.
-        if all_meet(MPI.COMM_WORLD, PATIENCE):
+        if all_meet(comm, PATIENCE):
             text = f"vipetsc: {error}"
             if getattr(options, "force", False):
                 text += "; omit --force, which would start again"
-            echo(MPI.COMM_WORLD, text, sys.stderr)
+            echo(comm, text, sys.stderr)
         return STOPPED
 
 
-def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None) -> Parser:
+def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None, comm: "MPI.Comm" = ALONE) -> Parser:
     """The parser of all verbs.
 
     ``complete`` says how a shell completes arguments (values of ``shtab``), by the arguments' names or flags. If the
     verb that is ``called`` is known, it alone gets its arguments, since to declare those of all verbs takes longer than
-    to parse a command.
+    to parse a command. It prints on one rank of ``comm``.
     """
     parser = Parser(
         prog="vipetsc",
         description="Waves in phononic lattices with vibro-impacts. Without a verb, the built-in four-band case runs.",
         epilog="PETSc options follow --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
     )
+    parser.comm = comm
     parser.add_argument("--version", action=ShowVersion, nargs=0, help="show program's version number and exit")
 
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -174,6 +184,7 @@ def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None
             epilog=f"example: vipetsc {verb.example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        verb_parser.comm = comm
         # The verb `completion` makes a parser of its own with this function, to describe it to a shell.
         verb_parser.set_defaults(parser=_parser)
         if called not in (None, verb.name):

@@ -12,13 +12,14 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, TextIO
 
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import on_root
 from vipetsc.progress import BAR
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 logger = logging.getLogger("vipetsc")
 answers = logging.getLogger("vipetsc.answers")
@@ -70,7 +71,7 @@ def code_of(title: str, error: OSError | None) -> int:
     return 1
 
 
-def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
+def echo(comm: "MPI.Comm", text: str, stream: TextIO | None = None) -> None:
     """Print ``text`` on rank 0, as an answer; with stderr as the ``stream`` as a warning."""
     if comm.rank != 0:
         return
@@ -80,20 +81,20 @@ def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
         logger.warning("%s", text)
 
 
-def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
+def echo_paths(comm: "MPI.Comm", paths: Iterable[Path]) -> None:
     """Print on rank 0 which files were written."""
     for path in paths:
         echo(comm, f"  {path}")
 
 
-def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
+def echo_warnings(comm: "MPI.Comm", warnings: Iterable[str]) -> None:
     """Print warnings about a case or a result on rank 0."""
     for warning in warnings:
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
 
 
 @contextmanager
-def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[Output]]:
+def reporting(comm: "MPI.Comm", options: argparse.Namespace, is_answer: bool) -> Iterator[list[Output]]:
     """Print messages within the block as ``options`` ask for (quiet, verbose, log).
 
     With ``is_answer``, answers are printed even with --quiet. The value of the block is the list of the outputs that

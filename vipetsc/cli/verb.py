@@ -16,8 +16,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-
 from vipetsc.case import CaseFile
 from vipetsc.cli.arguments import Argument
 from vipetsc.cli.drawing import Pictures, draw_pictures
@@ -27,6 +25,8 @@ from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     import xarray as xr
 
 # Exit codes.
@@ -36,7 +36,7 @@ BAD_INPUT = 2  # as argparse exits for wrong arguments
 STOPPED = os.EX_TEMPFAIL  # asks a batch script to queue the job again
 
 Rows = list[tuple[str, str]]
-Function = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
+Function = Callable[[argparse.Namespace, "MPI.Comm", StopRequest], int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Verb(ABC):
     takes_petsc_options: bool = False
 
     @abstractmethod
-    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    def call(self, options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
         """Do what ``options`` ask for; returns the exit code. All ranks must call it."""
 
 
@@ -70,7 +70,7 @@ class PlainVerb(Verb):
 
     function: Function
 
-    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    def call(self, options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
         """Call the function; returns its exit code."""
         return self.function(options, comm, stop)
 
@@ -84,7 +84,7 @@ class Work:
 
     options: argparse.Namespace
     folder: Path
-    comm: MPI.Comm
+    comm: "MPI.Comm"
     stop: StopRequest
     warned: list[str] = field(default_factory=list)
 
@@ -166,7 +166,7 @@ class StudyVerb(Verb):
     load: Callable[[argparse.Namespace], CaseFile] | None = None
     is_stoppable: bool = True
 
-    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    def call(self, options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
         """Compute, draw and report; returns the exit code."""
         # The case is read before anything is written: one that is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
@@ -203,9 +203,9 @@ class StudyVerb(Verb):
     def checked_case(self, options: argparse.Namespace) -> CaseFile:
         """Read the case, on one rank; raises CaseError, also for PETSc options that time stepping does not know."""
         # Imported here: verbs such as `manual` and `schema` need neither PETSc nor compiled kernels.
-        from vipetsc.dynamics.options import check_options
+        from vipetsc.dynamics.plan import check_petsc_options
 
         case = self.load(options) if self.load else self.case.load(options.case, options.set)
         for run in case.runs():
-            check_options(run)
+            check_petsc_options(run)
         return case

@@ -36,7 +36,7 @@ import numpy as np
 
 from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.observers import Observer, Setup
-from vipetsc.dynamics.options import options_of, petsc_options
+from vipetsc.dynamics.options import petsc_options
 from vipetsc.dynamics.samples import Block, Samples
 
 # The deviation's first size, of the largest state so far.
@@ -119,7 +119,7 @@ class LargestExponent(Observer):
         """Let the companion go on from this rank's parts ``here`` of a checkpoint, in order; all ranks must call it."""
         engine = self.setup.engine
         if self._companion is None:
-            with petsc_options(options_of(self.setup.case)):
+            with petsc_options(self.setup.case.petsc_options):
                 self._companion = type(engine)(self.setup.model, self.setup.layout)
         parts = [part for of_rank in self.setup.layout.comm.allgather(here) for part in of_rank]
         self._companion.restore(parts)

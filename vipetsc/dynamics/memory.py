@@ -3,19 +3,18 @@
 import os
 import resource
 from pathlib import Path
-from typing import Any
-
-from mpi4py import MPI
-from petsc4py import PETSc
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
-from vipetsc.dynamics.petsc_library import refused_scalars
 from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.recorded_sizes import chunk_samples, recorded_cells
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
@@ -109,33 +108,44 @@ def memory_available() -> int:
     return min(free, max(limit - taken, 0))
 
 
-def check_numbers(model: Model, scalar: Any = PETSc.ScalarType) -> None:
-    """Raise CaseError if this PETSc does not compute with real doubles, or its indices do not count the state.
+def check_scalars(scalar: Any = None) -> None:
+    """Raise CaseError if PETSc does not compute with real doubles; ``scalar`` is the type of its numbers."""
+    from vipetsc.dynamics.petsc_library import refused_scalars
 
-    ``scalar`` is the type of its numbers.
-    """
     refused = refused_scalars(scalar)
     if refused:
         raise CaseError([Problem("petsc", None, refused)])
+
+
+def check_size(model: Model) -> None:
+    """Raise CaseError if the indices of this PETSc do not count the numbers of the state of ``model``."""
     chain = model.chain
-    most = int(np.iinfo(PETSc.IntType).max)
     size = chain.cells * (2 * chain.cell.dofs + chain.is_damped) + len(chain.sites) + 1
+    # Every PETSc counts so many: it is not started to look at its indices, since that takes a quarter of a second.
+    if size <= np.iinfo(np.int32).max:
+        return
+    from petsc4py import PETSc
+
+    most = int(np.iinfo(PETSc.IntType).max)
     if size > most:
         remedy = f"results in a state of {size} numbers, more than the {most} that the indices of this PETSc count"
         build = "use a PETSc configured --with-64-bit-indices (Debian: python3-petsc4py-64-real)"
         raise CaseError([Problem("lattice.cells", chain.cells, f"{remedy}; {build}")])
 
 
-def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
+def check_memory(model: Model, output: OutputTable, engine: str, comm: "MPI.Comm") -> None:
     """Raise CaseError on all ranks if one has less memory left than the run needs; all must call it.
 
     The same error is raised if PETSc's numbers or indices do not suffice.
     """
-    check_numbers(model)
+    check_scalars()
+    check_size(model)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
     if comm.size > 1 and sample > LARGEST_MESSAGE:
         remedy = f"a sample of {sample / 1e9:.3g} GB exceeds the size of one MPI message; fewer cells reduce it"
         raise CaseError([Problem("output.window", output.window, remedy)])
+
+    from mpi4py import MPI
 
     # The ranks of a machine divide what it has left.
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)

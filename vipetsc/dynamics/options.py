@@ -14,19 +14,11 @@ from vipetsc.dynamics.petsc_library import petsc_library
 RENAMING_VERSION = (3, 25)
 
 
-def options_of(case: CaseFile | None) -> dict[str, str]:
-    """The PETSc options of ``case`` by name."""
-    table = getattr(case, "petsc", None)
-    if table is None:
-        return {}
-    return table.model_dump()
-
-
 def with_database(case: Case) -> Case:
     """The ``case`` with the options of ``ts`` in PETSc's database, where a script has put them."""
     database = PETSc.Options().getAll()
     names = [name for name in database if name.startswith("ts_") and not only_looks(name)]
-    given = {name: database[name] or "true" for name in names} | options_of(case)
+    given = {name: database[name] or "true" for name in names} | case.petsc_options
     if not given:
         return case
     return case.model_copy(update={"petsc": PetscTable.model_validate(given)})
@@ -89,9 +81,9 @@ def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
             database[name] = value
 
 
-def check_options(case: CaseFile | None) -> None:
+def check_options(case: CaseFile) -> None:
     """Raise CaseError for options of ``case`` that Runge-Kutta stepping does not have, or whose value PETSc refuses."""
-    options = options_of(case)
+    options = case.petsc_options
     if not options:
         return
 

@@ -8,9 +8,12 @@ from petsc4py import PETSc
 import numpy as np
 
 
-def refused_scalars(scalar: Any = PETSc.ScalarType) -> str | None:
-    """Why a PETSc whose numbers are of the type ``scalar`` cannot be used, or None: kernels read real doubles."""
-    value = np.dtype(scalar)
+def refused_scalars(scalar: Any = None) -> str | None:
+    """Why a PETSc whose numbers are of the type ``scalar`` cannot be used, or None: kernels read real doubles.
+
+    By default it is the installed one.
+    """
+    value = np.dtype(scalar or PETSc.ScalarType)
     if value == np.float64:
         return None
     return (

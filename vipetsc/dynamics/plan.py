@@ -2,8 +2,7 @@
 
 from typing import NamedTuple, Self
 
-from vipetsc.case import Case, Model
-from vipetsc.dynamics.options import check_options, options_of, with_database
+from vipetsc.case import Case, CaseFile, Model
 from vipetsc.dynamics.propagator.step_choice import refusal
 
 PROPAGATOR = "propagator"
@@ -34,18 +33,26 @@ class RunPlan(NamedTuple):
 
     @classmethod
     def of(cls, case: Case) -> Self:
-        """Return the plan of a run of ``case``, with options from PETSc's database; raises CaseError for bad ones."""
-        case = with_database(case)
-        check_options(case)
+        """Return the plan of a run of ``case``; raises CaseError for PETSc options that there are not."""
+        check_petsc_options(case)
         model = case.model()
         return cls(case, model, choose_engine(case, model), tuple(case.warnings()))
+
+
+def check_petsc_options(case: CaseFile) -> None:
+    """Raise CaseError for PETSc options of ``case`` that there are not, or whose value PETSc refuses."""
+    # PETSc takes a quarter of a second to start: cases without options are checked without it.
+    if case.petsc_options:
+        from vipetsc.dynamics.options import check_options
+
+        check_options(case)
 
 
 def choose_engine(case: Case, model: Model) -> EngineChoice:
     """Return the engine that ``case`` names, by default the propagator; ``ts`` where that does not suit ``model``."""
     if case.time.engine == TS:
         return EngineChoice(TS, None)
-    if options_of(case):
+    if case.petsc_options:
         return EngineChoice(TS, f"{PROPAGATOR} refused: PETSc options require ts")
     reason = refusal(model)
     if reason is not None:

@@ -22,7 +22,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.lyapunov import LargestExponent
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
-from vipetsc.dynamics.options import options_of, petsc_options
+from vipetsc.dynamics.options import petsc_options, with_database
 from vipetsc.dynamics.plan import RunPlan
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
@@ -114,7 +114,7 @@ def simulate(
 
     # What is wrong with the case is refused before anything is allocated or written.
     on_every_rank(ranks, case.import_plugins)
-    plan = RunPlan.of(case)
+    plan = RunPlan.of(with_database(case))
     check_memory(plan.model, plan.case.output, plan.engine.name, ranks)
 
     # The guard first: the others see only samples that it accepts.
@@ -168,7 +168,7 @@ class Simulation:
 
         began = Clocks(wall=time.perf_counter(), cpu=time.process_time())
         sys.audit("vipetsc.set-up", case.name)
-        with log.SET_UP, petsc_options(options_of(case)):
+        with log.SET_UP, petsc_options(case.petsc_options):
             kind = ENGINES[engine_choice.name]
             layout = Layout(model, output.comm, dashpots=True, integrates_damping=kind.integrates_damping)
             engine = kind(model, layout, self.stop)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import h5py
 import numpy as np
 
-from vipetsc.io.atomic import Arrays
+from vipetsc.io.hdf5 import Arrays
 from vipetsc.io.netcdf import tabulated
 
 if TYPE_CHECKING:

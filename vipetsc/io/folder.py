@@ -17,12 +17,8 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-from petsc4py import PETSc
-
-import h5py
 import numpy as np
 
 import vipetsc
@@ -32,6 +28,9 @@ from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.parallel import on_root
 from vipetsc.process import say
 from vipetsc.sources import source_key
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 MOST_NAMED = 6  # keys of another case that a message names: more do not help to tell which case it is
 # The file in NAME.old by which it is known as a folder of earlier results, and not one of the user's.
@@ -55,7 +54,7 @@ class Claim:
     ``going_on`` is whether it holds earlier results of the same case.
     """
 
-    comm: MPI.Comm
+    comm: "MPI.Comm"
     folder: Path
     going_on: bool
 
@@ -79,7 +78,7 @@ def set_aside_in(folder: Path) -> Path:
 
 @contextmanager
 def claimed(
-    comm: MPI.Comm,
+    comm: "MPI.Comm",
     path: str | Path,
     kind: ResultKind,
     text: str,
@@ -260,7 +259,7 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
             yield path + key, value
 
 
-def provenance(comm: MPI.Comm) -> dict[str, Any]:
+def provenance(comm: "MPI.Comm") -> dict[str, Any]:
     """Record of versions, date, host, command and number of ranks, as attributes that every output carries.
 
     Two runs of one command differ in it.
@@ -273,6 +272,12 @@ def origin() -> dict[str, Any]:
 
     ``petsc_options`` are those of PETSc's database, given on the command line; those of a case are in the case's text.
     """
+    # Of what has computed, all of it loaded.
+    from mpi4py import MPI
+    from petsc4py import PETSc
+
+    import h5py
+
     options = PETSc.Options().getAll()
     given = " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items()))
 

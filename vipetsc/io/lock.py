@@ -8,11 +8,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from vipetsc.io.errors import FolderError
 from vipetsc.parallel import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 LOCK = ".lock"
 # The name of this process in a lock: two processes in containers on one host may have the same number.
@@ -22,7 +24,7 @@ ATTEMPTS = 100
 
 
 @contextmanager
-def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
+def locked(comm: "MPI.Comm", *paths: Path) -> Iterator[None]:
     """Keep other commands out of the folders ``paths`` within the block; those that are missing are created.
 
     All ranks must call it. Rank 0 locks the file ``.lock`` in each folder; the system releases the lock when the

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import h5py
 import numpy as np
 
-from vipetsc.io.atomic import atomic_write, hdf5_file
+from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
+from vipetsc.io.hdf5 import hdf5_file
 from vipetsc.register import PartError
 from vipetsc.wording import shortened, system_number, system_reason
 

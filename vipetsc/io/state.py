@@ -6,8 +6,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from vipetsc.io.netcdf import open_netcdf
-
 
 class State(NamedTuple):
     """``displacement`` (cell, dof) in m and ``velocity`` in m/s of the cells ``cell``, from 1; all others are at rest.
@@ -32,6 +30,9 @@ class State(NamedTuple):
         ``orbit``; the last one is the default. A key that the file has no use for is ignored. Raises OSError if the
         file cannot be opened, ValueError if it holds no state, not that one, or numbers that are not finite.
         """
+        # Most cases begin at rest, and are read without h5py.
+        from vipetsc.io.netcdf import open_netcdf
+
         with open_netcdf(path, "state") as file:
             # A branch has its states in a group of their own.
             prefix = ""

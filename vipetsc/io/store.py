@@ -27,17 +27,9 @@ import h5py
 import numpy as np
 
 from vipetsc.io import chunks
-from vipetsc.io.atomic import (
-    Arrays,
-    StoredArrays,
-    atomic_write,
-    discard,
-    hdf5_file,
-    read_arrays,
-    save_arrays,
-    write_text,
-)
+from vipetsc.io.atomic import atomic_write, discard, write_text
 from vipetsc.io.chunks import Recording
+from vipetsc.io.hdf5 import Arrays, StoredArrays, hdf5_file, read_arrays, save_arrays
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run, with_point_names

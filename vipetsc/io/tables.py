@@ -10,10 +10,12 @@ import csv
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import h5py
 import numpy as np
+
+if TYPE_CHECKING:
+    import h5py
 
 COMMENTS = ("#", "%")
 NUMBER_BEGINS = re.compile(r"""["']?([-+.\d]|nan|inf)""", re.IGNORECASE)
@@ -202,6 +204,8 @@ def read_columns(path: Path, places: Mapping[str, int | str], most_rows: int = M
             raise ColumnError(str(error)) from None
         return {key: table.values[:, _index_of(place, table, key)] for key, place in places.items()}
 
+    import h5py
+
     columns = {}
     try:
         with h5py.File(path) as file:
@@ -214,6 +218,8 @@ def read_columns(path: Path, places: Mapping[str, int | str], most_rows: int = M
 
 def is_hdf5(path: Path) -> bool:
     """Return whether the file at ``path`` is HDF5, by its name or its content."""
+    import h5py
+
     return path.suffix.lower() in HDF5 or h5py.is_hdf5(path)
 
 
@@ -222,6 +228,8 @@ def column_names(path: Path, most_rows: int = MOST_ROWS) -> list[str]:
 
     Those of one dimension count, in their order. Raises ColumnError.
     """
+    import h5py
+
     try:
         if not is_hdf5(path):
             return read_table(path, most_rows).names
@@ -249,7 +257,7 @@ def _index_of(place: int | str, table: TextTable, key: str) -> int:
     raise ColumnError(f"no column of that name; {remedy}", key, place)
 
 
-def _hdf5_column(file: h5py.File, key: str, place: int | str) -> np.ndarray:
+def _hdf5_column(file: "h5py.File", key: str, place: int | str) -> np.ndarray:
     """The numbers at a ``place``: a dataset of one dimension, or with "[3]" behind its name the third column of two."""
     name = str(place)
     column: int | None = None
@@ -258,6 +266,8 @@ def _hdf5_column(file: h5py.File, key: str, place: int | str) -> np.ndarray:
         name = match[1]
         column = int(match[2])
     dimensions = 1 + (column is not None)
+
+    import h5py
 
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset):

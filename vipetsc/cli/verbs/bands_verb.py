@@ -3,9 +3,7 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +16,10 @@ from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, modes_of_a_cell, pass_bands, wave_bands
 from vipetsc.lattice.damped import damped_bloch, decay_length
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import ALONE, StopRequest, on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 MODES = argument(
     "--modes",
@@ -30,7 +31,7 @@ NEAR = argument("--near", type=float, metavar="OMEGA", help="frequency in rad/s 
 JSON = argument("--json", action="store_true", help="print JSON instead of a table")
 
 
-def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def bands(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print pass bands, gaps and group velocities of a case's cell, and write them as a table and a picture."""
     case = on_root(comm, lambda: Case.load(options.case, options.set))
     folder = options.out or default_folder(case.name, "bands")
@@ -52,7 +53,7 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     cell = case.lattice.unit_cell()
     numbers = bands_table(cell) | damping_table(cell, case.wave_frequency or 0.0)
     # The lock has the communicator of this rank, the only one here: with another it would wait for all ranks.
-    with locked(MPI.COMM_SELF, folder):
+    with locked(ALONE, folder):
         picture: dict[str, str] = {}
         if cell.joins_cells:
             picture["picture"] = str(draw_bands(cell, folder / "bands.png", case.wave_frequency))
@@ -171,7 +172,7 @@ def damping_report(numbers: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MPI.Comm) -> str:
+def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: "MPI.Comm") -> str:
     """Find the linear modes that ``--modes`` asks for, and write them to ``folder``; returns text about them on rank 0.
 
     The text is empty if none are requested, and on the other ranks. Collective. Raises CaseError for options that do

@@ -2,8 +2,7 @@
 
 import argparse
 import time
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from vipetsc.cli.arguments import argument
 from vipetsc.cli.installation import checks
@@ -13,8 +12,11 @@ from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+
+def doctor(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print versions, MPI, HDF5 and ranks, and faults with their remedies."""
     text, is_healthy = doctor_table(comm)
     echo(comm, text)
@@ -25,7 +27,7 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     return DONE
 
 
-def compile_now(comm: MPI.Comm) -> None:
+def compile_now(comm: "MPI.Comm") -> None:
     """Compile missing kernels, and print the time that this took; all ranks must call it."""
     # Imported here: what it loads may be what is missing.
     from vipetsc.studies.first_calls import compile_kernels
@@ -35,7 +37,7 @@ def compile_now(comm: MPI.Comm) -> None:
     echo(comm, f"kernels of runs, modes and measures: compiled and called in {duration(time.monotonic() - begin)}")
 
 
-def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
+def doctor_table(comm: "MPI.Comm") -> tuple[str, bool]:
     """The versions and checks as a table, and whether the program can work here; all ranks must call it."""
     results = checks(comm)
     names = {check.name for check in results}
@@ -43,6 +45,8 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     rows = [(name, value) for name, value in about.items() if name not in names]
     rows += [(check.name, check.text) for check in results]
     # All ranks build the table, which rank 0 alone prints: gathering the hosts is collective.
+    from mpi4py import MPI
+
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
 

@@ -6,9 +6,7 @@ import tomllib
 from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, NamedTuple
 
 from vipetsc.case import CaseError, Problem
 from vipetsc.case.parts import relative_modules
@@ -19,7 +17,10 @@ from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import FolderError
 from vipetsc.io.lock import locked
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import ALONE, StopRequest, on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 FOLDER = Path(str(files("vipetsc") / "examples"))
 
@@ -35,7 +36,7 @@ class Example(NamedTuple):
     verbs: list[str]
 
 
-def examples(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def examples(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print a list of the case files of the package, or copy those that are named."""
     shipped = on_root(comm, shipped_examples)
     if not (options.name or options.all or options.out or options.force):
@@ -115,8 +116,8 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
     others = [path for path, content in contents.items() if path.exists() and not _holds(path, content)]
     if others and not force:
         raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
-    # The lock has the communicator of this rank, the only one here: with another it would wait for all ranks.
-    with locked(MPI.COMM_SELF, *{path.parent for path in contents}):
+    # This rank alone is here: with the ranks' communicator the lock would wait for all of them.
+    with locked(ALONE, *{path.parent for path in contents}):
         for path, content in contents.items():
             with atomic_write(path) as aside:
                 aside.write_bytes(content)

@@ -2,8 +2,7 @@
 
 import argparse
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from vipetsc.cli.arguments import SET, argument
 from vipetsc.cli.messages import echo_paths
@@ -13,8 +12,11 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+
+def analyse(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Measure finished runs again; of a sweep, those whose fields were kept, and its ensemble."""
     from vipetsc.studies.reanalysis import reanalyse_folders
 
@@ -23,7 +25,7 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> i
     return DONE
 
 
-def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def export(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Write ``run.xdmf`` into the folder of a run, and curves of runs, sweeps, branches and searches as CSV."""
     with locked(comm, *existing_folders(options.path, comm)):
         for path in options.path:
@@ -31,7 +33,7 @@ def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     return DONE
 
 
-def existing_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
+def existing_folders(paths: list[Path], comm: "MPI.Comm") -> list[Path]:
     """The folders to lock for ``paths``: each path itself, or the folder of a file."""
     # A missing path has no folder to lock; the verb refuses it with a reason.
     return on_root(comm, lambda: [_folder_of(path) for path in paths if path.exists()])

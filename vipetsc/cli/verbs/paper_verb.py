@@ -3,8 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from vipetsc.cli.arguments import argument, output_folder
 from vipetsc.cli.messages import echo
@@ -13,8 +12,11 @@ from vipetsc.io.extras import require
 from vipetsc.io.kinds import PAPER
 from vipetsc.parallel import StopRequest, on_root
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+
+def paper(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Compute the missing results of the paper, draw its figures, evaluate its claims, and write a report."""
     from vipetsc.paper.make import make_paper, plan_table
     from vipetsc.paper.plan import FULL, QUICK, paper_plan

@@ -7,8 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mpi4py import MPI
-
 from vipetsc.cli.arguments import Argument, argument
 from vipetsc.cli.drawing import Pictures, draw_pictures, prepare
 from vipetsc.cli.messages import echo, echo_paths
@@ -19,6 +17,8 @@ from vipetsc.io.kinds import RUN
 from vipetsc.parallel import StopRequest, on_root
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from vipetsc.figures.look import Look
 
 NARROWEST = 320  # pixels, at which the type can still be read
@@ -115,7 +115,7 @@ LOOK_ARGUMENTS: dict[str, Argument] = {
 }
 
 
-def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def plot(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Draw the pictures of result folders again, or render a movie of a run.
 
     Raises FolderError where the folders do not have what the options ask for.

@@ -3,9 +3,7 @@
 import argparse
 import itertools
 import json
-from typing import Any
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any
 
 from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import argument
@@ -16,8 +14,11 @@ from vipetsc.io.extras import require
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.wording import nearest
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+
+def manual(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print a chapter of the manual in Markdown, or a list of them; raises CaseError for an unknown topic."""
     if options.topic is None:
         echo(comm, on_root(comm, contents))
@@ -35,7 +36,7 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     return DONE
 
 
-def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def schema(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print the JSON schema of case files, with the names of laws and other parts that a case's [plugins] register."""
     echo(comm, on_root(comm, lambda: json.dumps(schema_of(options.case), indent=2)))
     return DONE
@@ -56,7 +57,7 @@ def schema_of(path: str | None) -> dict[str, Any]:
     return json_schema(module_names(table))
 
 
-def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+def completion(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Print a script by which the shell completes verbs, options and files."""
     require("shtab", "completion")
     import shtab

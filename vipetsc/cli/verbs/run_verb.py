@@ -131,13 +131,13 @@ def measure_unless_measured(case: Case, work: Work) -> None:
 def run_rows(case: Case, ranks: int) -> Rows:
     """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
-    from vipetsc.dynamics.memory import check_numbers, memory_available, memory_needed
+    from vipetsc.dynamics.memory import check_size, memory_available, memory_needed
     from vipetsc.dynamics.plan import RunPlan
     from vipetsc.dynamics.recorded_sizes import recorded_cells
 
     plan = RunPlan.of(case)
     model = plan.model
-    check_numbers(model)
+    check_size(model)
     chain = model.chain
     cost = estimate(plan, ranks)
 

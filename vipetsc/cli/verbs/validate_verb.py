@@ -2,8 +2,7 @@
 
 import argparse
 import tomllib
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,8 +16,11 @@ from vipetsc.cli.tables import first_few, table
 from vipetsc.cli.verb import DONE, PlainVerb, Rows
 from vipetsc.parallel import StopRequest, on_root
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+
+def validate(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
     """Check a case for every verb whose section it contains, and print the numbers that follow from it."""
     echo(comm, on_root(comm, lambda: report_of(options, comm.size)))
     return DONE
@@ -27,13 +29,13 @@ def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
 def report_of(options: argparse.Namespace, ranks: int) -> str:
     """The rows of all verbs that read the case, and its warnings; raises CaseError. Called on one rank."""
     from vipetsc.cli.verbs.verb_list import verb_of
-    from vipetsc.dynamics.options import check_options
+    from vipetsc.dynamics.plan import check_petsc_options
 
     cases = load_every(options.case, options.set)
     rows: Rows = []
     warnings: list[str] = []
     for case in cases:
-        check_options(case)
+        check_petsc_options(case)
         rows += verb_of(case).table(case, ranks)
         rows += part_rows(case)
         warnings += case.warnings()
