@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase, Sweep
-from vipetsc.case.case_file import Table
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
+from vipetsc.case.reading import Table
 
 ROOT = Path(__file__).parents[1]
 CHAPTER = ROOT / "vipetsc" / "manual" / "features.md"

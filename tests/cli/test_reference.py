@@ -15,8 +15,9 @@ import pytest
 
 import vipetsc as package
 from vipetsc.case import keys
-from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
+from vipetsc.case.reading import read_section, sections_in
+from vipetsc.case.section import CaseError
 from vipetsc.case.verb_cases import SECTIONS, load_every
 from vipetsc.cli.chapters import KEYS
 from vipetsc.cli.verbs.reference_verbs import schema_of

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError
-from vipetsc.case.case_file import sections_in
 from vipetsc.case.contacts import describe_stops
+from vipetsc.case.reading import sections_in
 from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics.propagator.step_choice import refusal

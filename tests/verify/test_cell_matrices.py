@@ -8,9 +8,9 @@ import scipy
 from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case, Sweep
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
+from vipetsc.case.section import CaseError
 from vipetsc.dynamics import simulate
 from vipetsc.lattice import bloch, pass_bands
 

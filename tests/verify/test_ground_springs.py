@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case
-from vipetsc.case.case_file import CaseError
+from vipetsc.case.section import CaseError
 from vipetsc.dynamics import simulate
 
 NEXT = {"start": 1, "end": 1, "stiffness": 900.0, "next_cell": True}

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from vipetsc.case import Case
-from vipetsc.case.case_file import CaseError
+from vipetsc.case.section import CaseError
 from vipetsc.dynamics import simulate
 from vipetsc.lattice.drive import Drive, joined
 

@@ -10,8 +10,8 @@ from scipy.special import ellipk
 
 from tests.steady_states import CUBIC_OSCILLATOR
 from vipetsc.case import NnmCase
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.section import CaseError
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 

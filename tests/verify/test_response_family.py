@@ -13,9 +13,9 @@ import xarray as xr
 
 import vipetsc
 from tests.rigs import TWO_MASSES
-from vipetsc.case.case_file import put
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.reading import put
 from vipetsc.figures import response_family
 from vipetsc.figures.nfrc import responses_in
 from vipetsc.figures.registry import draw

@@ -12,8 +12,8 @@ import pytest
 import vipetsc
 from tests.rigs import TWO_MASSES, period_map
 from tests.steady_states import motion_at
-from vipetsc.case.case_file import put
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.reading import put
 from vipetsc.figures.registry import draw
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod

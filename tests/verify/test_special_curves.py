@@ -9,8 +9,8 @@ import pytest
 
 from tests.steady_states import CUBIC_OSCILLATOR
 from tests.verify.test_special_responses import FLIP, PAIR, UNEVEN, case_of
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.section import CaseError
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 

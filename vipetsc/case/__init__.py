@@ -19,9 +19,10 @@ What depends on the machine, as memory and PETSc's options, is asked by ``dynami
 """
 
 from vipetsc.case.case import Case, Model, case_id
-from vipetsc.case.case_file import CaseError, CaseFile, Problem
+from vipetsc.case.case_file import CaseFile
 from vipetsc.case.design import DesignCase
 from vipetsc.case.law import LawCase
 from vipetsc.case.nnm import NnmCase
+from vipetsc.case.section import CaseError, Problem
 from vipetsc.case.sweep import Sweep, SweepMember
 from vipetsc.case.verb_cases import VERB_CASES

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from vipetsc.case.case_file import Problem
+from vipetsc.case.section import Problem
 from vipetsc.lattice import Chain, contacts
 from vipetsc.lattice.cell import GROUND, connected_groups
 

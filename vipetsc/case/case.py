@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
+from vipetsc.case.case_file import CaseFile, Valid
 from vipetsc.case.contacts import check_joined, check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_waves, driven_wave, packet_frequency
@@ -20,6 +20,7 @@ from vipetsc.case.inhomogeneity import check_inhomogeneity, check_right_wall
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.points import check_points
+from vipetsc.case.reading import Table, read_section
 from vipetsc.case.resolve import (
     build_chain,
     cells_of_sites,
@@ -34,6 +35,7 @@ from vipetsc.case.resolve import (
 )
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
+from vipetsc.case.section import Problem, Section
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT

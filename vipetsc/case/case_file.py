@@ -14,18 +14,18 @@ import tomli_w
 
 from vipetsc.case.cell_matrices import with_matrices
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_parts
-from vipetsc.case.reading import LARGEST as LARGEST
-from vipetsc.case.reading import Table as Table
-from vipetsc.case.reading import parsed, plain_table, unknown_key, wrong_keys
-from vipetsc.case.reading import put as put
-from vipetsc.case.reading import read_section as read_section
-from vipetsc.case.reading import read_toml as read_toml
-from vipetsc.case.reading import sections_in as sections_in
-from vipetsc.case.reading import with_overrides as with_overrides
-from vipetsc.case.section import CaseError as CaseError
-from vipetsc.case.section import Problem as Problem
-from vipetsc.case.section import Section as Section
-from vipetsc.case.section import described, is_within
+from vipetsc.case.reading import (
+    Table,
+    parsed,
+    plain_table,
+    read_section,
+    read_toml,
+    sections_in,
+    unknown_key,
+    with_overrides,
+    wrong_keys,
+)
+from vipetsc.case.section import CaseError, Problem, Section, described, is_within
 from vipetsc.case.strip import with_strip
 from vipetsc.plugins import only
 from vipetsc.register import PartError

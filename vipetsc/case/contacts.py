@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.case_file import Problem, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.registered import check_factors, check_law, check_law_parameters
 from vipetsc.case.schema import LatticeTable
+from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.cell import connected_groups

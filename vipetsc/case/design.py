@@ -6,9 +6,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
+from vipetsc.case.case_file import CaseFile, Valid
+from vipetsc.case.reading import Table
 from vipetsc.case.schema import OutputTable, Positive
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, Section, described
 
 # Bloch problems (lambda, eta, kappa) of one reading: the four bands of so many are 640 MB in memory and on disk.
 LARGEST = 20_000_000

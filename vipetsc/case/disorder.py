@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, create_model
 
-from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.contacts import lists_of
 from vipetsc.case.inhomogeneity_sections import Deviation, ScatterTable
 from vipetsc.case.quantities import QUANTITIES, Quantity, Sections, differs_by_side
-from vipetsc.case.section import described
+from vipetsc.case.reading import Table
+from vipetsc.case.section import Problem, Section, described
 from vipetsc.case.sites import ContactsTable
 
 SEED = "disorder.seed"

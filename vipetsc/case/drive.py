@@ -6,11 +6,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from vipetsc.case.case_file import Problem, Table, Valid
+from vipetsc.case.case_file import Valid
+from vipetsc.case.reading import Table
 from vipetsc.case.registered import check_parameters
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import LatticeTable, TimeTable
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, described
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
 from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, wave_bands, waves_at
 

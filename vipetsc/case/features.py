@@ -7,11 +7,13 @@ not exclude a feature whose reason begins with "not yet": only the code for it i
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from vipetsc.case.case_file import CaseFile, Problem, Table, Valid
+from vipetsc.case.case_file import CaseFile, Valid
 from vipetsc.case.contacts import JOINS, SIDES
 from vipetsc.case.drive import DriveTable
+from vipetsc.case.reading import Table
 from vipetsc.case.resolve import check_cell
 from vipetsc.case.schema import LatticeTable
+from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable
 
 FEATURES = {

@@ -10,9 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from vipetsc.case.case_file import LARGEST, Problem
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, AnyProfile, Deviation, Profile
+from vipetsc.case.reading import LARGEST
 from vipetsc.case.schema import LatticeTable
+from vipetsc.case.section import Problem
 from vipetsc.lattice import Chain, SpringTerms, UnitCell, Variation
 from vipetsc.lattice.ends import absorber
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.case_file import CaseError, Problem, Section, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.places import Place, Places
 from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
-from vipetsc.case.section import described
+from vipetsc.case.section import CaseError, Problem, Section, described
 from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Table
+from vipetsc.case.reading import Table
 from vipetsc.case.schema import MULTIPLE_OF_PI
 from vipetsc.case.section import unit_at
 from vipetsc.case.units import NUMBER_WITH_UNIT

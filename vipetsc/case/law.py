@@ -14,12 +14,13 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Problem, Section, Table, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.contacts import JOINS, SIDES, Gaps, gaps_of_sites, lists_of, path_of, values_of_sites
 from vipetsc.case.model import Model
+from vipetsc.case.reading import Table
 from vipetsc.case.resolve import check_cell, with_preset
 from vipetsc.case.schema import PRESETS, Positive
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, Section, described
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import wave_warnings
 from vipetsc.lattice import Contact, max_group_velocity, pass_bands, waves_at

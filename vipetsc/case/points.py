@@ -5,9 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.places import Place
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, Section, described
 
 NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point, which is part of names in result files
 # Points are recorded at every sample, whatever the stride of the fields: displacement, velocity and acceleration of a

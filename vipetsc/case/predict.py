@@ -6,10 +6,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.case_file import Problem, Section, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, Section, described
 from vipetsc.case.warnings import end_warnings, length_warnings, wave_warnings
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice.packet import narrow_fraction

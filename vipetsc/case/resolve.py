@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.absorbing import designed_end
-from vipetsc.case.case_file import Problem, Table, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.contacts import (
     MATERIAL,
     check_per_site,
@@ -21,7 +21,9 @@ from vipetsc.case.contacts import (
 from vipetsc.case.drive import DriveTable, build_drives, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
+from vipetsc.case.reading import Table
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
+from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.waveforms import DEFAULT, is_sine
 from vipetsc.lattice import Chain, UnitCell, pass_bands

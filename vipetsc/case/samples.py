@@ -5,10 +5,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from vipetsc.case.case_file import LARGEST, Problem, Section, Table
-from vipetsc.case.reading import MISSING
+from vipetsc.case.reading import LARGEST, MISSING, Table
 from vipetsc.case.schema import Finite, Positive
-from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.section import BY_SHAPE, Problem, Section, described
 from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.tables import ColumnError, read_columns, read_table
 from vipetsc.lattice.drive import Interpolation, Joined, joined

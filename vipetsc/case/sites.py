@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, create_model
 
-from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
 from vipetsc.case.places import Pair, Places
 from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
-from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.section import BY_SHAPE, Section, described
 from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
 from vipetsc.register import DISSIPATION, LAW
 

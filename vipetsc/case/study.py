@@ -3,7 +3,9 @@
 from collections.abc import Iterable
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseFile, Problem, Table
+from vipetsc.case.case_file import CaseFile
+from vipetsc.case.reading import Table
+from vipetsc.case.section import Problem
 
 
 class StudyCase(CaseFile):

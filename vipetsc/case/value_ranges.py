@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.case_file import LARGEST, Problem, Table
 from vipetsc.case.disorder import SEED
+from vipetsc.case.reading import LARGEST, Table
+from vipetsc.case.section import Problem
 
 # Every rank lists the names of all members: 0.6 s and 70 MB for a million.
 MOST_MEMBERS = 1_000_000

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section, read_toml, with_overrides
+from vipetsc.case.case_file import CaseFile
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.identify import IdentifyCase
@@ -13,6 +13,8 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
+from vipetsc.case.reading import Table, read_section, read_toml, with_overrides
+from vipetsc.case.section import CaseError, Problem, Section
 from vipetsc.case.sweep import Sweep
 
 VERB_CASES: tuple[type[CaseFile], ...]

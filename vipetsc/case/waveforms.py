@@ -11,12 +11,11 @@ from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.case_file import Section
 from vipetsc.case.parts import PartName
 from vipetsc.case.places import BeamTable, Place, Places
 from vipetsc.case.samples import WALL_UNITS, SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
-from vipetsc.case.section import described
+from vipetsc.case.section import Section, described
 from vipetsc.lattice import ToneBurst, Waveform
 from vipetsc.lattice.drive import along, impulse, main_frequency, ramped
 from vipetsc.plugins import call, number_of

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import CaseError
-from vipetsc.case.case_file import Problem
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.matrices import LatticeMatrices
 
 # Direct solvers, of which the first that PETSc has is taken. MUMPS takes ten times as long for a band.

@@ -8,7 +8,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import CaseError, Model
-from vipetsc.case.case_file import Problem
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.io.names import file_hash

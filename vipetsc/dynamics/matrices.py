@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from vipetsc.case import CaseError
-from vipetsc.case.case_file import Problem
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.layout import cell_cuts
 from vipetsc.lattice import Chain, contacts
 from vipetsc.lattice.elements import joined_stiffness

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vipetsc.case import CaseError, Model
-from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.recorded_sizes import chunk_samples, recorded_cells
 

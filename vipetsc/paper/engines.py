@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Sweep
-from vipetsc.case.case_file import put
+from vipetsc.case.reading import put
 from vipetsc.io.read import axes, open_ensemble, select
 from vipetsc.studies.ensemble import AMPLITUDE
 from vipetsc.studies.linear_run import FITTED

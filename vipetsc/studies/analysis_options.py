@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vipetsc.case import Case
-from vipetsc.case.case_file import read_toml
+from vipetsc.case.reading import read_toml
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import root_attributes
 from vipetsc.io.read import RUN_NEEDS

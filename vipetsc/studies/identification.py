@@ -21,8 +21,8 @@ import xarray as xr
 from scipy.stats import qmc
 
 from vipetsc.case import CaseError
-from vipetsc.case.case_file import Problem
 from vipetsc.case.identify import IdentifyCase, Measured, MeasuredError, read_measured
+from vipetsc.case.section import Problem
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, ProfileCosts, Side, profile_about, profile_costs

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, CaseError, Model
-from vipetsc.case.case_file import Problem
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.eigen import modes_near
 from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.dynamics.memory import LARGEST_MESSAGE

@@ -11,7 +11,7 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
+from vipetsc.case.case_file import CaseFile
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.identify.measured import MeasuredError, RecordTable, read_measured, sensor_problems
 from vipetsc.case.identify.sought import (
@@ -24,7 +24,8 @@ from vipetsc.case.identify.sought import (
 )
 from vipetsc.case.identify.trial import TrialCases
 from vipetsc.case.quantities import QUANTITIES, differs_by_side
-from vipetsc.case.section import described
+from vipetsc.case.reading import Table, read_section
+from vipetsc.case.section import CaseError, Problem, Section, described
 from vipetsc.case.study import StudyCase
 from vipetsc.case.warnings import loss_warnings, unit_warnings
 from vipetsc.case.waveforms import OneDrive

@@ -5,12 +5,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.reading import MISSING
 from vipetsc.case.samples import WALL_UNITS, Place
 from vipetsc.case.schema import Finite, Positive, Range
-from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.section import BY_SHAPE, Problem, Section, described
 from vipetsc.io.names import file_hash, resolved_path
 from vipetsc.io.tables import ColumnError, read_columns
 from vipetsc.wording import counted

@@ -7,10 +7,9 @@ import numpy as np
 
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Section
 from vipetsc.case.quantities import QUANTITIES
 from vipetsc.case.schema import Range
-from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.section import BY_SHAPE, Section, described
 from vipetsc.lattice import pass_bands
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, Problem
 from vipetsc.case.drive import check_drives
 from vipetsc.case.identify.sought import SoughtParameter, changed_case, numbers_of
 from vipetsc.case.quantities import QUANTITIES
 from vipetsc.case.resolve import check_cell, check_contacts
+from vipetsc.case.section import CaseError, Problem
 
 FOLLOWING = ("kind", "energy", "near")
 """Keys of ``[initial]`` from which, together with the lattice, other numbers of the motion follow."""

@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
+from vipetsc.case.case_file import Valid
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, has_equal_sides, lists_of
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.nfrc.ends import are_contacts_springs, check_ground, check_open_ends, no_waves
@@ -19,7 +19,9 @@ from vipetsc.case.nfrc.family import FamilyMember, family_of
 from vipetsc.case.nfrc.measures import RESPONSE, ResponseMeasure, measures_of
 from vipetsc.case.nfrc.table import NfrcTable
 from vipetsc.case.nfrc.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
+from vipetsc.case.reading import Table, read_section
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
+from vipetsc.case.section import CaseError, Problem
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_springs, waves_at
 from vipetsc.lattice.compliance.by_modes import MOST_DOFS

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
-from vipetsc.case.case_file import Problem
 from vipetsc.case.nfrc.table import NfrcTable
 from vipetsc.case.resolve import check_cell
 from vipetsc.case.schema import LatticeTable
+from vipetsc.case.section import Problem
 from vipetsc.lattice import Chain
 
 

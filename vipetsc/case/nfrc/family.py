@@ -6,7 +6,8 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from vipetsc.case.case_file import Problem, Table, put
+from vipetsc.case.reading import Table, put
+from vipetsc.case.section import Problem
 from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
 from vipetsc.wording import distinct
 

@@ -4,10 +4,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from vipetsc.case.case_file import Section
 from vipetsc.case.nfrc.varied_key import is_key
 from vipetsc.case.schema import Finite, Positive, Range, once
-from vipetsc.case.section import described
+from vipetsc.case.section import Section, described
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
 

@@ -3,7 +3,8 @@
 import copy
 from typing import Any
 
-from vipetsc.case.case_file import Problem, Table, put
+from vipetsc.case.reading import Table, put
+from vipetsc.case.section import Problem
 
 PARAMETERS = "amplitude", "frequency"
 SECTIONS = ("lattice", "contacts", "disorder")  # whose keys can vary along a curve

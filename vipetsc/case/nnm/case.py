@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from vipetsc.case.bodies import check_apart
-from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
+from vipetsc.case.case_file import CaseFile, Valid
 from vipetsc.case.contacts import (
     MATERIAL,
     Gaps,
@@ -40,6 +40,7 @@ from vipetsc.case.nnm.checks import (
     rigid_motions_of_pair,
 )
 from vipetsc.case.nnm.table import NnmTable
+from vipetsc.case.reading import Table, read_section
 from vipetsc.case.resolve import (
     build_chain,
     check_cell,
@@ -52,6 +53,7 @@ from vipetsc.case.resolve import (
     with_preset,
 )
 from vipetsc.case.schema import LatticeTable, OutputTable
+from vipetsc.case.section import Problem, Section
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact
 from vipetsc.lattice.cell import connected_groups

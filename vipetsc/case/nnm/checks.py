@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
-from vipetsc.case.case_file import Problem, Valid
+from vipetsc.case.case_file import Valid
 from vipetsc.case.contacts import (
     Gaps,
     check_joined,
@@ -19,6 +19,7 @@ from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
 from vipetsc.case.nnm.table import MOST_MASSES, MOST_OF_DAMPED, NnmTable
 from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
+from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, UnitCell, nonlinear_springs, wave_bands
 from vipetsc.lattice.cell import connected_groups

@@ -4,9 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from vipetsc.case.case_file import Section
 from vipetsc.case.schema import Finite, NotNegative, Positive, once, rising
-from vipetsc.case.section import BY_SHAPE, described
+from vipetsc.case.section import BY_SHAPE, Section, described
 
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vipetsc.case.amplitude import amplitude_changes, amplitude_of, amplitude_unit, has_free_amplitude
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
+from vipetsc.case.case_file import CaseFile
 from vipetsc.case.law import LawCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise.objective import (
@@ -23,8 +23,9 @@ from vipetsc.case.optimise.objective import (
 from vipetsc.case.optimise.problems import variable_problems, variable_warnings
 from vipetsc.case.optimise.search_space import SearchSpace, case_of, search_space
 from vipetsc.case.optimise.variables import Variable, VariablesTable
+from vipetsc.case.reading import Table, read_section
 from vipetsc.case.schema import Positive
-from vipetsc.case.section import described, is_within
+from vipetsc.case.section import CaseError, Problem, Section, described, is_within
 from vipetsc.case.study import StudyCase
 
 # Designs of a search: with a run of 0.3 s for each, as of the built-in case, so many take eight hours.

@@ -7,10 +7,9 @@ from pydantic import WithJsonSchema
 
 from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.nfrc import RESPONSE, NfrcCase
 from vipetsc.case.schema import Finite, Positive, PositiveRange
-from vipetsc.case.section import described
+from vipetsc.case.section import Problem, Section, described
 from vipetsc.lattice import pass_bands, wave_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 from vipetsc.wording import nearest

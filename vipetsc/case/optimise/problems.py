@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, Problem, Table, put
 from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.optimise.search_space import VariableRow, case_of, row_of, search_space
 from vipetsc.case.optimise.variables import VariablesTable
-from vipetsc.case.section import is_within
+from vipetsc.case.reading import Table, put
+from vipetsc.case.section import CaseError, Problem, is_within
 
 AT = "optimise.variables"
 # Keys of the case that are clearances; each path stands for the keys within it, too.

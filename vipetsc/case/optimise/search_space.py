@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import LARGEST, Table, put
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.optimise.variables import Kind, Variable, VariablesTable
 from vipetsc.case.quantities import OF_PRESET, table_of
-from vipetsc.case.reading import value_at
+from vipetsc.case.reading import LARGEST, Table, put, value_at
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import number
 from vipetsc.case.value_ranges import RANGES

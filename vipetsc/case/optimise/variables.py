@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from vipetsc.case.case_file import Section
 from vipetsc.case.schema import PositiveRange, rising
-from vipetsc.case.section import described
+from vipetsc.case.section import Section, described
 from vipetsc.case.value_ranges import leaves
 
 SECTIONS = ("lattice", "contacts", "drive", "initial", "time", "output")  # whose keys may vary

@@ -20,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.case.case_file import CaseError
 from vipetsc.case.nfrc import NfrcCase, NfrcTable
+from vipetsc.case.section import CaseError
 from vipetsc.lattice import Chain
 from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.cache import BoundedCache
