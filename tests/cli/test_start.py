@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from vipetsc.__main__ import LOOKING
+from vipetsc.cli.verbs.verb_list import VERBS
+
 pytestmark = pytest.mark.parallel(1)
 
 # The import of each of these takes a tenth of a second or more.
@@ -67,6 +70,10 @@ def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_ke
     assert loaded[5] <= {"scipy.optimize"}
     # The module that draws bands also draws runs, and must not load kernels.
     assert "numba" not in loaded[6]
+
+
+def test_what_one_process_answers_are_verbs_and_a_flag():
+    assert set(LOOKING) == {"--version", *VERBS} & set(LOOKING)
 
 
 def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kernels(tmp_path):

@@ -259,3 +259,16 @@ def test_the_quadrature_of_dashpots_is_the_trapezoidal_rule_over_all_blocks(cuts
     assert found["damping_quadrature"] == trapezoid(powers)
     distances = [trapezoid(powers[: n + 1]) - 2 * trapezoid(powers[: n + 1 : 2]) for n in (0, 2, 4, 6)]
     assert found["damping_quadrature_error"] == np.abs(distances).max() > 0
+
+
+def test_the_quadrature_of_dashpots_has_the_same_bits_in_any_blocks():
+    """Blocks have as many samples as fit into the memory of a rank, fewer on more ranks."""
+    powers = np.random.default_rng(3).random(240)
+    found = []
+    for count in (240, 80, 48, 7, 1):
+        ledger = begun(Ledger)
+        for first in range(0, len(powers), count):
+            part = powers[first : first + count]
+            ledger.observe(damped_block(np.zeros(len(part)), part, first))
+        found.append(ledger.statistics())
+    assert all(statistics == found[0] for statistics in found)

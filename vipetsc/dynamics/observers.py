@@ -184,14 +184,16 @@ class Ledger(Observer):
             self.quadrature = -self.last_power
             self.coarse = -2 * self.last_power
         before = np.append(self.last_power, powers[:-1])
-        quadrature = self.quadrature + np.cumsum((before + powers) / 2)
+        # From the sum so far on, one term after the other: the number of ranks, on which the length of a block depends,
+        # changes no bit.
+        quadrature = np.cumsum(np.append(self.quadrature, (before + powers) / 2))[1:]
         self.quadrature = float(quadrature[-1])
         self.last_power = float(powers[-1])
 
         even = slice(first % 2, None, 2)
         if powers[even].size:
             before = np.append(self.last_even_power, powers[even][:-1])
-            coarse = self.coarse + np.cumsum(before + powers[even])
+            coarse = np.cumsum(np.append(self.coarse, before + powers[even]))[1:]
             self.quadrature_error = max(self.quadrature_error, float(np.abs(quadrature[even] - coarse).max()))
             self.coarse = float(coarse[-1])
             self.last_even_power = float(powers[even][-1])
