@@ -234,6 +234,15 @@ def test_parameters_go_into_the_case(tmp_path):
     assert again.options.records[0].sha256
 
 
+def test_problems_of_the_case_come_with_those_of_its_identification(tmp_path):
+    """A site outside the lattice is named as in a run, beside an unknown that there is not."""
+    table = lattice_table(contacts={"sites": [2, 3, 99]})
+    unknowns = [{"quantity": "clearence", "bounds": [1e-4, 1e-3]}]
+    with pytest.raises(CaseError) as caught:
+        IdentifyCase.from_table(identify_table(table, record_in(written(tmp_path)), unknowns=unknowns))
+    assert {problem.key for problem in caught.value.problems} >= {"contacts.sites", "identify.unknowns[1].quantity"}
+
+
 def test_an_initial_state_of_many_masses_is_refused(tmp_path):
     record = record_in(written(tmp_path)) | {"initial": "estimate"}
     table = lattice_table(lattice={"cells": 60})
