@@ -19,10 +19,10 @@ pytestmark = pytest.mark.slow
 
 CHAIN = {
     "masses": [0.25],
-    "springs": [{"start": 1, "end": 1, "stiffness": 4e4, "damping": 4.0, "next_cell": True}],
+    "springs": [{"start": 1, "end": 1, "stiffness": 4e4, "damping": 3.5, "next_cell": True}],
     "contact": [1, 1],
 }
-GROUND_STOP = {"law": "bilinear", "stiffness": 1.5e6, "restitution": 0.9, "sites": [3], "pair": [0, 1], "side": "plus"}
+GROUND_STOP = {"law": "bilinear", "stiffness": 1.8e6, "restitution": 0.85, "sites": [3], "pair": [0, 1], "side": "plus"}
 
 
 def results_of(folder, table):
@@ -68,7 +68,7 @@ def chain_table(path, **record: Any) -> dict[str, Any]:
     return {
         "name": "chain",
         "lattice": {"cells": 4, "cell": CHAIN},
-        "contacts": GROUND_STOP | {"clearance": 5.2e-4},
+        "contacts": GROUND_STOP | {"clearance": 4.6e-4},
         "drive": {"amplitude": 0.0},
         "initial": {"kind": "velocity", "cell": 1, "velocity": 0.5},
         "identify": {"records": records, "unknowns": unknowns, "profile": 0},
