@@ -20,11 +20,14 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     lattice = f"{counted(chain.cells, 'cell')}, {counted(chain.cells * cell.dofs, 'mass')}, {describe_ends(case)}"
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
+    strip = case.lattice.cell and case.lattice.cell.from_strip
+    if strip:
+        lattice += f"; strip of {chain.cells} x {strip.rows} cells, {strip.kind}, {strip.edges} edges, {strip.motion}"
     band_list = "none: no spring runs from cell to cell"
     gap_list = ""
     bands = wave_bands(cell)
     if bands:
-        band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands) + " rad/s"
+        band_list = first_few([f"{band.low:.2f}-{band.high:.2f}" for band in bands]) + " rad/s"
         gap_list = "none"
         if between := gaps(bands):
             gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in between) + " rad/s"

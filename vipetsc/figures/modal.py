@@ -102,7 +102,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     panel["steps"].tick_params(labelbottom=False)
     _draw_impacts(panel["impacts"], run)
     percent = 100 * moved.energy / float(run["energy/work"][-1])
-    _draw_matrix(panel["matrix"], moved.labels, [*(names[p] for p in parts), "lost"], percent)
+    _draw_matrix(panel["matrix"], moved.labels, [*(style.part_label(names[p]) for p in parts), "lost"], percent)
     panels.label_panels([panel["steps"], panel["impacts"], panel["matrix"]])
     if len(moved.labels) < moved.rows:
         style.add_note(figure, f"transfers: the {MOST_ROWS} of {moved.rows} rows with the largest ones")
@@ -116,7 +116,8 @@ def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[i
     at_end = energy[:, -1].sum()
     for p, look in zip(parts, _looks(names, parts), strict=True):
         fraction = float(energy[p, -1] / at_end)
-        axes.plot(analysis["bands/instant"], energy[p], lw=0.9, label=f"{names[p]}: {fraction:.1%}", **look)
+        label = f"{style.part_label(names[p])}: {fraction:.1%}"
+        axes.plot(analysis["bands/instant"], energy[p], lw=0.9, label=label, **look)
     axes.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
     axes.legend(loc="best", ncols=2 if len(parts) > 5 else 1, title="fraction at the end", title_fontsize=7)
 

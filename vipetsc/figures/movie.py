@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import matplotlib as mpl
 import numpy as np
@@ -15,12 +15,14 @@ import xarray as xr
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 from PIL import Image
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 from vipetsc.figures.layout import lay_out
 from vipetsc.figures.movie_frames import WIDTH, MovieFrames
+from vipetsc.figures.strips import StripFrames
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 
@@ -190,7 +192,23 @@ def ffmpeg() -> str | None:
         return None
 
 
-def write_movie(movie: MovieFigure, rate: float, paths: Sequence[Path]) -> list[Path]:
+class Filmed(Protocol):
+    """What frames are taken of: a figure that shows and returns frame ``k`` of a ``content`` with their times."""
+
+    figure: Figure
+
+    @property
+    def content(self) -> MovieFrames | StripFrames:
+        """The content of the frames, of which ``time`` (frame,) is in s."""
+
+    def show(self, k: int) -> None:
+        """Let the moving artists show frame ``k``."""
+
+    def frame(self, k: int) -> np.ndarray:
+        """Return frame ``k`` as (row, column, RGBA) bytes, valid until the next one is drawn."""
+
+
+def write_movie(movie: Filmed, rate: float, paths: Sequence[Path]) -> list[Path]:
     """Write the frames of ``movie`` at ``rate`` a second to ``paths``, ``.gif`` and ``.mp4``, each whole or not at all.
 
     Raises OSError, as when there is no ffmpeg for an MP4.
@@ -206,7 +224,7 @@ def write_movie(movie: MovieFigure, rate: float, paths: Sequence[Path]) -> list[
     return list(paths)
 
 
-def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
+def _write_gif(movie: Filmed, rate: float, path: Path) -> None:
     """Write a GIF that repeats.
 
     Pillow takes one frame after the other; matplotlib's PillowWriter keeps all of them in memory, 2 MB each.
@@ -221,7 +239,7 @@ def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
     first.save(path, "GIF", save_all=True, append_images=images, duration=durations, loop=0)
 
 
-def _write_mp4(movie: MovieFigure, rate: float, path: Path) -> None:
+def _write_mp4(movie: Filmed, rate: float, path: Path) -> None:
     """Write an MP4 that browsers play, by matplotlib's writer, which sends the frames to ffmpeg."""
     command = ffmpeg()
     if command is None:

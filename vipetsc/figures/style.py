@@ -131,6 +131,15 @@ def band_number(part: str) -> int | None:
     return int(numbers.split("+")[0])
 
 
+def part_label(part: str) -> str:
+    """The name of a ``part`` of the frequency axis in a picture; of many bands that overlap, the first and the last."""
+    kind, _, numbers = part.partition(" ")
+    bands = numbers.split("+")
+    if kind != "band" or len(bands) < 4:
+        return part
+    return f"bands {bands[0]} to {bands[-1]}"
+
+
 @contextmanager
 def rc_style(style: str | None = None) -> Iterator[None]:
     """Make and save figures in the house style within the block; then matplotlib's settings are as before.

@@ -32,8 +32,9 @@ TAIL = "</Grid></Domain></Xdmf>\n"
 def write_xdmf(folder: Path) -> Path | None:
     """Write ``run.xdmf`` next to ``run.h5`` in ``folder``, and return its path; None for a run without fields.
 
-    The text describes a regular mesh of nodes (cell, mass), and for each frame says which hyperslabs of the datasets in
-    ``run.h5`` are the fields. Raises OSError or ValueError as ``open_run``, OSError if the text cannot be written.
+    The text describes a regular mesh of nodes (cell, mass), of a strip of the plane (cell, row) with a field for each
+    mass, and for each frame says which hyperslabs of the datasets in ``run.h5`` are the fields. Raises OSError or
+    ValueError as ``open_run``, OSError if the text cannot be written.
     """
     with open_run(folder / "run.h5") as run:
         units = {name: run[name].attrs["units"] for name in FIELDS if name in run}
@@ -42,21 +43,25 @@ def write_xdmf(folder: Path) -> Path | None:
         times = field_time(run)
         cells = run["cell"].values
         shape = run[next(iter(units))].shape
+        rows_of_strip = int(run["row"][-1]) if "row" in run.coords else None
 
     # The XML is made once, since frames differ in two numbers only.
-    frame = _frame(cells, shape, units)
+    frame = _frame(cells, shape, units, rows_of_strip)
     rows = range(0, shape[0], -(-shape[0] // MOST_FRAMES))
     frames = [frame.format(row=row, time=float(times[row])) for row in rows]
     write_text(folder / "run.xdmf", HEAD + "".join(frames) + TAIL)
     return folder / "run.xdmf"
 
 
-def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> str:
+def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str], rows: int | None) -> str:
     """The text of a frame's grid, in which ``{row}`` and ``{time}`` are to be filled in.
 
-    ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``cells`` are those recorded.
+    ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``cells`` are those recorded,
+    ``rows`` the number of those of a strip, None for a chain.
     """
-    mesh = _words(shape[1:])
+    across = rows or shape[2]
+    masses = shape[2] // across
+    mesh = _words((shape[1], across))
     grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")
     _child(grid, "Time", Value="{time!r}")
     _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
@@ -69,12 +74,16 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> 
     _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")
 
     for name, unit in units.items():
-        node = _child(grid, "Attribute", Name=f"{name} ({unit})", AttributeType="Scalar", Center="Node")
-        slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=mesh)
-        start_stride_count = f"{{row}} 0 0 1 1 1 1 {mesh}"
-        _child(slab, "DataItem", start_stride_count, Dimensions="3 3", Format="XML")
-        about = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
-        _child(slab, "DataItem", f"run.h5:/{name}", **about)
+        for mass in range(masses):
+            # The masses of a row follow each other in the wide cell.
+            number = f" {mass + 1}" if masses > 1 else ""
+            about = {"Name": f"{name}{number} ({unit})", "AttributeType": "Scalar", "Center": "Node"}
+            node = _child(grid, "Attribute", **about)
+            slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=mesh)
+            start_stride_count = f"{{row}} 0 {mass} 1 1 {masses} 1 {mesh}"
+            _child(slab, "DataItem", start_stride_count, Dimensions="3 3", Format="XML")
+            source = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
+            _child(slab, "DataItem", f"run.h5:/{name}", **source)
     Xml.indent(grid, " ")
     return Xml.tostring(grid, "unicode") + "\n"
 

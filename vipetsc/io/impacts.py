@@ -47,11 +47,12 @@ class RunResult(Protocol):
 def impacts(run: str | Path | xr.Dataset | RunResult) -> pd.DataFrame:
     """Return a table of the impacts of a ``run``: what ``simulate`` returns, a folder, a ``run.h5``, or a dataset.
 
-    The index ``episode`` counts impacts by their onsets, from 1. Columns are the ``cell`` and those of ``COLUMNS``, in
-    SI units, which ``attrs["units"]`` has by column. Where the folder has an analysis with the energies of the linear
-    modes there are also ``cluster``, the number of the group of impacts that overlap in time, and for each part of the
-    frequency axis ``transfer to PART`` in J: what the impact moved to it, NaN in a cluster of several impacts, which
-    cannot be told apart. Raises OSError or ValueError as ``open_run``, and ValueError for a run without results here.
+    The index ``episode`` counts impacts by their onsets, from 1. Columns are the ``cell``, of a strip also the ``row``,
+    and those of ``COLUMNS``, in SI units, which ``attrs["units"]`` has by column. Where the folder has an analysis with
+    the energies of the linear modes there are also ``cluster``, the number of the group of impacts that overlap in
+    time, and for each part of the frequency axis ``transfer to PART`` in J: what the impact moved to it, NaN in a
+    cluster of several impacts, which cannot be told apart. Raises OSError or ValueError as ``open_run``, and ValueError
+    for a run without results here.
     """
     if not isinstance(run, str | Path | Mapping):
         held = run.folder or run.dataset
@@ -84,6 +85,10 @@ def _table(run: xr.Dataset, analysis: xr.Dataset | None) -> pd.DataFrame:
         if name == "site":
             columns["cell"] = run["sites/cell"].values[columns["site"].astype(int) - 1]
             units["cell"] = "1"
+            # Of a strip of the plane.
+            if "sites/row" in run:
+                columns["row"] = run["sites/row"].values[columns["site"].astype(int) - 1]
+                units["row"] = "1"
 
     # An analysis that is older than its run may have other impacts.
     if analysis is not None and CLUSTER in analysis and analysis.sizes["bands/episode"] == run.sizes["episode"]:

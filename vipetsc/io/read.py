@@ -31,6 +31,7 @@ RUN_NEEDS = (
     *(f"impacts/{name}" for name in ("site", "side", "onset", "approach_velocity", "separation")),
     *(f"impacts/{name}" for name in ("indentation", "force", "impulse", "loss")),
 )
+STRIP = "[lattice.cell.from_strip]"  # in the case of a run on a strip of the plane
 PARTS = "bands/part", "part"  # dimensions of pass bands and the gaps between them, of one run and of a sweep
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
@@ -41,7 +42,7 @@ def open_run(path: str | Path) -> xr.Dataset:
     ``encoding["source"]`` is the path. Raises OSError or ValueError as ``open_netcdf``.
     """
     run = open_netcdf(path, "run", RUN_NEEDS)
-    run = with_point_names(run)
+    run = with_rows(with_point_names(run))
     run.encoding["source"] = str(path)
     return run
 
@@ -56,6 +57,27 @@ def with_point_names(run: xr.Dataset) -> xr.Dataset:
         return run
     names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
     return _renamed(run, "point", names)
+
+
+def with_rows(run: xr.Dataset) -> xr.Dataset:
+    """The ``run`` of a strip of the plane with the ``row`` and the ``mass`` of each dof, and the row of each site.
+
+    Both count from 1; ``mass`` is the degree of freedom in a cell of the plane. Other results come back as they are.
+    """
+    # Only the case of a strip is read: its text is long.
+    if STRIP not in str(run.attrs.get("case")) or "dof" not in run.dims or "sites/cell" not in run:
+        return run
+    case = tomllib.loads(run.attrs["case"])
+    dofs = run.sizes["dof"] // case["lattice"]["cell"]["from_strip"].get("rows", 1)
+    number = np.arange(run.sizes["dof"])
+    named = run.assign_coords(row=("dof", number // dofs + 1), mass=("dof", number % dofs + 1))
+    contacts = case["contacts"]
+    pairs = contacts.get("each", {}).get("pair") or [contacts.get("pair", [1, 2])] * run.sizes["site"]
+    rows = [(resonator - 1) // dofs + 1 for _, resonator in pairs]
+    about = {"units": "1", "long_name": "row of the strip in which the site's resonator is"}
+    named["sites/row"] = ("site", np.array(rows, np.int64), about)
+    named.set_close(run.close)
+    return named
 
 
 def with_part_names(analysis: xr.Dataset) -> xr.Dataset:
@@ -100,7 +122,7 @@ def open_results(path: str | Path) -> xr.Dataset:
         raise ValueError(f"{path}: contains {contents}; name a file")
 
     data = open_netcdf(files[0], "result", needs=("case",))
-    data = with_part_names(with_point_names(data))
+    data = with_part_names(with_rows(with_point_names(data)))
     data.encoding["source"] = str(files[0])
     return data.set_coords([name for name in ("impacts/onset",) if name in data])
 

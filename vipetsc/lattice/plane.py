@@ -69,6 +69,20 @@ class PlaneCell:
 
     def frequencies(self, k1: ArrayLike, k2: ArrayLike) -> np.ndarray:
         """Return the angular frequencies (..., dofs) in rad/s of waves with phases ``k1``, ``k2`` (...) in rad/cell."""
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(self._dynamical(k1, k2)), 0.0))
+
+    def waves(self, k1: ArrayLike, k2: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return frequencies as ``frequencies`` does, and shapes (..., dofs, branch) of the amplitudes M^(1/2) U."""
+        squared, shapes = np.linalg.eigh(self._dynamical(k1, k2))
+        return np.sqrt(np.maximum(squared, 0.0)), shapes
+
+    @property
+    def roots(self) -> np.ndarray:
+        """Roots of the masses (dofs,) in kg^(1/2) of the degrees of freedom."""
+        return np.sqrt(np.repeat(self.masses, self.components))
+
+    def _dynamical(self, k1: ArrayLike, k2: ArrayLike) -> np.ndarray:
+        """The dynamical matrix (..., dofs, dofs) in (rad/s)^2 at the phases ``k1`` and ``k2`` (...)."""
         k1, k2 = np.broadcast_arrays(np.asarray(k1, float), np.asarray(k2, float))
         matrix = np.zeros((*k1.shape, self.dofs, self.dofs), complex)
         for spring in self.springs:
@@ -82,9 +96,8 @@ class PlaneCell:
             matrix[..., start, start] += block
             matrix[..., start, end] -= block * phase
             matrix[..., end, start] -= block * phase.conj()
-        root = 1 / np.sqrt(np.repeat(self.masses, self.components))
-        squared = np.linalg.eigvalsh(matrix * (root[:, None] * root))
-        return np.sqrt(np.maximum(squared, 0.0))
+        root = 1 / self.roots
+        return np.asarray(matrix * (root[:, None] * root))
 
     def wide_masses(self, rows: int) -> list[float]:
         """Return the masses (rows dofs,) in kg of the wide cell, in the order of its degrees of freedom."""

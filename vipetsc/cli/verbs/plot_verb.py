@@ -215,7 +215,7 @@ def film(
     can be written. Returns the files, and a sentence about a format that was left out, empty if none was. Raises
     FolderError, before anything is written, if ``folder`` holds no run or the options do not fit it.
     """
-    from vipetsc.figures import movie, movie_frames
+    from vipetsc.figures import movie, movie_frames, strips
     from vipetsc.figures.style import rc_style
     from vipetsc.io.netcdf import naming_spoilt, open_netcdf
     from vipetsc.io.read import open_run
@@ -247,7 +247,7 @@ def film(
     with rc_style(), ExitStack() as stack:
         run = stack.enter_context(open_run(folder / "run.h5"))
         try:
-            movie_frames.check(run, shot)
+            checked = movie_frames.check(run, shot)
         except ValueError as error:
             raise FolderError(f"{folder}: {error}") from None
 
@@ -255,6 +255,8 @@ def film(
         prepare(pictures, [folder])
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
         paths = [folder / "figures" / f"movie-{quantity}.{name}" for name in MOVIE_FORMATS if name in formats]
+        if strips.is_strip(run):
+            return movie.write_movie(strips.StripMovie(run, shot, checked), shot.rate, paths), missing
         with naming_spoilt(lambda: [run, analysis]):
             stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)
             return movie.write_movie(stage, shot.rate, paths), missing

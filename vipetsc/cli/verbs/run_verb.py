@@ -22,7 +22,7 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import RUN
 from vipetsc.lattice import waves_at
 from vipetsc.parallel import on_root
-from vipetsc.wording import counted
+from vipetsc.wording import MOST_SHOWN, counted
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
@@ -191,11 +191,14 @@ def _drive_rows(case: Case) -> Rows:
     """Rows on the drives, the waves at their frequency, and the times at which the drives and the run end."""
     model = case.model()
     rows: Rows = []
-    for _, drive in case.drive.every:
+    # A beam has a drive at each of its places.
+    for _, drive in case.drive.every[:MOST_SHOWN]:
         text = "none"
         if drive.amplitude:
             text = drive.describe()
         rows.append(("drive", text))
+    if len(case.drive.every) > MOST_SHOWN:
+        rows.append(("drive", f"and {len(case.drive.every) - MOST_SHOWN} more"))
 
     # Where nothing is driven, the waves are those of the motion that the lattice begins with.
     omega = case.wave_frequency
@@ -204,6 +207,9 @@ def _drive_rows(case: Case) -> Rows:
             f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
             for band, kappa, speed in waves_at(model.chain.cell, omega)
         ]
+        # A wide cell has as many bands as masses.
+        if len(waves) > MOST_SHOWN:
+            waves = [*waves[:MOST_SHOWN], f"and {len(waves) - MOST_SHOWN} more"]
         rows.append(("waves at Om", "; ".join(waves) or "none: the frequency is in a gap"))
 
     run_end = f"{model.end:.6g} s"
