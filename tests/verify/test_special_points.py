@@ -104,29 +104,6 @@ def test_two_special_points_within_a_step_are_found(kind):
     assert not of_kind(kind, locate(problem, left, right))
 
 
-def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, monkeypatch):
-    """Where the branch cannot be followed over most of a step, its halves are searched and give the same fold."""
-    problem = short_branch.problem
-    a, b = folding_steps(short_branch.points)[0]
-    (fold,) = of_kind("fold-energy", locate(problem, a, b))
-    at = Segment.at
-    missed = []
-
-    def fails_off_the_middle(self, arclength):
-        # Segments longer than 0.9 of the step fail off their middle; halves of the step do not.
-        if self.length > 0.9 * b.step and arclength != 0.5 * self.length:
-            raise NoMotionError("no luck")
-        return at(self, arclength)
-
-    monkeypatch.setattr(Segment, "at", fails_off_the_middle)
-    (second,) = of_kind("fold-energy", locate(problem, a, b, missed=missed))
-
-    assert second.energy == pytest.approx(fold.energy, rel=1e-12)
-    # The energy is stationary at a fold, so that the fold's place is less exact than its energy.
-    assert second.step == pytest.approx(fold.step, rel=1e-3)
-    assert not missed
-
-
 def test_a_root_that_is_never_found_is_reported(short_branch, monkeypatch):
     """A fold between two points that cannot be located is named with the point before it and its energy."""
     a, b = folding_steps(short_branch.points)[0]
