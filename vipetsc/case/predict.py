@@ -54,7 +54,7 @@ class PredictCase(LawCase):
         feature: reason
         for feature, reason in LawCase.refuses.items()
         if feature not in ("absorbing ends", "other waveforms")
-    } | {"damped wall": "not yet: the wave that is composed comes from a spring or a force alone"}
+    } | {"damped wall": "its dashpot adds the rate of the waveform, and waves are composed of the waveform alone"}
 
     def warnings(self) -> list[str]:
         """Warnings about the waves of the prediction; its runs do not store fields."""

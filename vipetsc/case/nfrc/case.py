@@ -72,7 +72,7 @@ class NfrcCase(Case):
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     refuses: ClassVar[Mapping[str, str]] = {
         "initial motion": "a curve has all steady states, whatever the motion at t = 0",
-        "damped wall": "not yet: a wall acts by springs alone in steady states",
+        "damped wall": "the force of its dashpot grows with the frequency, and curves have one force for a motion",
         "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",
     }
     waveforms = ("burst", "harmonic")
