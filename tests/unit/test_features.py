@@ -32,6 +32,7 @@ CHANGES = {
     "rings": ({"lattice": {"ends": "periodic"}}, "lattice.ends"),
     "unlike sites": ({"contacts": {"side": "plus"}}, "contacts.side"),
     "touching stops": ({"contacts": {"clearance": 0.0, "side": "plus", "restitution": 1.0}}, "contacts.clearance"),
+    "rigid stops": ({"contacts": {"law": "rigid"}}, "contacts.law"),
     "initial motion": ({"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}}, "initial.kind"),
     "many drives": ({"drive": {"more": [{"frequency": 1000.0, "cell": 2}]}}, "drive.more"),
     "moved wall": ({"drive": {"end": "left"}}, "drive.end"),
@@ -95,7 +96,7 @@ def test_a_feature_is_refused_by_verbs_that_give_a_reason(kind, feature):
     assert (key in refused_keys(kind, changes)) == (feature in kind.refuses)
 
 
-@pytest.mark.parametrize("feature", ["damping", "absorbing ends", "unlike sites", "disorder", "rings"])
+@pytest.mark.parametrize("feature", ["damping", "absorbing ends", "unlike sites", "disorder", "rings", "rigid stops"])
 def test_normal_modes_refuse_what_they_give_a_reason_for(feature):
     changes, key = CHANGES[feature]
     # The reduced model, which is the default, has one cell and one contact only.

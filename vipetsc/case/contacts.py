@@ -15,7 +15,7 @@ from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.cell import connected_groups
 from vipetsc.lattice.chain import Pair
-from vipetsc.lattice.contact import PARAMETERS, least_restitution, registered_law
+from vipetsc.lattice.contact import PARAMETERS, RIGID, least_restitution, registered_law
 
 MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
@@ -34,6 +34,16 @@ def lists_of(contacts: ContactsTable) -> dict[str, list[Any]]:
 def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
     """The value of a ``key`` of ``[contacts]`` at each of ``count`` sites."""
     return lists_of(contacts).get(key) or [getattr(contacts, key)] * count
+
+
+def is_rigid_of_sites(contacts: ContactsTable, count: int) -> list[bool]:
+    """Whether each of ``count`` sites has a stop that does not yield."""
+    return [law == RIGID for law in values_of_sites(contacts, "law", count)]
+
+
+def is_all_rigid(contacts: ContactsTable) -> bool:
+    """Whether no site has a stop that yields."""
+    return set(values_of_sites(contacts, "law", 1)) == {RIGID}
 
 
 def check_per_site(
@@ -59,11 +69,34 @@ def check_per_site(
     lacking = [key for key in MATERIAL if None in values_of_sites(contacts, key, count)]
     if has_material and lacking:
         yield Problem(f"contacts.{lacking[0]}", None, "missing; needed for the stiffness of each site")
+    yield from _check_rigid(contacts, count)
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
     # A pressed or touching stop that is wrong by itself would be reported again for its restitution.
     wrong = list(_check_stops(contacts, gaps))
     yield from wrong or check_touching(contacts, gaps, at_rest)
+
+
+def _check_rigid(contacts: ContactsTable, count: int) -> Iterator[Problem]:
+    """Problems with keys that mean nothing to rigid stops, where all sites have these, and with their precompression.
+
+    A stiffness or a material may be that of other sites.
+    """
+    if is_all_rigid(contacts):
+        given = {"adhesion": contacts.adhesion != "allow", "approach_floor": contacts.approach_floor > 0.0}
+        for key in ("stiffness", *MATERIAL, "damping"):
+            given[key] = getattr(contacts, key) is not None or key in lists_of(contacts)
+        for key, is_given in given.items():
+            if is_given:
+                remedy = 'a stop of law = "rigid" does not yield, and restitution is all of its dissipation; remove it'
+                yield Problem(path_of(contacts, key), getattr(contacts, key), remedy)
+
+    pressed = values_of_sites(contacts, "precompression", count)
+    for is_rigid, depth in zip(is_rigid_of_sites(contacts, count), pressed, strict=True):
+        if is_rigid and depth:
+            remedy = "a rigid stop has no indentation; press a mass on it by a force that is on from t = 0"
+            yield Problem(path_of(contacts, "precompression"), depth, remedy)
+            return
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
@@ -126,8 +159,10 @@ def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence
     ``gaps`` are the clearances in m.
     """
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
+    is_rigid = is_rigid_of_sites(contacts, len(gaps))
     for number, (plus, minus) in enumerate(gaps_of_sites(contacts, gaps), 1):
-        is_singular = restitutions[number - 1] < 1 and contacts.approach_floor == 0
+        is_lossy = restitutions[number - 1] < 1 and not is_rigid[number - 1]
+        is_singular = is_lossy and contacts.approach_floor == 0
         if min(plus, minus) == 0 and at_rest[number - 1] and is_singular:
             remedy = (
                 f"site {number} touches its stop at rest: its first contact has no approach velocity, by which the"
@@ -188,6 +223,8 @@ def with_stiffness(contacts: ContactsTable, count: int) -> ContactsTable:
 
 def contact_of(contacts: ContactsTable) -> Contact:
     """The law of all sites of a resolved case; the stiffness is 0 where none is given."""
+    if contacts.law == RIGID:
+        return Contact(RIGID, 0.0, restitution=contacts.restitution)
     return Contact(
         contacts.law,
         contacts.stiffness or 0.0,

@@ -8,13 +8,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vipetsc.case.case_file import CaseFile, Valid
-from vipetsc.case.contacts import JOINS, SIDES
+from vipetsc.case.contacts import JOINS, SIDES, lists_of, path_of
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.reading import Table
 from vipetsc.case.resolve import check_cell
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable
+from vipetsc.lattice.contact import RIGID
 
 FEATURES = {
     "damping": "remove [lattice.damping] and the dashpots of the cell",
@@ -27,6 +28,7 @@ FEATURES = {
     # Laws that differ, stops on one side, other masses than the cell's pair.
     "unlike sites": "remove the key",
     "touching stops": "give a clearance above 0",
+    "rigid stops": 'give a law that yields, as "bilinear" with a large stiffness; `run` and `sweep` accept rigid stops',
     "initial motion": "remove [initial]",
     "many drives": "remove [[drive.more]]",
     "moved wall": "remove drive.end",
@@ -79,6 +81,9 @@ def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Pro
             if key == "each":
                 value = None
             yield from _refusal(kind, "unlike sites", f"contacts.{key}", value)
+
+    if RIGID in [contacts.law, *lists_of(contacts).get("law", [])]:
+        yield from _refusal(kind, "rigid stops", path_of(contacts, "law"), RIGID)
 
     clearance = contacts.clearance
     if clearance == 0 or (isinstance(clearance, list) and 0 in clearance):

@@ -150,6 +150,7 @@ class LawCase(Case):
         "strips": "the waves that leave a site of a strip go to all sides, and the law has those of one direction",
         "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
         "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
+        "rigid stops": "sites are compared by the stiffness of stops that yield, which a rigid stop does not have",
         "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
         "many drives": "the law is that of one wave",
         "other waveforms": 'the scattering law needs a finite single-frequency wave: use waveform = "burst"',

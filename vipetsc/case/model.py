@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vipetsc.case.contacts import Gaps
 from vipetsc.case.drive import wave_speed
 from vipetsc.case.initial import InitialTable
-from vipetsc.lattice import Chain, Contact, Drive, Waveform
+from vipetsc.lattice import Chain, Contact, Drive, Waveform, contacts
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,20 @@ class Model:
     def law_of_sites(self) -> tuple[Contact, ...]:
         """The law of each site."""
         return self.laws or (self.contact,) * len(self.chain.sites)
+
+    @property
+    def has_rigid_sites(self) -> bool:
+        """Whether any site has a stop that does not yield."""
+        return bool(self.chain.sites) and any(law.is_rigid for law in self.used_laws)
+
+    @property
+    def shared_masses(self) -> np.ndarray:
+        """The masses, counted through all cells, on which more than one rigid site acts."""
+        elements = contacts(self.chain)
+        rigid = np.array([law.is_rigid for law in self.law_of_sites], bool)
+        ends = np.concatenate([elements.start[rigid], elements.end[rigid]])
+        masses, times = np.unique(ends[ends >= 0], return_counts=True)
+        return masses[times > 1]
 
     @property
     def effective_restitution(self) -> float | list[float]:

@@ -12,6 +12,7 @@ from vipetsc.case.contacts import (
     MATERIAL,
     check_per_site,
     contact_of,
+    is_all_rigid,
     laws_of_sites,
     lists_of,
     pairs_of_sites,
@@ -29,6 +30,7 @@ from vipetsc.case.waveforms import DEFAULT, is_sine
 from vipetsc.lattice import Chain, UnitCell, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 from vipetsc.lattice.chain import unstable_key
+from vipetsc.lattice.contact import RIGID
 
 # A key of a case file takes the place of these keys of the preset, which would contradict it.
 REPLACES = {
@@ -68,7 +70,12 @@ def with_preset(table: Table) -> Table:
     preset = PRESETS[str(lattice["preset"])]
     table = table | {"lattice": {"cells": preset.cells} | lattice}
     if isinstance(table.get("contacts", {}), dict):
-        table["contacts"] = _with_defaults(preset.contacts, table.get("contacts", {}))
+        given = table.get("contacts", {})
+        defaults = preset.contacts
+        if given.get("law") == RIGID and "each" not in given:
+            # A stop that does not yield has no material.
+            defaults = {key: value for key, value in defaults.items() if key not in MATERIAL}
+        table["contacts"] = _with_defaults(defaults, given)
     if isinstance(table.get("drive", {}), dict):
         drive = table.get("drive", {})
         table["drive"] = _with_defaults(_preset_drive(preset.drive, drive), drive)
@@ -299,7 +306,7 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
         yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
     # A material that is given for each site in part is completed by that of all sites, as ``check_per_site`` says.
     has_stiffnesses = bool(lists_of(contacts).keys() & {"stiffness", *MATERIAL})
-    is_needed = any_sites and contacts.stiffness is None and not has_stiffnesses
+    is_needed = any_sites and contacts.stiffness is None and not has_stiffnesses and not is_all_rigid(contacts)
     if is_needed and missing and valid(*(f"contacts.{key}" for key in MATERIAL)):
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
@@ -360,7 +367,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
     chain = build_chain(lattice, resolved)
     laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
     # A set, since sites of one kind have one duration, and each takes a quadrature.
-    impacts = {*zip(laws, chain.reduced_masses(), strict=True)}
+    impacts = {(law, mass) for law, mass in zip(laws, chain.reduced_masses(), strict=True) if not law.is_rigid}
     return max((np.pi / law.impact_time(speed, mass) for law, mass in impacts), default=None)
 
 

@@ -36,7 +36,9 @@ class ClearanceSpan(Section):
     last: Positive = described("clearance of the last site", unit="m")
 
 
-OF_LAW: Any = described("force over indentation: power 3/2, linear, or the power `exponent`", "hertz")
+OF_LAW: Any = described(
+    "force over indentation: power 3/2, linear, the power `exponent`, or a stop that does not yield (rigid)", "hertz"
+)
 OF_LAWS: Any = described("contact law of each site", None)
 
 

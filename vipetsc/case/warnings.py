@@ -16,6 +16,7 @@ from vipetsc.io.tables import is_number
 from vipetsc.lattice import Chain, ToneBurst, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 from vipetsc.lattice.drive import main_frequency, spectrum
+from vipetsc.wording import counted
 
 # Bounds beyond which a setting is probably unintended. They change no result, and a warning too many or too few costs a
 # reader little, so that they are round numbers.
@@ -40,6 +41,7 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
         *field_warnings(model, output),
         *closing_warnings(model),
         *contact_warnings(model, petsc),
+        *rigid_warnings(model),
     ]
 
 
@@ -253,6 +255,19 @@ def closing_warnings(model: Model) -> Iterator[str]:
         )
 
 
+def rigid_warnings(model: Model) -> Iterator[str]:
+    """The warning of rigid stops that may be struck at one instant."""
+    if not model.has_rigid_sites:
+        return
+    masses = model.shared_masses
+    if len(masses):
+        cell, mass = divmod(int(masses[0]), model.chain.cell.dofs)
+        yield (
+            f"{counted(len(masses), 'mass')} with more than one rigid stop, the first being mass {mass + 1} of cell"
+            f" {cell + 1}: stops that are struck at one instant are so by their numbers, and the answer depends on that"
+        )
+
+
 def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     """Warnings of contacts that samples, or steps of fixed length, do not resolve."""
     speed = model.scale * model.drive.frequency
@@ -261,7 +276,9 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
 
     # The briefest contact decides, at the speed of the undisturbed wave. A set, since similar sites have one duration.
     masses = model.chain.reduced_masses()
-    time = min(law.impact_time(speed, mass) for law, mass in {*zip(model.law_of_sites, masses, strict=True)})
+    kinds = {(law, mass) for law, mass in zip(model.law_of_sites, masses, strict=True) if not law.is_rigid}
+    # The impact of a rigid stop takes no time, which nothing has to resolve.
+    time = min((law.impact_time(speed, mass) for law, mass in kinds), default=np.inf)
     step = DEFAULT_STEP / model.drive.frequency
     # Options of PETSc are text in a case. PETSc reads some that are no numbers here, such as "0x10" and "default".
     if is_number(petsc.get("ts_dt", "")):

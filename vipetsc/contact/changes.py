@@ -9,6 +9,9 @@ of one of two switching functions of the site's mode, each affine in w or in w':
 - resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing;
 - permanent: side w - D and D - side w, where the masses meet and part. The mode stays: only a search for kinks, by an
   engine whose steps end on them, asks for these.
+
+A stuck site does not move: its row of a motion is (R, R', 0), its reaction in N, positive where it pushes, and the rate
+of that. It changes where the reaction turns to pull.
 """
 
 from typing import Any, NamedTuple
@@ -22,6 +25,8 @@ from vipetsc.contact.law import (
     FREE,
     PERMANENT,
     RESTING,
+    SHORTEST_FLIGHT,
+    STUCK,
     contact_force,
     gap_of,
     impact_time,
@@ -36,6 +41,11 @@ LANDED_G = 1e-9
 # A site at rest in contact has opened or closed when it is so many tolerances away from D. A return to D from there is
 # a motion of its own, on which the site may land again.
 MOVED = 100.0
+# A stuck site is released where its reaction pulls by this fraction of the force that stops it within the
+# shortest period, to half of it, so that the
+# reaction pulls whatever the error of the landing. Reactions below that are not resolved: they begin as a high power of
+# time where a wave begins, of which a cubic makes a pull.
+RELEASED = 1e-10
 
 # The largest force in a step is sampled at the ends of so many intervals, then sought by golden sections between the
 # neighbours of the largest sample. These are a quarter of the step apart; 24 sections leave 2e-6 of the step, over
@@ -131,11 +141,24 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
 
 
 @kernel
+def _least_pull(site: Any) -> float:
+    """The pull in N on which a stuck ``site`` is released."""
+    # The force that stops its reduced mass from the speed of the motion within the shortest period.
+    force_scale = site.reduced_mass * abs(site.approach) * SHORTEST_FLIGHT / site.flight
+    return RELEASED * force_scale
+
+
+@kernel
 def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -> Switching:
     """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) at its ``motion`` (3,): w, w', w''.
 
     The value is -inf if the site's mode has no such function.
     """
+    if abs(contacts[i].mode) == STUCK:
+        if function == 1:
+            return Switching(value=-np.inf, rate=0.0, tolerance=0.0, mode=FREE)
+        least = _least_pull(contacts[i])
+        return Switching(value=-motion[0] - least, rate=-motion[1], tolerance=0.5 * least, mode=FREE)
     form = _affine_form(contacts, i, function)
     value = form.factor * motion[form.order] + form.offset
     rate = form.factor * motion[form.order + 1]
@@ -164,8 +187,13 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
 
     The step has ``h`` seconds; ``b`` (6,) is overwritten.
     """
+    if abs(site.mode) == STUCK:
+        return False
     side = landed_side(site, start[0])
     if side == 0:
+        return False
+    # A rigid site only rests, and is stuck then, where it is pressed so that no flight would leave the tolerance.
+    if site.rigid and not 0.5 * end[1] * end[1] <= side * end[2] * site.tolerance:
         return False
     # A contact may be so stiff that an impact of any speed ends within the tolerance: its separation is not rest.
     if site.mode != FREE and gap_of(site, side) > 0.0:
@@ -208,6 +236,21 @@ def _next_kink(site: Any, motion: np.ndarray) -> int:
 
 
 @kernel
+def _first_pull(site: Any, start: np.ndarray, end: np.ndarray, h: float, c: np.ndarray) -> float:
+    """Position at which the reaction of a stuck ``site`` first turns to pull in a step of ``h`` seconds, else 2.
+
+    The reaction is the cubic with the values and rates at both ends, ``start`` and ``end`` (3,); ``c`` (4,) is
+    overwritten by the Bernstein form of the pull.
+    """
+    least = _least_pull(site)
+    c[0] = -start[0] - least
+    c[3] = -end[0] - least
+    c[1] = c[0] - h * start[1] / 3.0
+    c[2] = c[3] + h * end[1] / 3.0
+    return first_upcrossing(c)
+
+
+@kernel
 def first_change(
     contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray, kinks: bool = False
 ) -> ModeChange:
@@ -222,6 +265,11 @@ def first_change(
     for i in range(contacts.size):
         permanent = abs(contacts[i].mode) == PERMANENT
         if permanent and not kinks:
+            continue
+        if abs(contacts[i].mode) == STUCK:
+            position = _first_pull(contacts[i], start[i], end[i], h, c[:4])
+            if position < first.position:
+                first = ModeChange(position=position, site=i, function=0)
             continue
         bernstein(start[i], end[i], h, b)
         if permanent and not _passes_kink(contacts[i], b):
@@ -242,7 +290,11 @@ def first_change(
                     c[k] = form.factor * b[k] + form.offset
                 else:
                     c[k] = form.factor * 5.0 * (b[k + 1] - b[k]) / h + form.offset
-            position = first_upcrossing_after_start(c[: 6 - form.order], form.tolerance)
+            near = form.tolerance
+            if contacts[i].rigid:
+                # A blow on another site may have left it a little beyond its stop: it lands where it comes back there.
+                near = max(near, c[0])
+            position = first_upcrossing_after_start(c[: 6 - form.order], near)
             # Strictly less: of changes at one time that of the first site is landed on, and the others land with it.
             if position < first.position:
                 first = ModeChange(position=position, site=i, function=function)

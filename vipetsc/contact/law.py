@@ -28,9 +28,11 @@ LANDED = 1e-10
 # of displacements: contacts that are less deep than the tolerance have no onset and no separation of their own. A stop
 # without clearance keeps the larger tolerance, below which the front of a wave passes through w = 0 again and again.
 ROUNDINGS = 1000 * float(np.finfo(float).eps)
-# Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. Modes from
-# PERMANENT on have the force of max(x, 0), without loss.
-FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4
+# Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. The modes
+# PERMANENT and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
+FREE, CLOSED, CLIPPED, PERMANENT, RESTING, STUCK = 0, 1, 2, 3, 4, 5
+# A rigid site sticks where its next flight would take less than this fraction of the shortest period of the motion.
+SHORTEST_FLIGHT = 1e-6
 
 PARAMETERS = ("first", "second", "third", "fourth")  # of a registered law
 ELASTIC = np.dtype(
@@ -62,6 +64,15 @@ SITE = np.dtype(
         ("clip", bool),
         ("reduced_mass", np.float64),
         ("preload", np.float64),
+        ("rigid", bool),
+        ("shares", bool),
+        ("restitution", np.float64),
+        ("flight", np.float64),
+        ("host", np.int64),
+        ("resonator", np.int64),
+        ("host_inverse", np.float64),
+        ("resonator_inverse", np.float64),
+        ("reaction", np.float64),
     ],
     align=True,
 )
@@ -70,6 +81,11 @@ m, the ``tolerance`` in m of a landing on a clearance, the signed ``approach`` v
 law, the damping c of the factor g, the ``floor`` of |w'_minus| in m/s, whether g is kept from becoming negative; the
 reduced mass of its two masses in kg. ``preload`` in N is the force of a permanent contact at w = 0: a static load
 balances it.
+
+A ``rigid`` site has its ``restitution`` r, the shortest ``flight`` in s after which it still is free, its ``host`` and
+``resonator`` as masses counted through all cells (-1: the ground), their inverse masses in 1/kg (0 of the ground), and
+whether it ``shares`` one of them with another rigid site; the ``approach`` stands for the speed of the motion there.
+``reaction`` in N is the force on its host while it is stuck, which the engine keeps up to date.
 """
 
 
@@ -122,6 +138,8 @@ def create_contacts(
     sites["damping"] = [dampings[law] for law in per_site]
     sites["floor"] = [law.approach_floor for law in per_site]
     sites["clip"] = [law.adhesion == "clip" for law in per_site]
+    sites["rigid"] = [law.is_rigid for law in per_site]
+    sites["restitution"] = [law.restitution for law in per_site]
     sites["reduced_mass"] = reduced_mass
     return sites
 
@@ -272,6 +290,8 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
     side = side_of(site.mode)
     x = side * w - gap_of(site, side)
     if abs(site.mode) >= PERMANENT:
+        if abs(site.mode) == STUCK:
+            return site.reaction, 0.0
         # The mode stays while the masses part and meet: the force itself has the kink at x = 0.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
 

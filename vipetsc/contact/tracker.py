@@ -3,6 +3,10 @@
 Engines locate the instants at which a contact opens or closes (``contact.changes``) and end a step there. The tracker
 then gives the site its new mode, and keeps the log of contact episodes. An episode begins where a site closes; the
 largest indentation and force of every step update it; where the site opens it is written to the log.
+
+A rigid site that lands is struck: the tracker says by which impulse, and whether the site flies on or is stuck; the
+engine adds the impulse to its motion. Several rigid sites that have one mass in common may be struck at one instant,
+one after the other by their numbers until none approaches.
 """
 
 from collections.abc import Sequence
@@ -18,6 +22,7 @@ from vipetsc.contact.law import (
     FREE,
     PERMANENT,
     RESTING,
+    STUCK,
     clipped_energy,
     contact_force,
     elastic_energy,
@@ -30,6 +35,11 @@ from vipetsc.contact.law import (
 # What is counted of each site: landings on the clearance without an onset, onsets below the floor of the approach
 # velocity, contacts that were clipped, and contacts that pulled.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
+# Blows of all sites at one instant beyond which those that go on are left to the next step.
+MOST_BLOWS = 10_000
+# Of several sites that are struck at one instant one that approaches at less than this fraction of the fastest speed is
+# at rest: without restitution, or in a row of stuck masses, speeds fall by a fraction from blow to blow.
+SLOW = 1e-13
 COUNTS = np.dtype([(name, np.int64) for name in LIMITS])
 _REALS = ("onset", "approach_velocity", "separation", "indentation", "force", "impulse", "loss")
 EPISODE = np.dtype([("site", np.int64), ("side", np.int64), *((name, np.float64) for name in _REALS)])
@@ -37,7 +47,8 @@ EPISODE = np.dtype([("site", np.int64), ("side", np.int64), *((name, np.float64)
 
 The ``approach_velocity`` is in m/s, the largest ``indentation`` in m, the largest ``force`` in N; ``impulse`` is the
 integral of the force in N s, positive where the contact pushes; ``loss`` is the energy in J that the contact has
-dissipated.
+dissipated. An impact on a rigid stop takes no time: its separation is its onset, unless the site sticks; indentation
+and force are 0, but for the reaction of a stuck site.
 """
 TRACKED = np.dtype(
     [
@@ -106,6 +117,14 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
 
 
 @kernel
+def hold_episode(episode: Any, start: np.ndarray, end: np.ndarray, h: float) -> None:
+    """Update the open ``episode`` of a stuck site with ``h`` seconds from ``start`` to ``end`` (3,): R, R', 0."""
+    episode.force = max(episode.force, max(start[0], end[0]))
+    # The integral of the cubic with these values and rates.
+    episode.impulse += 0.5 * h * (start[0] + end[0]) + h * h / 12.0 * (start[1] - end[1])
+
+
+@kernel
 def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> bool:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3).
 
@@ -115,7 +134,9 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
     for i in range(contacts.size):
         side = side_of(contacts[i].mode)
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
-        if abs(contacts[i].mode) == PERMANENT and not turns:
+        if abs(contacts[i].mode) == STUCK:
+            hold_episode(tracks.sites[i].episode, start[i], end[i], h)
+        elif abs(contacts[i].mode) == PERMANENT and not turns:
             # The depth is largest at an end of the step, and its start was the end of the last step. A search for
             # extremes would cost as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
@@ -146,9 +167,13 @@ def _is_unresolved(site: Any, motion: np.ndarray, t: float) -> bool:
 
 
 @kernel
-def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
+def switch_sites(
+    contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, impulses: np.ndarray, t: float
+) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
+    ``impulses`` (sites,) in N s get what strikes the hosts of rigid sites at this instant, and their resonators the
+    other way; the rows of ``motion`` of rigid sites are overwritten by what follows.
     ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) in J are what the ledger has of each site: the energy
     that it has dissipated so far, and of a clipped site the ``clipped_energy`` in addition. While a site is clipped
     this sum is constant, since all of that energy is dissipated; this function changes it at both ends of the phase.
@@ -156,7 +181,12 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
     time, which would take short steps where the motion, free of force, needs none.
     """
     switched = 0
+    any_rigid = False
     for i in range(contacts.size):
+        impulses[i] = 0.0
+        if contacts[i].rigid:
+            any_rigid = True
+            continue
         # A step may end on the kink of a permanent contact, whose mode stays.
         if abs(contacts[i].mode) == PERMANENT:
             continue
@@ -174,21 +204,203 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
             _set_mode(contacts, tracks, i, mode, motion[i], energies, t)
             switched += 1
             break
+    if any_rigid:
+        switched += _switch_rigid_sites(contacts, tracks, motion, energies, impulses, t, -1)
     return switched
 
 
 @kernel
-def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
-    """Let site ``i`` rest in contact if it has landed on a stop; returns whether it does.
+def _switch_rigid_sites(
+    contacts: np.ndarray,
+    tracks: Tracks,
+    motion: np.ndarray,
+    energies: np.ndarray,
+    impulses: np.ndarray,
+    t: float,
+    resting: int,
+) -> int:
+    """Release rigid sites that are pulled, strike those that approach their stops; see ``switch_sites``.
+
+    The site ``resting``, if it is not -1, has landed on a stop and sticks there, however it moves.
+    """
+    switched = 0
+    for i in range(contacts.size):
+        site = contacts[i]
+        if site.rigid and abs(site.mode) == STUCK:
+            value, _, tolerance, _ = switching(contacts, i, 0, motion[i])
+            side = side_of(site.mode)
+            if value >= -tolerance:
+                site.mode = FREE
+                switched += 1
+            # From here on the row has the motion: without its reaction a stuck site would have the acceleration R/mu.
+            motion[i, 2] = side * motion[i, 0] / site.reduced_mass
+            motion[i, 0] = side * gap_of(site, side)
+            motion[i, 1] = 0.0
+
+    if resting >= 0:
+        side = landed_side(contacts[resting], motion[resting, 0])
+        _strike(contacts, tracks, resting, side, motion, energies, impulses, t, True)
+    switched += _strike_sites(contacts, tracks, motion, energies, impulses, t)
+
+    # Episodes of sites that are free again are over, those of an impact without duration among them.
+    for i in range(contacts.size):
+        episode = tracks.sites[i].episode
+        if contacts[i].rigid and contacts[i].mode == FREE and np.isnan(episode.separation):
+            episode.separation = t
+            episode.loss += energies[i]
+            tracks.log[tracks.closed[0]] = episode
+            tracks.closed[0] += 1
+    return switched
+
+
+@kernel
+def _approached_side(site: Any, w: float, rate: float) -> int:
+    """The side, 1 or -1, of the stop that a rigid ``site`` at ``w`` in m touches and approaches at ``rate``, else 0."""
+    if site.mode != FREE:
+        side = side_of(site.mode)
+        return side if side * rate > 0.0 else 0
+    for side in (1, -1):
+        if side * rate > 0.0 and side * w - gap_of(site, side) >= -site.tolerance:
+            return side
+    return 0
+
+
+@kernel
+def _strike_sites(
+    contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, impulses: np.ndarray, t: float
+) -> int:
+    """Strike rigid sites that approach, one after the other by number until none does; returns the number of blows."""
+    slow = 0.0
+    for i in range(contacts.size):
+        if contacts[i].rigid and _approached_side(contacts[i], motion[i, 0], motion[i, 1]) != 0:
+            slow = max(slow, SLOW * abs(motion[i, 1]))
+
+    blows = 0
+    is_calm = False
+    while not is_calm and blows < MOST_BLOWS:
+        is_calm = True
+        for i in range(contacts.size):
+            site = contacts[i]
+            if not site.rigid:
+                continue
+            side = _approached_side(site, motion[i, 0], motion[i, 1])
+            if side != 0 and abs(motion[i, 1]) > slow:
+                _strike(contacts, tracks, i, side, motion, energies, impulses, t, False)
+                blows += 1
+                # One site alone needs no second look.
+                is_calm &= not site.shares
+            elif abs(site.mode) == STUCK and side_of(site.mode) * motion[i, 1] < -slow:
+                # The blow on another site has thrown the masses apart.
+                site.mode = FREE
+    return blows
+
+
+@kernel
+def _strike(
+    contacts: np.ndarray,
+    tracks: Tracks,
+    i: int,
+    side: int,
+    motion: np.ndarray,
+    energies: np.ndarray,
+    impulses: np.ndarray,
+    t: float,
+    rests: bool,
+) -> None:
+    """Strike the rigid site ``i`` at its stop on a ``side``: an impulse, an episode, and a new mode.
+
+    It flies on, or sticks where its flight would be too short, and in any case if it ``rests``.
+    """
+    site = contacts[i]
+    speed = side * motion[i, 1]
+    pressing = side * motion[i, 2]
+    rebound = site.restitution * speed
+    sticks = rests or (pressing >= 0.0 and 2.0 * rebound <= site.flight * pressing)
+    if not sticks and pressing < 0.0 and 0.5 * speed * speed <= -pressing * site.tolerance:
+        # It would turn by itself within the tolerance of its landing: no impact, and no loss.
+        tracks.sites[i].counts.grazes += 1
+        _push(contacts, i, side * 2.0 * site.reduced_mass * speed, motion, impulses)
+        motion[i, 1] = -side * speed
+        return
+
+    if sticks:
+        rebound = 0.0
+    impulse = site.reduced_mass * (speed + rebound)
+    _begin_blow(tracks.sites[i], side, motion[i, 1], energies[i], t)
+    tracks.sites[i].episode.impulse += impulse
+    energies[i] += 0.5 * impulse * (speed - rebound)
+    _push(contacts, i, side * impulse, motion, impulses)
+    motion[i, 1] = -side * rebound
+    site.mode = FREE
+    if sticks:
+        site.mode = side * STUCK
+
+
+@kernel
+def _begin_blow(track: Any, side: int, rate: float, energy: float, t: float) -> None:
+    """Begin the episode of a rigid site that is struck at ``t`` in s, unless one is open: stuck, or struck just now.
+
+    ``rate`` in m/s is w' before the blow, ``energy`` in J what the site has dissipated up to now.
+    """
+    episode = track.episode
+    if np.isnan(episode.separation):
+        return
+    episode.site = track.number
+    episode.side = side
+    episode.onset = t
+    episode.approach_velocity = rate
+    episode.separation = np.nan
+    episode.indentation = 0.0
+    episode.force = 0.0
+    episode.impulse = 0.0
+    episode.loss = -energy
+
+
+@kernel
+def _push(contacts: np.ndarray, i: int, impulse: float, motion: np.ndarray, impulses: np.ndarray) -> None:
+    """Add an ``impulse`` in N s to the host of site ``i``, and the opposite one to its resonator.
+
+    It changes the rates w' in ``motion`` (site, 3) of the other rigid sites on these masses; the caller sets its own.
+    """
+    struck = contacts[i]
+    impulses[i] += impulse
+    if not struck.shares:
+        return
+    for j in range(contacts.size):
+        site = contacts[j]
+        if j == i or not site.rigid:
+            continue
+        for sign, mass in ((-1.0, site.host), (1.0, site.resonator)):
+            if mass == struck.host:
+                motion[j, 1] += sign * impulse * struck.host_inverse
+            if mass == struck.resonator:
+                motion[j, 1] -= sign * impulse * struck.resonator_inverse
+
+
+@kernel
+def rest_site(
+    contacts: np.ndarray,
+    tracks: Tracks,
+    i: int,
+    motion: np.ndarray,
+    energies: np.ndarray,
+    impulses: np.ndarray,
+    t: float,
+) -> bool:
+    """Let site ``i`` rest in contact if it has landed on a stop; returns whether it does. A rigid one is stuck then.
 
     ``contacts`` (site,) are of dtype ``SITE``; ``motion`` (site, 3) has w, w' and w'' at the time ``t`` in s, and
-    ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``. The log must have room. Why sites
-    rest: see the package's docstring.
+    ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``, and ``impulses`` (site,) what
+    strikes hosts. The log must have room. Why sites rest: see the package's docstring.
     """
+    impulses[:] = 0.0
     site = contacts[i]
     side = landed_side(site, motion[i, 0])
     if side == 0 or abs(site.mode) >= PERMANENT:
         return False
+    if site.rigid:
+        _switch_rigid_sites(contacts, tracks, motion, energies, impulses, t, i)
+        return True
     _set_mode(contacts, tracks, i, side * RESTING, motion[i], energies, t)
     return True
 
@@ -289,6 +501,8 @@ class ImpactTracker:
         # Whether any episode may be open: false only after a step in which none was, until a mode may change.
         self._may_be_open = True
         self.tracks = Tracks(sites, log=np.zeros(2 * len(sites), EPISODE), closed=np.zeros(1, np.int64))
+        # What has struck the hosts of rigid sites in N s, when sites last switched or came to rest.
+        self.impulses = np.zeros(len(sites))
 
         # Permanent contacts are in an episode from the start.
         held = np.flatnonzero(np.abs(contacts["mode"]) == PERMANENT)
@@ -316,7 +530,7 @@ class ImpactTracker:
         # On the clearance itself, to the tolerance of a landing, w' decides.
         near = sites["tolerance"][numbered]
         touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
-        closing = touching & (sites["mode"][numbered] == FREE)
+        closing = touching & (sites["mode"][numbered] == FREE) & ~sites["rigid"][numbered]
         closed = numbered[closing]
         side = side[closing]
         rate = rate[closing]
@@ -369,16 +583,18 @@ class ImpactTracker:
         """
         self._may_be_open = True
         self.tracks = with_room(self.tracks)
-        return switch_sites(self.contacts, self.tracks, self.start, energies, t)
+        return switch_sites(self.contacts, self.tracks, self.start, energies, self.impulses, t)
 
     def rest(self, number: int, t: float, energies: np.ndarray) -> None:
         """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if this rank has it.
 
         ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``; the motion is that in ``start``.
         """
+        self._may_be_open = True
         self.tracks = with_room(self.tracks)
+        self.impulses[:] = 0.0
         for i in np.flatnonzero(self.tracks.sites["number"] == number):
-            rest_site(self.contacts, self.tracks, i, self.start, energies, t)
+            rest_site(self.contacts, self.tracks, i, self.start, energies, self.impulses, t)
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
         """Episodes (episode,) of dtype ``EPISODE`` that ended since the last call; if ``unfinished``, open ones too.

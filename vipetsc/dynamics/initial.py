@@ -9,6 +9,7 @@ import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.section import Problem
+from vipetsc.contact.law import LANDED
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.io.names import file_hash
@@ -39,10 +40,24 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
     of_rank = np.array(layout.contacts, np.int64), relative.reshape(-1, 2)
     for numbers, rows in layout.comm.allgather(of_rank):
         motion[numbers] = rows
+    _check_stops(setup.model, motion)
     no_work = np.zeros((1, 1))
     energy = float(meter.total(sums[None], no_work).total[0])
     setup.engine.begin(layout.motion(state.array_r), motion, energy)
     state.destroy()
+
+
+def _check_stops(model: Model, motion: np.ndarray) -> None:
+    """Raise CaseError for a ``motion`` (site, 2) in which a mass is beyond a stop that does not yield."""
+    for i, law in enumerate(model.law_of_sites):
+        w = float(motion[i, 0])
+        plus, minus = model.gaps[i]
+        beyond = max(w - plus, -w - minus)
+        if law.is_rigid and beyond > LANDED * max(abs(w), model.scale):
+            remedy = (
+                f"site {i + 1} begins {beyond:.3g} m beyond its rigid stop; give a smaller motion or a law that yields"
+            )
+            raise CaseError([Problem("initial", None, remedy)])
 
 
 def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,8 @@ The exponent is the mean rate at which a small deviation d of the state grows,
 where the deviation of a second run, the companion, is brought back to its first size d_0 after each interval i, in the
 direction that it has (Benettin, Galgani, Giorgilli and Strelcyn 1980). The companion is advanced by the same engine, so
 that contacts of both laws, nonlinear springs and dashpots are all in the exponent. Impacts need nothing more (Stefanski
-2000): where the two runs have not the same contacts closed, the companion goes on for another interval.
+2000): where the two runs have not the same contacts closed, the companion goes on for another interval. So it does
+while a site sticks to a rigid stop, whose deviation has nowhere to go.
 
 **Size.** |d| is the largest |v| or Om |u| of any mass, Om the frequency of the intervals: all norms have one exponent,
 and the ranks agree on this one to the last bit. d_0 is ``SIZE`` of the largest |(u, v)| so far. The difference of two
@@ -34,6 +35,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from vipetsc.contact.law import STUCK
 from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.options import petsc_options
@@ -94,9 +96,14 @@ class LargestExponent(Observer):
         self.largest = max(self.largest, self._norm(cells))
         if self._companion is not None:
             self._compare(cells, float(block.times[-1]))
-        elif self.largest > 0:
+        elif self.largest > 0 and not self._sticks():
             self._begin_companion(cells)
             self.last = float(block.times[-1])
+
+    def _sticks(self) -> bool:
+        """Whether a site of the run sticks to a rigid stop; all ranks must call it."""
+        modes = self.setup.engine.checkpoint()["sites"]["mode"]
+        return any(self.setup.layout.comm.allgather(bool(np.any(np.abs(modes) == STUCK))))
 
     def _norm(self, cells: np.ndarray) -> float:
         """The size of a state or a deviation, from the own ``cells`` (cell, 2 dof); all ranks must call it."""
@@ -127,6 +134,8 @@ class LargestExponent(Observer):
     def _compare(self, cells: np.ndarray, time: float) -> None:
         """Take the growth of the deviation from the run's ``cells`` up to the ``time`` in s, and bring it back."""
         assert self._companion is not None
+        if self._sticks():
+            return
         of_run = self.setup.engine.checkpoint()["sites"]
         of_companion = self._companion.checkpoint()
         same = bool(np.array_equal(of_run["mode"], of_companion["sites"]["mode"]))

@@ -2,7 +2,8 @@
 
 from typing import NamedTuple, Self
 
-from vipetsc.case import Case, CaseFile, Model
+from vipetsc.case import Case, CaseError, CaseFile, Model
+from vipetsc.case.section import Problem
 from vipetsc.dynamics.propagator.step_choice import refusal
 
 PROPAGATOR = "propagator"
@@ -46,6 +47,16 @@ def check_petsc_options(case: CaseFile) -> None:
         from vipetsc.dynamics.options import check_options
 
         check_options(case)
+
+
+def check_ranks(plan: RunPlan, ranks: int) -> None:
+    """Raise CaseError for a ``plan`` that only one of several ``ranks`` can carry out."""
+    # Blows at one instant pass from mass to mass, and reactions depend on one another, across all ranks.
+    if ranks > 1 and plan.engine.name == TS and plan.model.has_rigid_sites and len(plan.model.shared_masses):
+        mass = int(plan.model.shared_masses[0])
+        cell = mass // plan.model.chain.cell.dofs + 1
+        remedy = f"rigid stops that share a mass, as in cell {cell}, run by {TS} on one rank: start it without mpirun"
+        raise CaseError([Problem("contacts.sites", None, remedy)])
 
 
 def choose_engine(case: Case, model: Model) -> EngineChoice:

@@ -23,7 +23,7 @@ from vipetsc.dynamics.lyapunov import LargestExponent
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
 from vipetsc.dynamics.options import petsc_options, with_database
-from vipetsc.dynamics.plan import RunPlan
+from vipetsc.dynamics.plan import RunPlan, check_ranks
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.result import Result
@@ -115,6 +115,7 @@ def simulate(
     # What is wrong with the case is refused before anything is allocated or written.
     on_every_rank(ranks, case.import_plugins)
     plan = RunPlan.of(with_database(case))
+    check_ranks(plan, ranks.size)
     check_memory(plan.model, plan.case.output, plan.engine.name, ranks)
 
     # The guard first: the others see only samples that it accepts.

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
 from vipetsc.compiled import kernel
-from vipetsc.contact.law import create_contacts, hold
+from vipetsc.contact.law import SHORTEST_FLIGHT, create_contacts, hold
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.rows import bounds_of
 from vipetsc.lattice import contacts
 
 END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
@@ -48,9 +49,38 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     # Contacts that are pressed at rest, and beads of neighbouring cells that touch and do not dissipate, part and meet
     # all the time: no such change is landed on, and the force has a kink. With loss a contact needs an onset, at which
     # its approach velocity is taken.
-    permanent = (least < 0) | ((least == 0) & joins_cells & (sites["damping"] == 0))
+    permanent = (least < 0) | ((least == 0) & joins_cells & (sites["damping"] == 0) & ~sites["rigid"])
     hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
+
+    sites["rigid"] &= exists
+    if sites["rigid"].any():
+        _describe_rigid_sites(sites, np.where(exists, numbers, 0), model)
     return sites
+
+
+def shortest_period(model: Model) -> float:
+    """Period in s of the highest frequency in the lattice and its drives; a sample interval where there is none."""
+    highest = max(bounds_of(model.chain).frequency, *(drive.waveform.frequency for drive in model.drives))
+    if highest == 0.0:
+        return model.sample_interval
+    return float(2 * np.pi / highest)
+
+
+def _describe_rigid_sites(sites: np.ndarray, numbers: np.ndarray, model: Model) -> None:
+    """Fill what the rigid ones among ``sites`` (site,), with these ``numbers`` (site,), have more than others."""
+    elements = contacts(model.chain)
+    shared = model.shared_masses
+    chosen = sites["rigid"]
+    sites["flight"][chosen] = SHORTEST_FLIGHT * shortest_period(model)
+    sites["approach"][chosen] = model.scale * model.drive.frequency
+    for name, masses in (("host", elements.start), ("resonator", elements.end)):
+        mass = masses[numbers]
+        sites[name] = mass
+        sites["shares"] |= chosen & np.isin(mass, shared)
+        cells, place = np.divmod(np.maximum(mass, 0), model.chain.cell.dofs)
+        places_of = zip(cells.tolist(), place.tolist(), strict=True)
+        inverse = [1 / model.chain.coefficients(cell, cell + 1).masses[0, i] for cell, i in places_of]
+        sites[f"{name}_inverse"] = np.where(mass >= 0, inverse, 0.0)
 
 
 def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:

@@ -18,15 +18,17 @@ from numpy.typing import ArrayLike
 
 from vipetsc.register import DISSIPATION, LAW, PARTS, DissipationPart, LawPart, reserve
 
-LAWS = ("hertz", "bilinear", "power")
-"""Shipped laws: the force of each is one power of the indentation."""
+RIGID = "rigid"
+LAWS = ("hertz", "bilinear", "power", RIGID)
+"""Shipped laws: the force of each is one power of the indentation; stops of the law ``RIGID`` do not yield."""
 DAMPINGS = ("paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores")
 """Names of shipped factors of dissipation."""
 Adhesion = Literal["allow", "clip"]
 LEAST_RESTITUTION: Mapping[str, float] = {"exact": 0.05, "flores": 0.05}  # their damping grows without bound towards 0
 
 # The power of the indentation with which the force of a law begins; that of "power" is its parameter.
-ONSET_EXPONENTS: Mapping[str, float] = {"hertz": 1.5, "bilinear": 1.0}
+# A rigid stop has no force of an indentation: its motion is smooth between impacts, as after a linear onset.
+ONSET_EXPONENTS: Mapping[str, float] = {"hertz": 1.5, "bilinear": 1.0, RIGID: 1.0}
 # Phases at which the duration of an impact is summed; relative errors are below 1e-5 where f begins as x^1.5.
 PHASES = 32
 # Depth in m from which the deepest indentation of an impact is sought: a force may overflow far beyond it.
@@ -95,7 +97,8 @@ class Contact:
     """An elastic ``law`` f(x) with its ``stiffness`` kc, and a ``restitution`` r in [0, 1]; 1 conserves energy.
 
     f = kc x^n for spheres in elastic contact (``hertz``, n = 3/2), a linear stop (``bilinear``, n = 1) and any
-    ``power`` n; kc in N/m^n. ``exponent`` is n, which the law ``power`` takes and the others set themselves.
+    ``power`` n; kc in N/m^n. ``exponent`` is n, which the law ``power`` takes and the others set themselves. A
+    ``rigid`` stop does not yield: it has no stiffness (0), and impacts that turn w' into -r w' at once.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
     smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``factor`` names the damping c in
@@ -119,6 +122,8 @@ class Contact:
             object.__setattr__(self, "exponent", ONSET_EXPONENTS[self.law])
 
     def __str__(self) -> str:
+        if self.is_rigid:
+            return f"{self.law}, restitution {self.restitution:g}"
         about = f"restitution {self.restitution:g}, effective {self.effective_restitution:.3f}"
         if self.factor != "paper":
             about += f" ({self.factor})"
@@ -140,9 +145,14 @@ class Contact:
         return self.exponent
 
     @property
+    def is_rigid(self) -> bool:
+        """Whether the stop does not yield: it has impulses in place of a force of the indentation."""
+        return self.law == RIGID
+
+    @property
     def is_linear(self) -> bool:
         """Whether the force is proportional to the indentation; what a user's module registers counts as nonlinear."""
-        return self.law in LAWS and self.onset_exponent == 1
+        return self.law in LAWS and self.onset_exponent == 1 and not self.is_rigid
 
     def elastic_force(self, x: ArrayLike) -> np.ndarray:
         """f (...) in N at indentations ``x`` (...) in m; zero for x <= 0."""
@@ -193,6 +203,8 @@ class Contact:
 
         ``reduced_mass`` in kg is m_host m_resonator / (m_host + m_resonator).
         """
+        if self.is_rigid:
+            return 0.0
         energy = 0.5 * reduced_mass * speed**2
         if self.duration_factor:
             n = self.onset_exponent
@@ -211,6 +223,7 @@ class Contact:
     def impact_time(self, speed: float, reduced_mass: float) -> float:
         """Duration in s of an impact without loss, as in ``impact_depth``: the integral of 2 dx/x'."""
         depth = self.impact_depth(speed, reduced_mass)
+        # The impact of a rigid stop has no depth, and takes no time.
         if self.duration_factor:
             return self.duration_factor * depth / speed
 
@@ -229,6 +242,8 @@ class Contact:
         Dyn. 25 (2011) 357. ``exact``: the one whose impact has the restitution r.
         """
         e = self.restitution
+        if self.is_rigid:
+            return 0.0
         registered = registered_factor(self.factor)
         if registered:
             return float(registered.function(e))
@@ -246,6 +261,8 @@ class Contact:
     @property
     def effective_restitution(self) -> float:
         """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
+        if self.is_rigid:
+            return self.restitution
         c = self.damping
         # Near c = 0 the terms of ``rebound`` cancel: its expansion takes their place.
         if c < 1e-6:

@@ -66,7 +66,8 @@ class IdentifyCase(StudyCase):
 
     verb = section = "identify"
     refuses: ClassVar[Mapping[str, str]] = {
-        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter"
+        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
+        "rigid stops": "not yet: the derivatives of a motion by its parameters have no jumps at impulses",
     }
 
     @classmethod

@@ -71,6 +71,7 @@ class NfrcCase(Case):
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     refuses: ClassVar[Mapping[str, str]] = {
+        "rigid stops": "the harmonics of an impulse do not decay, so that no number of them gives a steady state",
         "initial motion": "a curve has all steady states, whatever the motion at t = 0",
         "damped wall": "the force of its dashpot grows with the frequency, and curves have one force for a motion",
         "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",

@@ -75,7 +75,8 @@ class NnmCase(CaseFile):
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system and the map with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
-        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself"
+        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself",
+        "rigid stops": "not yet: neither orbits that are shot nor harmonics have the jumps of velocity at a rigid stop",
     }
 
     @classmethod

@@ -43,6 +43,9 @@ and repeated so that they end on the first one: see ``vipetsc.contact``. Contact
 always, F being what they have beyond their load. They change no mode, but F has a kink where they open or close, and
 substeps end there, too.
 
+At a rigid stop an impulse J adds G_il(s - s_J) J to x_i, as a force in a time dt adds G_il F dt. A site that sticks has
+w'' = 0, by which its reaction follows: R/mu = -a'' - integral of G'' R, an equation of the second kind.
+
 **5. What forces leave in the lattice** (``clusters``). K and M are symmetric, and so is (-A)^m M^-1: the motion
 after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
 the moments mu_k = integral of F (1 - s)^k dt over the step,

@@ -28,7 +28,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import ModeChange, extremes, first_change, stays_landed, switching
-from vipetsc.contact.law import CLOSED, PERMANENT, begins_linearly, contact_force, gap_of, side_of
+from vipetsc.contact.law import CLOSED, PERMANENT, STUCK, begins_linearly, contact_force, gap_of, side_of
 from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
@@ -315,6 +315,11 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float, kin
     end = trial.site_motion[i]
     history = cluster.history[i]
     side = side_of(cluster.contacts[i].mode)
+    if abs(cluster.contacts[i].mode) == STUCK:
+        history.force = max(history.force, max(start[0], end[0]))
+        for node in range(NODES):
+            history.impulse -= seconds * cluster.nodes.weight[kind, node] * side * trial.force[i, node]
+        return
     depth = max(side * start[0], side * end[0]) - gap_of(cluster.contacts[i], side)
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]

@@ -33,6 +33,14 @@ reach rounding. With a force -c w' each sweep leaves 0.09 h c/m of it, by the si
 method would need fewer sweeps, but each of them would take the law's derivatives and the solution of a linear system of
 8 equations for each active DoF.
 
+**Stuck sites.** At a rigid site that sticks w'' = 0. In units of H the acceleration of DoF i is, apart from its free
+motion, g_1 F of its own force at once and that of others on the same masses, and the sum over p >= 2 and over the nodes
+
+    to_a[k, j] = p (p - 1) g_p d^(p - 1) powers[p - 2, k, j].
+
+The reaction F at a node is what makes it vanish: a Volterra equation of the second kind, for which Picard's iteration
+contracts as above. Forces at once of several stuck sites on one mass are solved for together, one after the other.
+
 **Moments.** The integrals of a force times powers of the lag to the substep's end are sums over the nodes with Gauss's
 weights times dx/dz. They are those of the interpolant, a polynomial of degree 7 in z, as long as the integrand's degree
 in z is at most 15: up to the 8th power with plain nodes, where the lag is linear in z; up to the 3rd with the others,
@@ -47,12 +55,12 @@ import numpy as np
 from scipy.special import binom
 
 from vipetsc.compiled import inlined, kernel
-from vipetsc.contact.law import contact_force
+from vipetsc.contact.law import STUCK, contact_force, side_of
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive
-from vipetsc.dynamics.propagator.taylor import evaluate, shift
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, has_stuck_sites
+from vipetsc.dynamics.propagator.taylor import curvature, evaluate, shift
 from vipetsc.dynamics.spring_law import nonlinear_force
 
 # Sweeps beyond which a substep is cut instead: so many suffice up to h omega = 8, where the error is far from small
@@ -70,6 +78,12 @@ SMALLEST_RESPONSE = 1e-18
 # rounding. The hundredfold margin is for other forces, and cheap: half of it saves 8 % of the substeps of the built-in
 # case, twice as much costs 9 %.
 SUPERCONVERGENCE = 0.02
+# Sweeps over stuck sites that share masses in which their reactions are found, and the change of a reaction, relative
+# to the largest one, at which they are. A cluster has 32 sites at most: a row of so many takes 3,800 sweeps.
+MOST_ROUNDS = 10_000
+HELD = 1e-15
+# Half of the time over which the rate of a force is a difference, in units of H.
+RATE_SHIFT = 1e-4
 # Binomial coefficients binom(p, k), p down, k across, of all powers of s that a series may have.
 BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
@@ -96,7 +110,8 @@ def _force_of_spring(cluster: Cluster, i: int, z: float) -> float:
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """Put w, w', w'' of every site at the present position into ``out`` (site, 3), in m, m/s and m/s^2.
 
-    ``taylor`` (dof, coefficient) is the series of the free motion from that position on, in m.
+    ``taylor`` (dof, coefficient) is the series of the free motion from that position on, in m. Of a stuck site it is
+    the reaction R in N, R' in N/s and 0.
     """
     state = cluster.state[0]
     sites = cluster.contacts.size
@@ -113,12 +128,96 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
         forces[i] = _force_of_spring(cluster, i, taylor[i, 0])
     for i in range(first_drive(cluster), forces.size):
         forces[i] = drive_force(cluster.drives, i, state.begin + state.position * h)
+    any_stuck = has_stuck_sites(cluster)
+    if any_stuck:
+        _find_reactions(cluster, taylor, forces)
 
     for i in range(sites):
         acceleration = 2.0 * taylor[i, 2]
         for j in range(forces.size):
             acceleration += cluster.response[i, j, 0] * forces[j]
         out[i, 2] = acceleration / (h * h)
+    if any_stuck:
+        _put_reactions(cluster, taylor, forces, out)
+
+
+@kernel
+def _balance(cluster: Cluster, given: np.ndarray, forces: np.ndarray) -> None:
+    """Find ``forces`` (dof,) of stuck sites i with ``given`` (dof,) + sum over all j of g_ij forces_j = 0 there.
+
+    g_ij is the acceleration of i by a force on j at once. Forces of other DoFs are given.
+    """
+    for _ in range(MOST_ROUNDS):
+        change = 0.0
+        largest = 0.0
+        any_shared = False
+        for i in range(cluster.contacts.size):
+            if abs(cluster.contacts[i].mode) != STUCK:
+                continue
+            total = given[i]
+            for j in range(forces.size):
+                total += cluster.response[i, j, 0] * forces[j]
+            correction = -total / cluster.response[i, i, 0]
+            forces[i] += correction
+            change = max(change, abs(correction))
+            largest = max(largest, abs(forces[i]))
+            any_shared |= cluster.contacts[i].shares
+        if not any_shared or change <= HELD * largest:
+            break
+
+
+@kernel
+def _find_reactions(cluster: Cluster, taylor: np.ndarray, forces: np.ndarray) -> None:
+    """Put the reactions of stuck sites at the present position into ``forces`` (dof,), which has all other forces."""
+    given = cluster.trial.sums.given[: forces.size]
+    for i in range(cluster.contacts.size):
+        given[i] = 2.0 * taylor[i, 2]
+        if abs(cluster.contacts[i].mode) == STUCK:
+            forces[i] = 0.0
+    _balance(cluster, given, forces)
+    for i in range(cluster.contacts.size):
+        if abs(cluster.contacts[i].mode) == STUCK:
+            cluster.contacts[i].reaction = -forces[i]
+
+
+@kernel
+def _put_reactions(cluster: Cluster, taylor: np.ndarray, forces: np.ndarray, out: np.ndarray) -> None:
+    """Put R, R', 0 of stuck sites into ``out`` (site, 3), which has the motion of all; ``forces`` (dof,) act.
+
+    The derivative of w'' = 0 has the rates of the others' forces, and with dashpots a term of the forces themselves.
+    """
+    state = cluster.state[0]
+    sites = cluster.contacts.size
+    h = cluster.interval
+    rates = cluster.trial.sums.rates[: forces.size]
+    for i in range(sites):
+        step = RATE_SHIFT * h
+        after = _force_on_site(cluster.contacts, i, out[i, 0] + step * out[i, 1], out[i, 1] + step * out[i, 2])
+        before = _force_on_site(cluster.contacts, i, out[i, 0] - step * out[i, 1], out[i, 1] - step * out[i, 2])
+        rates[i] = (after - before) / (2.0 * RATE_SHIFT)
+    for i in range(sites, first_drive(cluster)):
+        step = RATE_SHIFT * taylor[i, 1]
+        after = _force_of_spring(cluster, i, taylor[i, 0] + step)
+        rates[i] = (after - _force_of_spring(cluster, i, taylor[i, 0] - step)) / (2.0 * RATE_SHIFT)
+    for i in range(first_drive(cluster), forces.size):
+        t = state.begin + state.position * h
+        after = drive_force(cluster.drives, i, t + RATE_SHIFT * h)
+        rates[i] = (after - drive_force(cluster.drives, i, t - RATE_SHIFT * h)) / (2.0 * RATE_SHIFT)
+
+    # Free motion, and with dashpots the second power in the responses.
+    given = cluster.trial.sums.given[: forces.size]
+    for i in range(sites):
+        given[i] = 6.0 * taylor[i, 3]
+        if _stride(cluster) == 1:
+            for j in range(forces.size):
+                given[i] += 2.0 * cluster.response[i, j, 1] * forces[j]
+    _balance(cluster, given, rates)
+    for i in range(sites):
+        if abs(cluster.contacts[i].mode) == STUCK:
+            side = side_of(cluster.contacts[i].mode)
+            out[i, 0] = -side * forces[i]
+            out[i, 1] = -side * rates[i] / h
+            out[i, 2] = 0.0
 
 
 @inlined
@@ -172,6 +271,109 @@ def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.
             break
         p += stride
     return reaches
+
+
+@kernel
+def _prepare_stuck(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Fill ``free_a`` and ``to_a`` of the stuck sites at the nodes: see the module's docstring."""
+    sums = trial.sums
+    active = trial.active
+    stride = _stride(cluster)
+    for target in range(trial.closed.size):
+        i = active[target]
+        if abs(cluster.contacts[i].mode) != STUCK:
+            continue
+        for node in range(NODES):
+            s = substep.length * cluster.nodes.position[substep.kind, node]
+            sums.free_a[target, node] = curvature(cluster.taylor[i], s)
+
+        for source in range(active.size):
+            to_a = sums.to_a[target, source]
+            to_a[:] = 0.0
+            for m in range(1, cluster.response.shape[2]):
+                p = stride * m + 1
+                factor = p * (p - 1) * cluster.response[i, active[source], m] * substep.length ** (p - 1)
+                if factor != 0.0:
+                    for k in range(NODES):
+                        for node in range(NODES):
+                            to_a[k, node] += factor * cluster.nodes.powers[substep.kind, p - 2, k, node]
+
+
+@kernel
+def _fill_residuals(cluster: Cluster, trial: Trial) -> None:
+    """Fill what is left of w'' of the stuck sites at the nodes, by all forces of the sweep before."""
+    sums = trial.sums
+    active = trial.active
+    for target in range(trial.closed.size):
+        i = active[target]
+        if abs(cluster.contacts[i].mode) != STUCK:
+            continue
+        for node in range(NODES):
+            total = sums.free_a[target, node]
+            for source in range(active.size):
+                force = trial.force[active[source]]
+                total += cluster.response[i, active[source], 0] * force[node]
+                for k in range(NODES):
+                    total += sums.to_a[target, source, k, node] * force[k]
+            sums.residuals[target, node] = total
+            sums.corrections[target, node] = 0.0
+
+
+@kernel
+def _find_corrections(cluster: Cluster, trial: Trial) -> None:
+    """Find the corrections of the reactions at the nodes whose accelerations at once balance the residuals."""
+    sums = trial.sums
+    active = trial.active
+    sites = trial.closed.size
+    for _ in range(MOST_ROUNDS):
+        largest = 0.0
+        last = 0.0
+        any_shared = False
+        for target in range(sites):
+            i = active[target]
+            if abs(cluster.contacts[i].mode) != STUCK:
+                continue
+            any_shared |= cluster.contacts[i].shares
+            for node in range(NODES):
+                total = sums.residuals[target, node]
+                for source in range(sites):
+                    if abs(cluster.contacts[active[source]].mode) == STUCK:
+                        total += cluster.response[i, active[source], 0] * sums.corrections[source, node]
+                step = total / cluster.response[i, i, 0]
+                sums.corrections[target, node] -= step
+                last = max(last, abs(step))
+                largest = max(largest, abs(sums.corrections[target, node]))
+        if not any_shared or last <= HELD * largest:
+            break
+
+
+@kernel
+def _hold_stuck(cluster: Cluster, trial: Trial, substep: Substep) -> float:
+    """Correct the reactions of stuck sites at the nodes to what makes w'' vanish there, with the forces of others.
+
+    Returns the largest correction, relative to the largest reaction of the site and to the force that would give its
+    masses the speed of the motion within the substep.
+    """
+    _fill_residuals(cluster, trial)
+    _find_corrections(cluster, trial)
+    change = 0.0
+    for target in range(trial.closed.size):
+        i = trial.active[target]
+        site = cluster.contacts[i]
+        if abs(site.mode) != STUCK:
+            continue
+        correction = 0.0
+        largest = 0.0
+        for node in range(NODES):
+            trial.force[i, node] += trial.sums.corrections[target, node]
+            correction = max(correction, abs(trial.sums.corrections[target, node]))
+            largest = max(largest, abs(trial.force[i, node]))
+        scale = abs(site.approach) * cluster.interval / (substep.length * cluster.response[i, i, 0])
+        # ``not ... <`` is true of NaN as well.
+        if not correction / (largest + scale) < np.inf:
+            return np.inf
+        change = max(change, correction / (largest + scale))
+    return change
 
 
 @inlined
@@ -254,6 +456,8 @@ def _replace(cluster: Cluster, i: int, w: np.ndarray, v: np.ndarray, trial: Tria
             return np.inf
         if i < contacts.size:
             site = contacts[i]
+            if abs(site.mode) == STUCK:
+                continue  # its reaction decides, not its motion
             change = max(change, abs(w[node] - trial.w[i, node]) / site.scale)
             # Never 0/0: a contact begins only at a speed above zero, and one that touches or is pressed at rest has the
             # typical speed of waves in its place (``contact.law.hold``).
@@ -278,15 +482,22 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     """
     contacts = cluster.contacts
     _prepare_nodes(cluster, trial, substep)
+    any_stuck = has_stuck_sites(cluster)
+    if any_stuck:
+        _prepare_stuck(cluster, trial, substep)
     last = np.inf
     for _ in range(MOST_SWEEPS):
         change = _move(cluster, trial)
+        if any_stuck:
+            change = max(change, _hold_stuck(cluster, trial, substep))
         if change < CONVERGED or (change < STAGNANT and change >= last):
             return True
         if change == np.inf:
             break
         last = change
         for i in trial.closed:
+            if abs(contacts[i].mode) == STUCK:
+                continue
             for node in range(NODES):
                 trial.force[i, node] = _force_on_site(contacts, i, trial.w[i, node], trial.v[i, node])
         for i in trial.springs:

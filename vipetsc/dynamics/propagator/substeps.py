@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.law import FREE
+from vipetsc.contact.law import FREE, STUCK
 from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.spring_law import SPRING_LAW
@@ -46,10 +46,13 @@ class Sums(NamedTuple):
 
     At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
-    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (power,) of one DoF's force about the substep's end;
-    ``series`` (power, coefficient), whose row k is the polynomial in s that term k of a response makes of them;
-    ``bernstein`` (2, 6), the coefficients of two quintics for w; and ``had_contact`` (dof,), whether a site was in
-    contact before the sites switched at the substep's end.
+    DoF. Of stuck sites: ``free_a`` (dof, node) and ``to_a`` (dof, source, node of the source, node), the same of the
+    acceleration by s, ``residuals`` (dof, node) of it, and ``corrections`` (dof, node) of their reactions. Besides,
+    ``forces`` (dof,) at one time, their ``rates``, and the ``given`` part of accelerations; ``impulses`` (dof,) that
+    have struck sites; ``moments`` (power,) of one DoF's force about the substep's end; ``series`` (power, coefficient),
+    whose row k is the polynomial in s that term k of a response makes of them; ``bernstein`` (2, 6), coefficients of
+    two quintics for w; and ``had_contact`` (dof,), whether a site was in contact before the sites switched at the
+    substep's end.
     """
 
     free_w: np.ndarray
@@ -59,7 +62,14 @@ class Sums(NamedTuple):
     reaches: np.ndarray
     w: np.ndarray
     v: np.ndarray
+    free_a: np.ndarray
+    to_a: np.ndarray
+    residuals: np.ndarray
+    corrections: np.ndarray
     forces: np.ndarray
+    rates: np.ndarray
+    given: np.ndarray
+    impulses: np.ndarray
     moments: np.ndarray
     series: np.ndarray
     bernstein: np.ndarray
@@ -97,7 +107,8 @@ class Cluster(NamedTuple):
     of its duration.
 
     ``taylor`` (dof, coefficient) is the series in m of the free motion about the present position, by powers of s,
-    twice ``StepSeries.terms`` of them; ``site_motion`` (dof, 3) has w, w', w'' of the sites there. ``moments`` (dof,
+    twice ``StepSeries.terms`` of them; ``site_motion`` (dof, 3) has w, w', w'' of the sites there, or of a stuck site
+    its reaction R, R', 0. ``moments`` (dof,
     power) in N s, as many, are the integrals of the step's forces times (remaining time/H)^power up to its end,
     ``energy`` (dof,) in J is what sites dissipated and the work of drives. ``history`` (dof,) is of dtype ``HISTORY``,
     ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is workspace for the largest cluster.
@@ -122,8 +133,14 @@ class Cluster(NamedTuple):
     trial: Trial
 
 
-def create_trial(dofs: int, terms: int) -> Trial:
-    """Workspace for a substep of ``dofs`` DoFs, all of which are active; as it is here, all are sites."""
+def create_trial(dofs: int, terms: int, any_rigid: bool = False) -> Trial:
+    """Workspace for a substep of ``dofs`` DoFs, all of which are active; as it is here, all are sites.
+
+    Only where sites may stick, with ``any_rigid``, is there room for what their accelerations take.
+    """
+    stuck = 0
+    if any_rigid:
+        stuck = dofs
     sums = Sums(
         free_w=np.zeros((dofs, NODES)),
         free_v=np.zeros((dofs, NODES)),
@@ -132,7 +149,14 @@ def create_trial(dofs: int, terms: int) -> Trial:
         reaches=np.zeros((dofs, dofs), bool),
         w=np.zeros(NODES),
         v=np.zeros(NODES),
+        free_a=np.zeros((stuck, NODES)),
+        to_a=np.zeros((stuck, stuck, NODES, NODES)),
+        residuals=np.zeros((stuck, NODES)),
+        corrections=np.zeros((stuck, NODES)),
         forces=np.zeros(dofs),
+        rates=np.zeros(dofs),
+        given=np.zeros(dofs),
+        impulses=np.zeros(dofs),
         moments=np.zeros(2 * terms),
         series=np.zeros((2 * terms, 2 * terms)),
         bernstein=np.zeros((2, 6)),
@@ -149,6 +173,15 @@ def create_trial(dofs: int, terms: int) -> Trial:
         site_motion=np.zeros((dofs, 3)),
         sums=sums,
     )
+
+
+@kernel
+def has_stuck_sites(cluster: Cluster) -> bool:
+    """Whether a rigid site of a cluster is stuck."""
+    any_stuck = False
+    for i in range(cluster.contacts.size):
+        any_stuck |= abs(cluster.contacts[i].mode) == STUCK
+    return any_stuck
 
 
 @kernel

@@ -51,6 +51,15 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
 
 
 @kernel
+def curvature(series: np.ndarray, s: float) -> float:
+    """Second derivative at ``s`` of a ``series`` (coefficient,) by rising powers of s."""
+    value = 0.0
+    for k in range(series.size - 1, 1, -1):
+        value = value * s + k * (k - 1) * series[k]
+    return value
+
+
+@kernel
 def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, length: float) -> float:
     """First s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.contact.changes import ModeChange, stays_landed, switching
+from vipetsc.contact.law import STUCK
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
@@ -54,6 +55,9 @@ FREE_STEP = 0.05
 STEP_PER_TIME = 0.25
 # A suggestion of so many times the step taken says that the step was cut short. Not sharp: from 2 on two steps change.
 CUT_SHORT = 4.0
+# The rate of a reaction is its difference over so many of the site's shortest flights, to either side: 1e-5 of the
+# shortest period, at which the difference errs by 1e-9 of the rate, and its rounding by less.
+RATE_FLIGHTS = 10.0
 # The result of a search that is left out.
 NO_CHANGE = ModeChange(position=2.0, site=-1, function=0)
 # An outcome of a landing in addition to those of the search: its site rests.
@@ -100,10 +104,15 @@ class Integrator(Engine):
         register_sums(self.state)  # before it is duplicated
         with self.state.localForm() as local:  # its memory, which stays where it is: own components, then ghosts
             self._components = local.array
-        # Only contacts of other pairs of masses are observed with rates of the whole state.
+        # Only contacts of other pairs of masses, and rigid ones, are observed with rates of the whole state.
         self.rates = self.state
-        if model.chain.pairs:
+        self._observes_rates = bool(model.chain.pairs) or model.has_rigid_sites
+        if self._observes_rates:
             self.rates = layout.create_vector()
+        # A state a little before or after one at which reactions are asked for, and its rates.
+        self._beside: list[PETSc.Vec] = []
+        if model.has_rigid_sites:
+            self._beside = [layout.create_vector(), layout.create_vector()]
         self.step = given_first_step(FREE_STEP / model.drive.frequency)
         self.free_step = self.step
         self._stepper = TimeStepper(model, layout, self.state, self.lattice)
@@ -123,7 +132,7 @@ class Integrator(Engine):
         """Fill ``motion`` (sites, 3) with w, w', w'' of the state at ``time`` in s, else at the present; collective."""
         if time is None:
             time = self.time
-        if not self.lattice.shape.paired:
+        if not self._observes_rates:
             if self.lattice.shape.exchange:
                 self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
             return observe_at(time, self._components, self._stepper.context_address, motion)
@@ -131,6 +140,33 @@ class Integrator(Engine):
         self.rates.ghostUpdate()
         with self.rates.localForm() as rates:
             observe_pairs(self._components, rates.array, self.lattice, motion)
+        if self._stepper.context["stuck"][0]:
+            self._observe_reactions(motion, time)
+
+    def _observe_reactions(self, motion: np.ndarray, time: float) -> None:
+        """Replace the motion of stuck sites by their reaction R, its rate R', 0 at ``time`` in s; collective.
+
+        The state and its ``rates`` are those of that time. The rate is a difference over a time in which the state
+        moves straight on.
+        """
+        contacts = self.tracker.contacts
+        reaction = contacts["reaction"].copy()
+        shift = RATE_FLIGHTS * float(contacts["flight"].max(initial=0.0))
+        shift = self.comm.allreduce(shift, MPI.MAX)
+        state, rates = self._beside
+        reactions = []
+        for sign in (-1, 1):
+            state.waxpy(sign * shift, self.rates, self.state)
+            self.ts.computeRHSFunction(time + sign * shift, state, rates)
+            reactions.append(contacts["reaction"].copy())
+        contacts["reaction"] = reaction
+
+        stuck = np.flatnonzero(np.abs(contacts["mode"]) == STUCK)
+        side = np.sign(contacts["mode"][stuck])
+        before, after = reactions
+        motion[stuck, 0] = side * reaction[stuck]
+        motion[stuck, 1] = side * (after - before)[stuck] / (2 * shift)
+        motion[stuck, 2] = 0.0
 
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self.layout.place(cells, energy, self.state.array)
@@ -349,6 +385,7 @@ class Integrator(Engine):
         losses = self.layout.losses(self.state.array_r)
         self.tracker.rest(number, self.time, losses)
         self._put_losses(losses)
+        self._apply_impulses()
         self._restart(was_free)
 
     def _switch(self) -> None:
@@ -358,7 +395,8 @@ class Integrator(Engine):
         losses = self.layout.losses(self.state.array_r)
         self.tracker.switch(self.time, losses)
         self._put_losses(losses)
-        switched = before != self.tracker.contacts["mode"]
+        self._apply_impulses()
+        switched = (before != self.tracker.contacts["mode"]) | (self.tracker.impulses != 0.0)
         self.counts["switches"] += int(switched[self._logged].sum())
         self._restart(was_free)
 
@@ -366,8 +404,27 @@ class Integrator(Engine):
         """Put the ledger's ``losses`` (site,) in J of this rank's own sites into the state."""
         self.state.array[self.layout.dissipated : self.layout.size] = losses[self._logged]
 
+    def _apply_impulses(self) -> None:
+        """Add what has struck rigid sites to the velocities of this rank's own masses."""
+        tracker = self.tracker
+        for i in np.flatnonzero(tracker.impulses):
+            site = tracker.contacts[i]
+            impulse = tracker.impulses[i]
+            host, resonator, _ = self.lattice.site_dofs[i]
+            if host["cell"] >= 0:
+                self.state.array[host["v"]] += impulse * site["host_inverse"]
+            if resonator["cell"] >= 0:
+                self.state.array[resonator["v"]] -= impulse * site["resonator_inverse"]
+
+    def _count_stuck(self) -> None:
+        """Let the right-hand side know whether any rank has a stuck site; collective where there are rigid sites."""
+        if self._beside:
+            stuck = np.count_nonzero(np.abs(self.tracker.contacts["mode"]) == STUCK)
+            self._stepper.context["stuck"] = self.comm.allreduce(stuck)
+
     def _restart(self, was_free: bool) -> None:
         """Set the step with which to go on from a state whose sites have new modes."""
+        self._count_stuck()
         shortest = self.comm.allreduce(self.tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
         # After any change: where no contact has just begun the root of time does no harm, and ranks need not agree.
@@ -418,10 +475,11 @@ class Integrator(Engine):
         self.counts["switches"] = 0
         if self.comm.rank == 0:
             self.counts["switches"] = int(tables["counts"][:, -1].sum())
+        self._count_stuck()
         self.ts.restartStep()
         self.observe(self.tracker.start)
 
     def destroy(self) -> None:
         self._stepper.destroy()
-        for vector in (self.state, self.rates):
+        for vector in (self.state, self.rates, *self._beside):
             vector.destroy()

@@ -27,8 +27,8 @@ class StepOutcome(NamedTuple):
 class TimeStepper:
     """Steps of ``model`` from its ``state``, tried one at a time; creation is collective, as is every step.
 
-    ``ts`` is PETSc's time stepper with the options that the user gave. ``context_address`` is that of its right-hand
-    side's ``CONTEXT``, which lives as long as ``ts``.
+    ``ts`` is PETSc's time stepper with the options that the user gave. ``context`` (1,) is its right-hand side's
+    ``CONTEXT``, which lives as long as ``ts``, and ``context_address`` where it is.
     """
 
     def __init__(self, model: Model, layout: Layout, state: PETSc.Vec, lattice: Record) -> None:
@@ -51,9 +51,9 @@ class TimeStepper:
         self.ts = ts
         self._state = state
         self._saved = state.duplicate()
-        context = register(ts, lattice)
-        self.context_address = int(context.ctypes.data)
-        self._onset = context["onset"]
+        self.context = register(ts, lattice)
+        self.context_address = int(self.context.ctypes.data)
+        self._onset = self.context["onset"]
 
         # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
         set_from_options(ts, "ts_adapt_wnormtype", "infinity")
