@@ -5,6 +5,7 @@ read its numbers and put others in their place by this row alone.
 """
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any, Literal, NamedTuple
 
 from vipetsc.case.contacts import values_of_sites
@@ -20,8 +21,9 @@ Sections = Mapping[str, Any]
 class Quantity(NamedTuple):
     """Numbers in SI units that each site, mass or spring of a case has, or its first drive.
 
-    ``key`` is the field of the section, ``text`` says what the numbers are. ``scale`` is that of the coordinate in
-    which they are sought by default. ``scattered_as`` is the key in ``[disorder]`` where it is not the name.
+    ``key`` is the field of the section, ``text`` says what the numbers are. They are sought within ``least`` and
+    ``most``, by default in a coordinate of the ``scale``. ``scattered_as`` is the key in ``[disorder]`` where it is not
+    the name.
     """
 
     name: str
@@ -30,7 +32,9 @@ class Quantity(NamedTuple):
     unit: str
     text: str
     scale: Literal["logarithmic", "linear"] = "logarithmic"
-    may_be_negative: bool = False
+    least: float = 0.0
+    most: float = inf
+    may_be_zero: bool = False
     scattered_as: str = ""
 
     def numbers(self, sections: Sections) -> list[float]:
@@ -102,22 +106,14 @@ QUANTITIES: Mapping[str, Quantity] = {
         Quantity("clearance", "site", "clearance", "m", "each site's clearance"),
         Quantity("clearance_minus", "site", "clearance_minus", "m", "each site's clearance on the side w < 0"),
         Quantity("stiffness", "site", "stiffness", "N/m^n", "the contact stiffness"),
-        Quantity("exponent", "site", "exponent", "1", "each site's exponent of the law power", scale="linear"),
-        Quantity("restitution", "site", "restitution", "1", "each site's restitution", scale="linear"),
+        Quantity("exponent", "site", "exponent", "1", "each site's exponent of the law power", "linear", 1, 10),
+        Quantity("restitution", "site", "restitution", "1", "each site's restitution", "linear", 0, 1, True),
         Quantity("mass", "mass", "masses", "kg", "the masses, equal in all cells", scattered_as="masses"),
-        Quantity("grounding", "mass", "grounding", "N s/m", "the dashpots from masses to ground"),
+        Quantity("grounding", "mass", "grounding", "N s/m", "the dashpots from masses to ground", may_be_zero=True),
         Quantity("spring", "spring", "stiffness", "N/m", "the springs, equal in all cells", scattered_as="springs"),
-        Quantity("dashpot", "spring", "damping", "N s/m", "the dashpots parallel to springs"),
-        Quantity(
-            "quadratic",
-            "spring",
-            "quadratic",
-            "N/m^2",
-            "the quadratic terms of springs",
-            "linear",
-            may_be_negative=True,
-        ),
-        Quantity("cubic", "spring", "cubic", "N/m^3", "cubic terms of springs", "linear", may_be_negative=True),
+        Quantity("dashpot", "spring", "damping", "N s/m", "the dashpots parallel to springs", may_be_zero=True),
+        Quantity("quadratic", "spring", "quadratic", "N/m^2", "quadratic terms of springs", "linear", -inf, inf, True),
+        Quantity("cubic", "spring", "cubic", "N/m^3", "cubic terms of springs", "linear", -inf, inf, True),
         # The unit of an amplitude is that of the drive's waveform.
         Quantity("amplitude", "drive", "amplitude", "", "the amplitude of the first drive"),
     )

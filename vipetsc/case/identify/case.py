@@ -4,7 +4,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from math import isfinite
+from math import inf, isfinite
 from typing import Annotated, Any, ClassVar
 
 import tomli_w
@@ -244,22 +244,20 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
 
 
 def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
-    """Problems of bounds beyond what the quantity may be."""
+    """Yield problems of bounds beyond what the quantity may be, or its logarithm."""
     low, high = unknown.bounds
-    quantity = unknown.quantity
-    # On a linear scale a quantity of either sign may have any bounds.
-    if QUANTITIES[quantity].may_be_negative and unknown.scale != "logarithmic":
-        return
-    if quantity == "restitution" and not 0 <= low < high <= 1:
-        yield Problem(f"{at}.bounds", unknown.bounds, "a restitution is between 0 and 1")
-    elif quantity == "exponent" and not 1 <= low < high <= 10:
-        yield Problem(f"{at}.bounds", unknown.bounds, "an exponent is between 1 and 10")
-    elif low <= 0 and (quantity not in ("restitution", *DASHPOTS) or unknown.scale == "logarithmic"):
-        yield Problem(f"{at}.bounds", unknown.bounds, "must be positive")
-    elif quantity in DASHPOTS and low <= 0 and unknown.scale != "linear":
-        yield Problem(f"{at}.bounds", unknown.bounds, 'must be positive, or give scale = "linear"')
-    elif quantity in DASHPOTS and low < 0:
-        yield Problem(f"{at}.bounds", unknown.bounds, "a dashpot must not be negative")
+    quantity = QUANTITIES[unknown.quantity]
+    is_linear = (unknown.scale or quantity.scale) == "linear"
+    if not (quantity.least <= low and high <= quantity.most):
+        remedy = f"must be between {quantity.least:g} and {quantity.most:g}"
+        if quantity.most == inf:
+            remedy = "must not be negative" if quantity.may_be_zero else "must be positive"
+        yield Problem(f"{at}.bounds", unknown.bounds, remedy)
+    elif low <= 0 and not (is_linear and quantity.may_be_zero):
+        remedy = "must be positive"
+        if quantity.may_be_zero:
+            remedy += ', or give scale = "linear"'
+        yield Problem(f"{at}.bounds", unknown.bounds, remedy)
 
 
 def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
