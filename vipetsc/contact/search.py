@@ -2,8 +2,7 @@
 
 Method and references: the package's docstring. A trajectory is known at the ends of steps alone, and each engine has
 steps of its own kind. An engine repeats a step until it ends on the root, and asks ``correct`` after each attempt what
-to do next: that is Newton's iteration on the switching function, with safeguards. (``vipetsc.modes.flow``
-keeps a bracket instead: it lands to the rounding of the time, where residuals no longer halve.)
+to do next: that is Newton's iteration on the switching function, with safeguards.
 """
 
 from typing import NamedTuple

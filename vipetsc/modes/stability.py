@@ -1,8 +1,9 @@
 r"""Stability: which perturbations of a periodic motion grow, and how fast, by shooting and by harmonic balance.
 
 A perturbation exp(lambda t) p(t), with p periodic as the motion, is multiplied by mu = exp(2 pi lambda/Om) in a period,
-a Floquet multiplier. A motion is unstable if a multiplier lies outside the unit circle, by more than a threshold
-(``LEAST_GROWTH``, ``least_growth``) that is the same for all methods. ``Perturbations`` are the result of each of them.
+a Floquet multiplier. A motion is unstable if a multiplier lies outside the unit circle, by more than a threshold:
+``LEAST_GROWTH`` for normal modes by every method and for finite systems without damping, less where energy leaves
+(``least_growth``). ``Perturbations`` are the result of each of them.
 
 **Half-traces of a shot orbit** (``half_traces``). S = [[A, B], [C, D]] is the derivative of the arc's end by its start,
 of displacements before velocities, in coordinates M^1/2 u: the block A becomes M^1/2 A M^-1/2, and so do the others. In

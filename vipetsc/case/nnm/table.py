@@ -130,8 +130,8 @@ class NnmTable(Section):
         "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
     )
     chart: Literal["auto", "relative", "grazing"] = described(
-        "unknowns: displacements over the clearance, or square roots of the distance to contact;"
-        " auto: grazing near contact",
+        "unknowns: displacements over the size of the motion (relative), or the root of the gap of a contact (grazing);"
+        " auto: grazing near a touch",
         "relative",
     )
     start_energy: Annotated[Positive | Literal["auto"], BY_SHAPE] = described(
