@@ -13,7 +13,7 @@ from vipetsc.lattice import Chain, Contact, DenseCompliance, ModalCompliance, Sp
 from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.conservative import ConservativeMotions, HarmonicFrame, fraction_closed
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance, ShiftedCompliance
-from vipetsc.modes.balance.harmonics import SiteForces, arcs
+from vipetsc.modes.balance.harmonics import SiteForces, intervals_above
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, NoMotionError
@@ -217,7 +217,7 @@ def test_short_arcs_are_not_missed():
     motion = np.stack([np.cos(theta) - 1, -np.sin(theta), -np.cos(theta)], axis=1)
     # The shortest of these arcs is a thousandth of the distance between samples.
     for depth in (1e-3, 1e-6, 1e-9):
-        ((start, end),) = arcs(motion, -depth)
+        ((start, end),) = intervals_above(motion, -depth)
         assert (end - start) / 2 == pytest.approx(np.arccos(1 - depth), rel=3e-3)
         assert (start + end) / 2 % (2 * np.pi) == pytest.approx(2 * np.pi - 0.3, abs=1e-4)
 
@@ -226,7 +226,7 @@ def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
     """An arc of cos above its value at the first sample ends with the period, 2 pi, and has the length 0.6."""
     theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
     motion = np.stack([np.cos(theta), -np.sin(theta), -np.cos(theta)], axis=1)
-    ((start, end),) = arcs(motion, motion[0, 0])
+    ((start, end),) = intervals_above(motion, motion[0, 0])
     assert start == pytest.approx(2 * np.pi - 0.6)
     assert end == pytest.approx(2 * np.pi)
 

@@ -69,7 +69,7 @@ def test_each_of_several_equal_sites_counts(stiffness, growing):
         z[:, 1] = 1.3
         series = SiteForces([Stops.both(Contact("bilinear", stiffness), 1.0)] * count).series(z, 1.0)
         found = Hill(EqualOscillators(count, 0.05), 1.0, 9, odd=False, finite=True, decay=0.05)
-        assert found.unstable(series) == count * growing
+        assert found.stability(series).unstable == count * growing
 
 
 def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude: float) -> np.ndarray:
@@ -126,7 +126,7 @@ def test_growth_of_a_slow_motion_is_that_of_the_monodromy_matrix(frequencies, co
     growth, found, series = slow_motion(frequencies, contact, amplitude, order=171)
     assert growth.max() > 0.01
     assert found.fastest(series).real == pytest.approx(growth.max(), abs=2e-3)
-    assert found.unstable(series) == np.count_nonzero(growth > found.least)
+    assert found.stability(series).unstable == np.count_nonzero(growth > found.least)
 
 
 @pytest.mark.parametrize(("order", "is_decided"), [(161, False), (171, True)])
@@ -139,9 +139,9 @@ def test_a_motion_with_fewer_harmonics_than_perturbations_need_is_undecided(orde
     growth, found, series = slow_motion(frequencies, contact, amplitude=1.3, order=order)
     assert np.count_nonzero(growth > found.least) == 1
     if is_decided:
-        assert found.unstable(series) == 1
+        assert found.stability(series).unstable == 1
         return
-    assert found.unstable(series) == -1
+    assert found.stability(series).unstable == -1
     assert found.fastest(series) is None
     assert found.pairs(series) == []
     with pytest.raises(NoMotionError, match="no complex pair"):

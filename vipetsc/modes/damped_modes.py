@@ -23,7 +23,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vipetsc.modes.balance.conservative import episodes_in_arc, fraction_closed
-from vipetsc.modes.balance.harmonic_balance import BalanceFrame
+from vipetsc.modes.balance.harmonic_balance import BalanceFrame, RealUnknowns
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
@@ -108,7 +108,7 @@ class DampedFrame(BalanceFrame):
             newton=max(len(attempt.history) - 1, 0),
             order=modes.order,
             truncation=modes.truncation(x, omega),
-            elongations=modes.rows @ modes.unpack(x).real.sum(axis=1),
+            elongations=modes.elongations @ modes.unpack(x).real.sum(axis=1),
             tangent=tangent,
             energy_tangent=energy_tangent,
             slope=slope,
@@ -118,7 +118,7 @@ class DampedFrame(BalanceFrame):
         )
 
 
-class DampedModes(OrbitProblem):
+class DampedModes(RealUnknowns, OrbitProblem):
     """Branches of damped modes of a ``system`` with dashpots ``damping`` (n, n) in N s/m, as a ``PeriodicProblem``.
 
     ``forces`` are those of its contacts, which may dissipate, and of its springs that are not linear. Harmonics are
@@ -135,15 +135,12 @@ class DampedModes(OrbitProblem):
         max_newton: int,
         mode: int,
     ) -> None:
+        super().__init__(system.dofs, order, forces.odd, cosines=False)
         self.system = system
         self.damping = damping
         self.forces = forces
-        self.order = order
         self.tolerance = tolerance
-        self.rows = np.vstack([system.contact_rows, system.spring_rows])
-        self.orders = np.arange(1, order + 1, 2) if forces.odd else np.arange(order + 1)
-        self._sines = self.orders[self.orders > 0]
-        self.size = system.dofs * (len(self.orders) + len(self._sines))
+        self.elongations = np.vstack([system.contact_rows, system.spring_rows])
         self.newton = DenseNewton(self.size + 2, max_newton)
         # The phase is that of the linear mode's first harmonic: of Im phi^T M U_1 = 0.
         self.mode = mode
@@ -151,21 +148,9 @@ class DampedModes(OrbitProblem):
         quarter[:, 1] = 1j * system.masses * system.linear_modes()[1][:, mode]
         self.phase_row = unit(self.pack(quarter))
 
-    def pack(self, u: np.ndarray) -> np.ndarray:
-        """Return the unknowns (n,) of harmonics (masses, K + 1) complex."""
-        return np.hstack([u[:, self.orders].real, u[:, self._sines].imag]).ravel()
-
-    def unpack(self, x: np.ndarray) -> np.ndarray:
-        """Return the harmonics (masses, K + 1) complex of unknowns."""
-        u = np.zeros((self.system.dofs, self.order + 1), complex)
-        parts = x.reshape(self.system.dofs, -1)
-        u.real[:, self.orders] = parts[:, : len(self.orders)]
-        u.imag[:, self._sines] = parts[:, len(self.orders) :]
-        return u
-
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
         """Return the forces at the elongations of a motion."""
-        return self.forces.series(self.rows @ self.unpack(x), omega)
+        return self.forces.series(self.elongations @ self.unpack(x), omega)
 
     def _dynamic(self, zeta: float, omega: float) -> np.ndarray:
         """Return the dynamic stiffness (order, masses, masses) of the linear system with the negative damping."""
@@ -177,31 +162,23 @@ class DampedModes(OrbitProblem):
     def residual(self, x: np.ndarray, zeta: float, omega: float) -> np.ndarray:
         """Return the residual (n,) in N of the harmonics of all masses."""
         u = self.unpack(x)
-        out = self.rows.T @ self.series(x, omega).forces[:, : self.order + 1]
+        out = self.elongations.T @ self.series(x, omega).forces[:, : self.order + 1]
         out[:, self.orders] += np.einsum("kij,jk->ik", self._dynamic(zeta, omega), u[:, self.orders])
         return self.pack(out)
 
     def jacobian(self, x: np.ndarray, zeta: float, omega: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives of the residual by x (n, n), by zeta (n,) and by omega (n,)."""
         count = len(self.orders)
-        skipped = count - len(self._sines)
-        # Forces by the harmonics of orders k and -k, which are conjugate to each other; the mean has one alone.
-        halves = np.where(self.orders == 0, 0.5, 1.0)[:, None]
-        columns = np.concatenate([self.orders, -self.orders])
-        two_sided = self.series(x, omega).jacobian(orders=columns, rows=self.orders) * halves
-        plus = two_sided[:, :, :count]
-        minus = two_sided[:, :, count:]
-        changes = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, skipped:]], axis=2)
-
+        skipped = self.skipped
         dofs = self.system.dofs
-        matrix = np.einsum("pi,pku,pj->ikju", self.rows, changes, self.rows).astype(complex)
+        changes = self.by_unknowns(self.series(x, omega))
+        matrix = np.einsum("pi,pku,pj->ikju", self.elongations, changes, self.elongations).astype(complex)
         dynamic = self._dynamic(zeta, omega)
         for place in range(count):
             matrix[:, place, :, place] += dynamic[place]
             if place >= skipped:
                 matrix[:, place, :, count + place - skipped] += 1j * dynamic[place]
-        matrix = matrix.reshape(dofs, count, -1)
-        by_x = np.concatenate([matrix.real, matrix[:, skipped:].imag], axis=1).reshape(self.size, self.size)
+        by_x = self.real_rows(matrix.reshape(dofs, count, -1))
 
         u = self.unpack(x)
         orders = np.arange(self.order + 1)
@@ -224,7 +201,7 @@ class DampedModes(OrbitProblem):
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
         """Estimated size of the harmonics left out, which inertia alone holds, over the sum of those kept."""
-        forces = np.abs(self.rows.T @ self.series(x, omega).forces)
+        forces = np.abs(self.elongations.T @ self.series(x, omega).forces)
         beyond = np.arange(self.order + 1, forces.shape[1])
         left_out = (forces[:, beyond] / (beyond * omega) ** 2).sum(axis=1) / self.system.masses
         return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())

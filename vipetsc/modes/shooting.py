@@ -34,8 +34,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.flow import MOST_LONGER, UNLIMITED, Arc, Flow, ShootingMap
-from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, StartError, unit
@@ -395,8 +395,8 @@ class Shooting(OrbitProblem):
         self._kept = None
         if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
             self._kept = system.mean_motion
-        self._arcs: LatestValues[tuple[bytes, float], Arc] = LatestValues(1)
-        self._frames: LatestValues[tuple[Point, str], ShootingFrame] = LatestValues(1)
+        self._arcs: BoundedCache[tuple[bytes, float], Arc] = BoundedCache(1)
+        self._frames: BoundedCache[tuple[Point, str], ShootingFrame] = BoundedCache(1)
 
     def start(self, x: np.ndarray) -> np.ndarray:
         """The state (2n,) at the start of the arc from initial values ``x``."""

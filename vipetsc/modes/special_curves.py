@@ -24,12 +24,12 @@ from itertools import pairwise
 import numpy as np
 
 from vipetsc.endings import Ended, Ending
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import ContinuationError, FlowError, NoMotionError, SpecialKind
 from vipetsc.modes.response.stability_changes import NEIMARK_SACKER, PERIOD_DOUBLING
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.stability import AT_ZERO, Perturbations
+from vipetsc.modes.stability import AT_ZERO, Stability
 from vipetsc.modes.user_equations import DIFFERENCE, UserFrame, UserProblem, UserSteps
 
 FOLD = "fold"
@@ -52,7 +52,7 @@ class SpecialCurve(UserProblem):
         self.states = states
         self.kind = kind
         self._amplitude = states.parameter.fixed
-        self._latest = LatestValues[float, SteadyStates](KEPT)
+        self._latest = BoundedCache[float, SteadyStates](KEPT)
         self._exponent = complex(AT_ZERO)
         if kind == PERIOD_DOUBLING:
             self._exponent = states.least_growth(point.xi) + 0.5j
@@ -98,7 +98,7 @@ class SpecialCurve(UserProblem):
     def measured(self, xi: np.ndarray) -> Measures:
         """Return the measures of a point; its stability is undecided, since it changes there."""
         states, inner = self._at(xi[:-1], xi[-1])
-        return states.measured(inner, Perturbations(-1, None))
+        return states.measured(inner, Stability(-1, fastest=None))
 
     def _at(self, y: np.ndarray, p: float) -> tuple[SteadyStates, np.ndarray]:
         """Return the equations at the amplitude, the last number of ``y``, and the unknowns of these equations."""

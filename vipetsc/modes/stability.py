@@ -3,7 +3,7 @@ r"""Stability: which perturbations of a periodic motion grow, and how fast, by s
 A perturbation exp(lambda t) p(t), with p periodic as the motion, is multiplied by mu = exp(2 pi lambda/Om) in a period,
 a Floquet multiplier. A motion is unstable if a multiplier lies outside the unit circle, by more than a threshold:
 ``LEAST_GROWTH`` for normal modes by every method and for finite systems without damping, less where energy leaves
-(``least_growth``). ``Perturbations`` are the result of each of them.
+(``least_growth``). ``Stability`` is the result of Hill's method.
 
 **Half-traces of a shot orbit** (``half_traces``). S = [[A, B], [C, D]] is the derivative of the arc's end by its start,
 of displacements before velocities, in coordinates M^1/2 u: the block A becomes M^1/2 A M^-1/2, and so do the others. In
@@ -193,10 +193,6 @@ class HalfTraceAbove:
         return bool(np.imag(point.half_traces[self.number]) == 0)
 
 
-# Pairs up to which determinants are those of all of them, though no force may act on some.
-FEW_PAIRS = 3
-
-
 def of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """G (..., order, pair, pair) between some of the ``pairs``."""
     if len(pairs) == g.shape[-1]:
@@ -357,17 +353,6 @@ class ContourLine(NamedTuple):
         return -1
 
 
-class Perturbations(NamedTuple):
-    """The number of perturbations that grow, -1 if it is undecided, and lambda/Om of the ``fastest``, None if unknown.
-
-    ``fastest`` has Im lambda >= 0, and is 0 if none grows. ``response.steady`` makes these of a state for its measures,
-    and asks for ``Stability`` where states are compared.
-    """
-
-    unstable: int
-    fastest: complex | None
-
-
 class _Determinants(NamedTuple):
     """D at some exponents: ``values`` (exponents,), and the ``logs`` (block, exponents) of |D| in each block of orders.
 
@@ -379,15 +364,17 @@ class _Determinants(NamedTuple):
 
 
 class Stability(NamedTuple):
-    """Number of perturbations of a motion that grow, -1 if it is undecided, and D where a multiplier is real.
+    """Number of perturbations of a motion that grow, -1 if it is undecided, D where a multiplier is real, the fastest.
 
     ``at_one`` and ``at_minus_one`` are D at Re lambda = ``least`` Om for Im lambda = 0 and Om/2: real, and zero where a
-    multiplier has the size exp(2 pi least) and is positive, or negative.
+    multiplier has the size exp(2 pi least) and is positive, or negative. ``fastest`` is lambda/Om of what grows
+    fastest, Im lambda >= 0; 0 if nothing does, None where it is not known.
     """
 
     unstable: int
-    at_one: float
-    at_minus_one: float
+    at_one: float = np.nan
+    at_minus_one: float = np.nan
+    fastest: complex | None = 0j
 
 
 def _turns(values: np.ndarray) -> np.ndarray:
@@ -437,7 +424,8 @@ class Hill:
         out = np.ones(len(exponents), complex)
         sizes = np.zeros((len(self._blocks), len(exponents)))
         units = np.broadcast_to(units, len(self._blocks))
-        acting = self._acting(series)
+        # A pair on which no force acts has a row of J that is zero, and leaves the determinant as it is.
+        acting = series.acting
         if not acting.size:
             return _Determinants(out, sizes)
         if self._reduced is None or self._reduced[0] is not series:
@@ -460,9 +448,7 @@ class Hill:
                 # As phase and logarithm, since at large exponents the product of so many pivots overflows.
                 phases, logs = np.linalg.slogdet(plus_one(g, matrix))
                 sizes[block, part] = logs
-                # One by one: products of complex arrays are rounded otherwise on some processors.
-                for i, value in enumerate(phases * np.exp(np.minimum(logs - units[block], LARGEST_LOG)), begin):
-                    out[i] *= value
+                out[part] *= phases * np.exp(np.minimum(logs - units[block], LARGEST_LOG))
         return _Determinants(out, sizes)
 
     def _reduce(self, series: ForceSeries, acting: np.ndarray) -> list[KeptOrders]:
@@ -471,18 +457,6 @@ class Hill:
         if highest > series.order * self.omega:
             return []
         return [kept_orders(self.compliance, self.omega, series, orders, acting, highest) for orders in self._blocks]
-
-    def _acting(self, series: ForceSeries) -> np.ndarray:
-        """Numbers of the pairs of which the determinant is taken.
-
-        A pair on which no force acts has a row of J that is zero, and leaves the determinant as it is. Up to
-        ``FEW_PAIRS`` pairs are all taken, which costs little, unless no force acts on any of them.
-        """
-        acting = series.acting
-        pairs = len(series.potential)
-        if acting.size and pairs <= FEW_PAIRS:
-            return np.arange(pairs)
-        return acting
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
         """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
@@ -548,12 +522,8 @@ class Hill:
             ends=(float(values[0].real), float(values[-1].real)),
         )
 
-    def unstable(self, series: ForceSeries) -> int:
-        """Number of perturbations that grow faster than ``least`` Om, two for a complex pair; -1 if it is undecided."""
-        return self._line(series, self.least).zeros_beyond()
-
     def stability(self, series: ForceSeries) -> Stability:
-        """The number of perturbations that grow faster than ``least`` Om, and D where multipliers are real."""
+        """The number of perturbations that grow faster than ``least`` Om, two for a pair; the fastest is not sought."""
         line = self._line(series, self.least)
         return Stability(line.zeros_beyond(), *line.ends)
 

@@ -47,7 +47,7 @@ import numpy as np
 
 from vipetsc.lattice import DenseCompliance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, NoMotionError, unit
 
@@ -113,10 +113,10 @@ class ShiftedCompliance:
         self.pairs = pairs
         self.orders = orders
         self.weight = weight
-        self._values = LatestValues[float, np.ndarray](KEPT)
-        self._shifted = LatestValues[tuple[float, bytes], Shifted](KEPT)
-        self._factors = LatestValues[tuple[int, float, bytes], np.ndarray](KEPT)
-        self._rates = LatestValues[tuple[float, bytes], np.ndarray](KEPT)
+        self._values = BoundedCache[float, np.ndarray](KEPT)
+        self._shifted = BoundedCache[tuple[float, bytes], Shifted](KEPT)
+        self._factors = BoundedCache[tuple[int, float, bytes], np.ndarray](KEPT)
+        self._rates = BoundedCache[tuple[float, bytes], np.ndarray](KEPT)
 
     def values(self, omega: float) -> np.ndarray:
         """G (orders, pairs, pairs) in m/N at the multiples of ``omega``."""
@@ -262,27 +262,70 @@ class ShiftedCompliance:
 FREQUENCY_STEP = 1e-5
 
 
-class _Columns(NamedTuple):
-    """How the harmonics of one pair follow from its unknowns.
+class RealUnknowns:
+    """Harmonics up to the ``order`` K of so many ``rows``, elongations or displacements, as real unknowns x (size,).
 
-    ``orders`` (2 orders,) are the orders k of the harmonics, and then -k of their conjugates. ``halves`` (orders, 1)
-    is 1/2 for the mean, which would otherwise be counted for k and for -k, and 1 for the others. ``same`` (orders,
-    unknowns) is dZ/dx of the pair.
+    x holds, row by row, Re Z_k for all ``orders`` k, those from 0 to K or the ``odd`` ones alone, and then Im Z_k for
+    those above 0, or none of them with ``cosines``.
     """
 
-    orders: np.ndarray
-    halves: np.ndarray
-    same: np.ndarray
+    def __init__(self, rows: int, order: int, odd: bool, cosines: bool) -> None:
+        self.rows = rows
+        self.order = order
+        self.orders = np.arange(order + 1)
+        if odd:
+            self.orders = np.arange(1, order + 1, 2)
+        # The cosines of all orders and the sines of those above 0 have these places among the orders from 0 to K.
+        self._places = slice(int(self.orders[0]), None, 1 + odd)
+        self._sine_places = slice(1, None, 1 + odd)
+        if cosines:
+            self._sine_places = slice(0, 0)
+        count = len(self.orders)
+        sines = len(range(*self._sine_places.indices(order + 1)))
+        # The orders that have no sine: the mean, or all of them.
+        self.skipped = count - sines
+        self.size = rows * (count + sines)
+        # dZ/dx (orders, unknowns) of one row.
+        one = np.eye(count)
+        self._same = np.concatenate([one, 1j * one[:, self.skipped :]], axis=1)
+
+    def pack(self, z: np.ndarray) -> np.ndarray:
+        """Unknowns (size,) of harmonics (rows, K + 1) complex."""
+        return np.hstack([z[:, self._places].real, z[:, self._sine_places].imag]).ravel()
+
+    def unpack(self, x: np.ndarray) -> np.ndarray:
+        """Harmonics (rows, K + 1) complex of unknowns."""
+        z = np.zeros((self.rows, self.order + 1), complex)
+        parts = x.reshape(self.rows, -1)
+        z.real[:, self._places] = parts[:, : len(self.orders)]
+        z.imag[:, self._sine_places] = parts[:, len(self.orders) :]
+        return z
+
+    def by_unknowns(self, series: ForceSeries) -> np.ndarray:
+        """The derivative (pair, orders, unknowns of a row) of forces by the unknowns of their own elongations."""
+        # Forces by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k they change by 1 and
+        # 1, by Im Z_k by i and -i. The mean would be counted for k and for -k.
+        count = len(self.orders)
+        halves = np.where(self.orders == 0, 0.5, 1.0)[:, None]
+        columns = np.concatenate([self.orders, -self.orders])
+        two_sided = series.jacobian(orders=columns, rows=self.orders) * halves
+        plus = two_sided[:, :, :count]
+        minus = two_sided[:, :, count:]
+        return np.concatenate([plus + minus, 1j * (plus - minus)[:, :, self.skipped :]], axis=2)
+
+    def real_rows(self, matrix: np.ndarray) -> np.ndarray:
+        """The rows (size, ...) of the unknowns, of a complex ``matrix`` (rows, orders, ...)."""
+        parts = [matrix.real, matrix[:, self.skipped :].imag]
+        return np.concatenate(parts, axis=1).reshape(self.size, *matrix.shape[2:])
 
 
-class HarmonicBalance:
+class HarmonicBalance(RealUnknowns):
     """The equations of motions with harmonics up to the ``order`` K, in real unknowns x (size,) in m.
 
     With ``odd`` only odd orders k are unknowns, which is enough for motions z(theta + pi) = -z(theta) if ``forces`` are
     odd, too. With ``cosines`` only the real parts of the harmonics are, which is enough for conservative motions at
-    rest at phase 0: ``forces`` that depend on no velocity, and no load. x holds, pair by pair, Re Z_k for all orders k
-    and then Im Z_k. ``weight`` multiplies the compliances of orders above the first: with 0 a motion has a mean and one
-    harmonic.
+    rest at phase 0: ``forces`` that depend on no velocity, and no load. ``weight`` multiplies the compliances of orders
+    above the first: with 0 a motion has a mean and one harmonic.
 
     Residual, derivative and energy are those of the compliance shifted by stiffnesses, which ``shift`` chooses at a
     frequency; one choice must be kept along a step. ``shifted`` may be that of other equations with the same
@@ -299,46 +342,24 @@ class HarmonicBalance:
         weight: float = 1.0,
         shifted: ShiftedCompliance | None = None,
     ) -> None:
+        super().__init__(forces.pairs, order, odd, cosines)
         self.compliance = compliance
         self.forces = forces
-        self.order = order
         self.odd = odd
         self.cosines = cosines
         self.weight = weight
-        self.orders = np.arange(order + 1)
-        if odd:
-            self.orders = np.arange(1, order + 1, 2)
-        # The cosines of all orders and the sines of those above 0 have these places among the orders from 0 to K.
-        self._places = slice(int(self.orders[0]), None, 1 + odd)
-        self._sine_places = slice(1, None, 1 + odd)
-        if cosines:
-            self._sine_places = slice(0, 0)
-        self._sines = np.arange(order + 1)[self._sine_places]
-        self.size = forces.pairs * (len(self.orders) + len(self._sines))
         if shifted is None:
             shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
         self.shifted = shifted
         # Newton's method asks for the same forces several times.
-        self._series = LatestValues[tuple[bytes, float], ForceSeries](1)
-        self._changes = LatestValues[tuple[bytes, float, bytes], np.ndarray](1)
+        self._series = BoundedCache[tuple[bytes, float], ForceSeries](1)
+        self._changes = BoundedCache[tuple[bytes, float, bytes], np.ndarray](1)
 
     def weighted(self, weight: float) -> "HarmonicBalance":
         """The equations with another ``weight``."""
         return HarmonicBalance(
             self.compliance, self.forces, order=self.order, odd=self.odd, cosines=self.cosines, weight=weight
         )
-
-    def pack(self, z: np.ndarray) -> np.ndarray:
-        """Unknowns (size,) of harmonics (pairs, K + 1) complex."""
-        return np.hstack([z[:, self._places].real, z[:, self._sine_places].imag]).ravel()
-
-    def unpack(self, x: np.ndarray) -> np.ndarray:
-        """Harmonics (pairs, K + 1) complex of unknowns."""
-        z = np.zeros((self.forces.pairs, self.order + 1), complex)
-        parts = x.reshape(self.forces.pairs, -1)
-        z.real[:, self._places] = parts[:, : len(self.orders)]
-        z.imag[:, self._sine_places] = parts[:, len(self.orders) :]
-        return z
 
     def resized(self, x: np.ndarray) -> np.ndarray:
         """Unknowns (size,) from those of equations with another ``order``, ``x`` (n,); 0 for orders that are new.
@@ -394,33 +415,20 @@ class HarmonicBalance:
     def jacobian(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """dR/dx (size, size) of the ``residual``."""
         shifted = self.shifted.at(omega, shift)
-        columns = self._columns
-        count = len(self.orders)
         pairs = self.forces.pairs
         changes = self._force_changes(x, omega, shift)
 
         # Of pair i and order k by the unknown u of pair j: G_s (dF - s dZ), and dZ of the pair itself.
         matrix = shifted.compliance.swapaxes(0, 1)[:, :, :, None] * changes.swapaxes(0, 1)
         for pair in range(pairs):
-            matrix[pair, :, pair] += columns.same
-        matrix = matrix.reshape(pairs, count, -1)
-        rows = [matrix.real, matrix[:, count - len(self._sines) :].imag]
-        return np.concatenate(rows, axis=1).reshape(self.size, self.size)
+            matrix[pair, :, pair] += self._same
+        return self.real_rows(matrix.reshape(pairs, len(self.orders), -1))
 
     def _force_changes(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """The derivative (pair, orders, unknowns of the pair) of F - s Z by the unknowns of the same pair."""
 
         def compute() -> np.ndarray:
-            columns = self._columns
-            count = len(self.orders)
-            # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k
-            # they change by 1 and 1, by Im Z_k by i and -i.
-            two_sided = self.series(x, omega).jacobian(orders=columns.orders, rows=self.orders) * columns.halves
-            plus = two_sided[:, :, :count]
-            minus = two_sided[:, :, count:]
-            changes = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, count - len(self._sines) :]], axis=2)
-            changes -= shift[:, 0] * columns.same
-            return changes
+            return self.by_unknowns(self.series(x, omega)) - shift[:, 0] * self._same
 
         return self._changes.get((x.tobytes(), omega, shift.tobytes()), compute)
 
@@ -434,16 +442,6 @@ class HarmonicBalance:
         by_omega = self.shifted.rate(omega, shift) @ self.shifted_force(x, omega, shift)
         out[:, self._places] = (self.orders[:, None, None] * by_omega)[..., 0].T
         return self.pack(out)
-
-    @cached_property
-    def _columns(self) -> _Columns:
-        count = len(self.orders)
-        one = np.eye(count)
-        return _Columns(
-            orders=np.concatenate([self.orders, -self.orders]),
-            halves=np.where(self.orders == 0, 0.5, 1.0)[:, None],
-            same=np.concatenate([one, 1j * one[:, count - len(self._sines) :]], axis=1),
-        )
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
         """Estimated size of the harmonics left out of the motion ``x`` (n,), over the largest sum of those kept.

@@ -7,25 +7,25 @@ the forces f_j have the harmonics F_jk likewise. A prime is a derivative by phas
 **From harmonics to harmonics.** As in the alternating frequency-time method (Cameron and Griffin 1989), forces are
 evaluated along the motion, and then transformed back. For springs the transform is a sum over uniform samples, which is
 exact for their polynomials. The force of a contact has a kink where it closes or opens, which would alias into every
-sampled harmonic: its integrals are taken over each arc, an interval of phase with contact (a contact episode), from the
+sampled harmonic: its integrals are taken over each contact episode, an interval of phase with contact, from the
 onset to the separation.
 
-**Arcs.** Onset and separation are roots of the quintics that interpolate uniform samples of (z, z', z''), found by
+**Episodes.** Onset and separation are roots of the quintics that interpolate uniform samples of (z, z', z''), found by
 ``vipetsc.contact.search``, which misses no root of a quintic. A contact so slight that the quintic does not reach the
 offset is missed. The quintics differ from the motion by 7e-9 of its last
 harmonic (``DENSITY``). Integrals of an elastic force are less in error: an end off by d changes them by the order
 d^(n+1), n the exponent of the force, which vanishes there.
 
-**Quadrature.** An arc from a to b is integrated by Gauss's rule in phi, theta = a + (b - a) sin^2 phi, in which
+**Quadrature.** An episode from a to b is integrated by Gauss's rule in phi, theta = a + (b - a) sin^2 phi, in which
 (theta - a)(b - theta) = (b - a)^2 sin^2 phi cos^2 phi: its powers, with which a Hertz force begins and ends, are smooth
-in phi. An arc is cut where its indentation has a minimum, since the motion may nearly separate there. With 160 nodes a
-panel instead of 64, forces change by 1e-10 of their largest harmonic for random motions whose harmonics fall as 0.7^k,
-and by 1e-6 where they fall as slowly as 0.97^k up to K = 201.
+in phi. An episode is cut where its indentation has a minimum, since the motion may nearly separate there. With 160
+nodes a panel instead of 64, forces change by 1e-10 of their largest harmonic for random motions whose harmonics fall as
+0.7^k, and by 1e-6 where they fall as slowly as 0.97^k up to K = 201.
 
 **Dissipation.** The factor of a contact is g = 1 + c z'/z'_minus with its damping c and the slope z'_minus at the
 onset. The onset is where z has the value of the clearance: if z changes by dz, it moves by -dz/z', and z'_minus
-changes by dz' - (z''/z') dz, all taken at the onset. Where g is clipped at 0, arcs are cut on its zeros. Forces are
-continuous: that the ends of arcs move adds nothing else to a derivative.
+changes by dz' - (z''/z') dz, all taken at the onset. Where g is clipped at 0, episodes are cut on its zeros. Forces are
+continuous: that the ends of episodes move adds nothing else to a derivative.
 
 T. M. Cameron, J. H. Griffin, An alternating frequency/time domain method for calculating the steady-state response of
 nonlinear dynamic systems, J. Appl. Mech. 56 (1989) 149-154.
@@ -100,7 +100,7 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
     return count
 
 
-def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
+def intervals_above(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
     """Intervals of phase (begin, end), begin < end, on which a periodic motion is above ``offset``.
 
     ``motion`` (samples, 3) holds (z, z', z'') over a period. A motion that is always above has the interval (0, 2 pi).
@@ -128,7 +128,7 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
 
 
 def minima(slope: np.ndarray) -> np.ndarray:
-    """Phases (minimum,) in rad of the minima of a periodic motion, near enough to cut arcs there.
+    """Phases (minimum,) in rad of the minima of a periodic motion, near enough to cut episodes there.
 
     ``slope`` (sample,) is its derivative at equal phases of one period. A minimum is where the straight line between
     two samples passes zero upwards.
@@ -148,7 +148,7 @@ def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]
     if b - a >= 2 * np.pi:
         yield a, b
         return
-    # An interval that contains phase 0 begins at a negative phase (``arcs``).
+    # An interval that contains phase 0 begins at a negative phase (``intervals_above``).
     turns = np.concatenate([places - 2 * np.pi, places])
     inside = np.sort(turns[(turns > a) & (turns < b)]).tolist()
     yield from itertools.pairwise([a, *inside, b])
@@ -178,7 +178,7 @@ LOSS_ORDERS = 32
 
 
 class Episode(NamedTuple):
-    """One arc of contact: the pair, the ``side`` that touches, onset phase and ``length`` in rad, ``approach`` in m/s.
+    """One contact episode: the pair, the ``side`` that touches, onset phase and ``length`` in rad, ``approach`` in m/s.
 
     ``side`` is the sign of z there; ``approach`` is |Om z'_minus|, of a dissipative contact at least the law's floor.
     """
@@ -191,10 +191,10 @@ class Episode(NamedTuple):
 
 
 class _Onset(NamedTuple):
-    """How a pair's force depends on z'_minus, the slope at the onset of one arc.
+    """How a pair's force depends on z'_minus, the slope at the onset of one episode.
 
-    ``phase`` is that of the onset, ``bend`` is z''/z' there; ``theta`` are the nodes of the arc, and ``weights`` their
-    weights in a mean over the period, times df/dz'_minus.
+    ``phase`` is that of the onset, ``bend`` is z''/z' there; ``theta`` are the nodes of the episode, and ``weights``
+    their weights in a mean over the period, times df/dz'_minus.
     """
 
     pair: int
@@ -278,12 +278,12 @@ def nodes(pieces: Sequence[tuple[float, float]], orders: int) -> tuple[np.ndarra
     return np.concatenate(theta), np.concatenate(weights)
 
 
-class _ArcForce(NamedTuple):
-    """The force of a pair at the nodes of a quadrature over one arc of contact, the ``episode``.
+class _EpisodeForce(NamedTuple):
+    """The force of a pair at the nodes of a quadrature over one contact ``episode``.
 
     ``theta`` (nodes,) in rad have ``weights`` in the integral over the period; ``values`` (4, nodes) are f, df/dz,
     df/dz' and the potential there, ``rate`` (nodes,) is z'. ``onset`` says how f depends on the slope with which the
-    arc begins, None where it does not.
+    episode begins, None where it does not.
     """
 
     episode: Episode
@@ -319,20 +319,20 @@ class ForceSeries:
         self._rates = np.zeros((pairs, 2 * order + 1), complex)  # those of df/dz'
         self._onsets: list[_Onset] = []
 
-    def add(self, arc: _ArcForce) -> None:
-        """Add the force in one arc of contact."""
-        pair = arc.episode.pair
+    def add(self, force: _EpisodeForce) -> None:
+        """Add the force in one contact episode."""
+        pair = force.episode.pair
         out = np.zeros((3, 2 * self.order + 1), complex)
-        _transform(arc.theta, np.ascontiguousarray(arc.values[:3] * arc.weights / (2 * np.pi)), out)
+        _transform(force.theta, np.ascontiguousarray(force.values[:3] * force.weights / (2 * np.pi)), out)
         self._include(pair, out)
         self._rates[pair] += out[2]
-        self.potential[pair] += arc.values[3] @ arc.weights / (2 * np.pi)
-        self.loss[pair] += arc.loss
-        # An onset that moves changes z'_minus, and with it the force of the whole arc; at the floor it does not.
-        if arc.onset is not None:
-            self._onsets.append(arc.onset)
-        self.closed[pair] += arc.episode.length / (2 * np.pi)
-        self.episodes.append(arc.episode)
+        self.potential[pair] += force.values[3] @ force.weights / (2 * np.pi)
+        self.loss[pair] += force.loss
+        # An onset that moves changes z'_minus, and with it the force of the whole episode; at the floor it does not.
+        if force.onset is not None:
+            self._onsets.append(force.onset)
+        self.closed[pair] += force.episode.length / (2 * np.pi)
+        self.episodes.append(force.episode)
 
     def add_spring(self, pair: int, values: np.ndarray) -> None:
         """Add a spring whose f, df/dz and potential are ``values`` (3, samples) at uniform phases of the period."""
@@ -462,8 +462,8 @@ class SiteForces:
         """
         series = ForceSeries(self.pairs, z.shape[1] - 1)
         for pair, stops in enumerate(self.contacts):
-            for arc in self._arcs(pair, z[pair], omega, 2 * series.order):
-                series.add(arc)
+            for force in self._contact_forces(pair, z[pair], omega, 2 * series.order):
+                series.add(force)
             if stops.is_pressed:
                 series.add_load(pair, stops, z[pair])
             if stops.drag:
@@ -483,11 +483,11 @@ class SiteForces:
 
         Raises NoMotionError where a dissipative contact never separates.
         """
-        taken = [self._arcs(pair, z[pair], omega, LOSS_ORDERS) for pair in range(len(self.contacts))]
-        return np.array([sum(arc.loss for arc in of_pair) for of_pair in taken])
+        taken = [self._contact_forces(pair, z[pair], omega, LOSS_ORDERS) for pair in range(len(self.contacts))]
+        return np.array([sum(force.loss for force in of_pair) for of_pair in taken])
 
-    def _arcs(self, pair: int, z: np.ndarray, omega: float, orders: int) -> Iterator[_ArcForce]:
-        """The force of a contact, number ``pair``, in each arc of contact, with nodes for so many ``orders``.
+    def _contact_forces(self, pair: int, z: np.ndarray, omega: float, orders: int) -> Iterator[_EpisodeForce]:
+        """The force of a contact, number ``pair``, in each contact episode, with nodes for so many ``orders``.
 
         ``z`` (K + 1,) are the harmonics of its elongation.
         """
@@ -497,24 +497,24 @@ class SiteForces:
             return
         motion = _sampled(z, derivatives=3).T
         for side, clearance in ((1, stops.plus), (-1, stops.minus)):
-            for begin, end in arcs(np.ascontiguousarray(side * motion[:, :3]), clearance):
+            for begin, end in intervals_above(np.ascontiguousarray(side * motion[:, :3]), clearance):
                 yield self._force(Episode(pair, side, begin, end - begin, approach=0.0), motion, z, omega, orders)
 
-    def _force(self, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float, orders: int) -> _ArcForce:
-        """The force in one ``arc`` of contact, whose approach velocity is found here.
+    def _force(self, episode: Episode, motion: np.ndarray, z: np.ndarray, omega: float, orders: int) -> _EpisodeForce:
+        """The force in one contact ``episode``, whose approach velocity is found here.
 
         ``motion`` (samples, 4) is that of the pair and its derivatives, ``z`` (K + 1,) are its harmonics.
         """
-        side = arc.side
-        stops = self.contacts[arc.pair]
+        side = episode.side
+        stops = self.contacts[episode.pair]
         law = stops.law
         c = law.damping
-        if c and arc.length >= 2 * np.pi:
+        if c and episode.length >= 2 * np.pi:
             raise NoMotionError("a dissipative contact never separates, so that it has no approach velocity")
 
-        # The slope z'_minus in m/rad with which the arc begins, and z''/z' there, 0 where the motion only touches.
+        # The slope z'_minus in m/rad with which it begins, and z''/z' there, 0 where the motion only touches.
         at_onset = np.empty((1, 3))
-        _evaluate(z, np.array([arc.onset]), at_onset)
+        _evaluate(z, np.array([episode.onset]), at_onset)
         approach = at_onset[0, 1]
         bend = 0.0
         if approach:
@@ -524,10 +524,10 @@ class SiteForces:
             approach = side * law.approach_floor / omega
 
         # Where the force is smooth: between minima of the indentation, and where the contact is not clipped.
-        pieces = list(cut(arc.onset, arc.onset + arc.length, minima(side * motion[:, 1])))
+        pieces = list(cut(episode.onset, episode.onset + episode.length, minima(side * motion[:, 1])))
         if c and law.adhesion == "clip":
             # g > 0 where side z' > -side z'_minus/c = -|z'_minus|/c.
-            pushing = arcs(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
+            pushing = intervals_above(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
             pieces = list(common(pieces, pushing))
 
         theta, weights = nodes(pieces, orders)
@@ -550,5 +550,5 @@ class SiteForces:
         onset = None
         if c and not floored:
             weighted = -per_rate * rate / approach * weights / (2 * np.pi)
-            onset = _Onset(arc.pair, arc.onset, bend, theta, weighted)
-        return _ArcForce(arc._replace(approach=abs(approach) * omega), theta, weights, values, rate, onset)
+            onset = _Onset(episode.pair, episode.onset, bend, theta, weighted)
+        return _EpisodeForce(episode._replace(approach=abs(approach) * omega), theta, weights, values, rate, onset)

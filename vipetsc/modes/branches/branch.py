@@ -4,11 +4,16 @@ from dataclasses import dataclass, field
 from typing import Any, Generic
 
 import numpy as np
+import xarray as xr
 
 from vipetsc.endings import NOT_FINISHED, Ended
-from vipetsc.io.branch_kinds import ORBITS
+from vipetsc.io.branch_kinds import ORBITS, RESPONSES
 from vipetsc.io.netcdf import Variables
 from vipetsc.modes.problem import S
+
+# The codes of normal modes and of responses; a file's own attribute ``flag_meanings`` is what it is read by.
+KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
+RESPONSE_KINDS = ("regular", "fold", "neimark-sacker", "period-doubling", "branch-point")
 
 
 @dataclass(eq=False)
@@ -54,3 +59,22 @@ class Branch(Generic[S]):
     def column(self, name: str) -> np.ndarray:
         """One quantity of every point (points, ...)."""
         return np.array([getattr(p, name) for p in self.points])
+
+
+def kinds_of(branch_kind: str) -> tuple[str, ...]:
+    """Kinds of points on a branch of that kind, in the order of their codes."""
+    if branch_kind == RESPONSES:
+        return RESPONSE_KINDS
+    return KINDS
+
+
+def kinds_in(branch: Branch[Any]) -> list[str]:
+    """Kinds of points on a branch, in the order of their codes: those of its method, then chosen values."""
+    names = dict.fromkeys([*kinds_of(branch.kind), *(point.kind for point in branch.points)])
+    return list(names)
+
+
+def stored_kinds(data: xr.Dataset) -> list[str]:
+    """The kind of every point in a branch file."""
+    names = np.array(data["kind"].attrs["flag_meanings"].split())
+    return [str(name) for name in names[data["kind"].values]]

@@ -97,17 +97,14 @@ class CondensedMethod(NnmMethod):
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
         self.motions, self.chain, self.system, self.dofs = Condensed.from_case(case)
+        self.unknowns = self.motions.forces.pairs
         self.dissipation = dissipation_of(case)
-
-    def new_branch(self, name: str) -> Branch[Point]:
-        """A branch without points."""
-        return Branch(name, self.case.to_toml(), self.motions.forces.pairs, self.kind)
 
     def name(self, job: int) -> str:
         """The name of the branch of a mode, or of a start frequency."""
         if self.system is None or self.options.start_frequency:
             return f"breather-{distinct(self.options.start_frequency)[job]}"
-        return self.system.branch_name(job)
+        return super().name(job)
 
     def problem(self, job: int) -> ConservativeMotions:
         """The equations of the case."""

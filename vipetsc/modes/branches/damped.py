@@ -6,7 +6,6 @@ from vipetsc.case import NnmCase
 from vipetsc.case.nnm import MOST_OF_DAMPED
 from vipetsc.io.branch_kinds import DAMPED
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.losses import dissipation_of
 from vipetsc.modes.branches.orbits import NnmMethod, start_energy
 from vipetsc.modes.damped_modes import DampedModes
@@ -21,18 +20,12 @@ class DampedMethod(NnmMethod):
     """Branches of ``DampedModes``."""
 
     kind = DAMPED
+    system: System
 
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
         self.system = System.from_case(case)
-
-    def new_branch(self, name: str) -> Branch[Point]:
-        """A branch without points."""
-        return Branch(name, self.case.to_toml(), self.problem(0).size + 1, self.kind)
-
-    def name(self, job: int) -> str:
-        """The name of the branch of a mode."""
-        return self.system.branch_name(job)
+        self.unknowns = self.problem(0).size + 1
 
     def problem(self, job: int) -> DampedModes:
         """The equations of the case, for the mode of a branch."""

@@ -20,8 +20,7 @@ from vipetsc.endings import Ended, Ending
 from vipetsc.io.atomic import write_text
 from vipetsc.io.branch_kinds import CONDENSED, DAMPED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
-from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.kinds import kinds_in, stored_kinds
+from vipetsc.modes.branches.branch import Branch, kinds_in, stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
 from vipetsc.modes.branches.sweeps import measure, outputs_of, sweep_down, sweep_up
 from vipetsc.modes.point import OF_LOSSES, QUANTITIES, Point

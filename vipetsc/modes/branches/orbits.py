@@ -37,14 +37,28 @@ ABOVE_LOWEST = 1.001
 
 
 class NnmMethod(Method[Point]):
-    """Base of the methods for normal modes, with the options of [nnm] that all of them have."""
+    """Base of the methods for normal modes, with the options of [nnm] that all of them have.
+
+    ``unknowns`` are as many as a branch's file counts of each point; ``system`` is that whose modes begin branches.
+    """
 
     case: NnmCase
+    unknowns: int
+    system: System | None
 
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
         self.options = case.nnm
         self.locates = case.nnm.locate
+
+    def new_branch(self, name: str) -> Branch[Point]:
+        """A branch without points."""
+        return Branch(name, self.case.to_toml(), self.unknowns, self.kind)
+
+    def name(self, job: int) -> str:
+        """The name of the branch of a mode."""
+        assert self.system is not None
+        return self.system.branch_name(job)
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps to the end of the ranges."""
@@ -124,25 +138,19 @@ class ShootingMethod(NnmMethod):
     """Branches of orbits by ``Shooting``, with the checks that half-traces allow."""
 
     kind = ORBITS
+    system: System
 
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
         options = case.nnm
         self.system = System.from_case(case)
+        self.unknowns = self.system.dofs
         self.dissipation = dissipation_of(case)
         self.locates_grazing = options.locate_grazing
         self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
 
         shooting_map = map_of(options, self.system)
         self.shooting = Shooting(Dop853Flow(self.system), shooting_map, options.tolerance, options.max_newton)
-
-    def new_branch(self, name: str) -> Branch[Point]:
-        """A branch without points."""
-        return Branch(name, self.case.to_toml(), self.system.dofs, self.kind)
-
-    def name(self, job: int) -> str:
-        """The name of the branch of a mode."""
-        return self.system.branch_name(job)
 
     def problem(self, job: int) -> Shooting:
         """The shooting equations of the case."""

@@ -14,10 +14,9 @@ from vipetsc.endings import Ending
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_springs
-from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.kinds import RESPONSE_KINDS
+from vipetsc.modes.branches.branch import RESPONSE_KINDS, Branch
 from vipetsc.modes.branches.method import CrossingBranch, Method, value_kind
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import PeriodicProblem, SpecialKind
 from vipetsc.modes.response.branch_switching import crossing_case, first_crossing
 from vipetsc.modes.response.condensation import compliance_of
@@ -30,7 +29,7 @@ from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
 from vipetsc.modes.special_curves import SpecialCurve, SpecialSteps, crosses_amplitude
-from vipetsc.modes.stability import Perturbations
+from vipetsc.modes.stability import Stability
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.measures import JOINT
 from vipetsc.wording import shortened
@@ -268,11 +267,11 @@ class ResponseMethod(Method[Response]):
         low, high = (bound / problem.parameter.scale for bound in options.range)
         rounding = 1e-9 * (high - low)
         # All values of all quantities are compared at the same few states.
-        latest = LatestValues[bytes, dict[str, Any]](4)
+        latest = BoundedCache[bytes, dict[str, Any]](4)
 
         def measured(xi: np.ndarray) -> dict[str, Any]:
             # The stability, which is not asked for here, is computed where the state is assessed.
-            measures = problem.measured(xi, Perturbations(0, 0j))
+            measures = problem.measured(xi, Stability(0))
             fields = measures._asdict() | dict(measures.outputs)
             return fields | {"share": measures.fractions}
 

@@ -422,11 +422,6 @@ FURTHEST = 0.5
 # Near the tips of narrow tongues rounding keeps Newton's method from reaching the tolerance. A residual of this many
 # times the tolerance is accepted for a special point.
 ROUNDING = 10
-# How often a segment is halved to find a special point that Newton's method does not reach. On the paper's three
-# branches, of which the in-phase one has 250 special points, neither this nor ROUNDING acts: both are a margin.
-HALVINGS = 5
-# Fractions of its length at which a segment may be cut in two; the first one at which Newton's method converges counts.
-MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
 # Where a test turns back between two points, its extreme value is estimated by a parabola. Two zeros are looked for if
 # the estimate is beyond zero or below this fraction of the smaller value at the ends: the parabola may be wrong by as
 # much.
@@ -581,28 +576,14 @@ class Segment(Generic[S]):
         point = self.between(before, self.left).root(kind)
         return [replace(point, index=self.right.index, step=0.0)]
 
-    def root(self, kind: SpecialKind[S], halvings: int = HALVINGS) -> S:
-        """The point where the kind's test, of two signs at the ends, vanishes.
-
-        Where Newton's method fails, the search is repeated in the half of the segment that has the zero. Raises
-        NoMotionError if it fails after ``halvings`` halvings as well.
-        """
+    def root(self, kind: SpecialKind[S]) -> S:
+        """The point where the kind's test, of two signs at the ends, vanishes; raises NoMotionError without one."""
         # So that the command line can report what a run is doing (``cli.messages``).
         sys.audit("vipetsc.landing", kind.name)
-        try:
-            point = self._find(kind)
-            if kind.finish is not None:
-                point = kind.finish(point, self.left, self.right)
-            return replace(point, kind=kind.name, step=self.begin + point.step)
-        except NoMotionError as error:
-            if halvings == 0:
-                raise NoMotionError(error) from error
-
-        # Nearer ends give better guesses, and a Newton step that left the segment may stay in its half.
-        first, second = self.split()
-        if kind.test(first.left) * kind.test(first.right) < 0:
-            return first.root(kind, halvings=halvings - 1)
-        return second.root(kind, halvings=halvings - 1)
+        point = self._find(kind)
+        if kind.finish is not None:
+            point = kind.finish(point, self.left, self.right)
+        return replace(point, kind=kind.name, step=self.begin + point.step)
 
     def _find(self, kind: SpecialKind[S]) -> S:
         """The point where a test of two signs at the ends vanishes, by Brent's method."""
@@ -619,16 +600,11 @@ class Segment(Generic[S]):
             return test(self.right)
         return test(at(arclength))
 
-    def split(self, arclength: float | None = None) -> "tuple[Segment[S], Segment[S]]":
-        """The parts before and after an arclength, or about the middle; raises NoMotionError if there is none."""
-        places = self.length * MIDDLES
-        if arclength is not None:
-            places = np.array([arclength])
-        for place in places.tolist():
-            with suppress(NoMotionError):
-                middle = self.at(place)
-                return self.between(self.left, middle, self.begin), self.between(middle, self.right, self.begin + place)
-        raise NoMotionError("Newton's method fails within the step")
+    def split(self, arclength: float) -> "tuple[Segment[S], Segment[S]]":
+        """The parts before and after an ``arclength``; raises NoMotionError if there is no point."""
+        middle = self.at(arclength)
+        after = self.between(middle, self.right, self.begin + arclength)
+        return self.between(self.left, middle, self.begin), after
 
 
 def _turn(*values: tuple[float, float]) -> float | None:

@@ -24,7 +24,7 @@ import numpy as np
 from vipetsc.case.nfrc import NfrcTable
 from vipetsc.lattice import ComplianceError, IncidentWave
 from vipetsc.modes.balance.harmonic_balance import BalanceFrame, HarmonicBalance
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError
 from vipetsc.modes.response.stability_changes import StatesWithStability
@@ -121,7 +121,7 @@ class SteadyEquations(StatesWithStability):
         self.tolerance = options.tolerance
         self.max_newton = options.max_newton
         # Along a curve over the amplitude the drive's term is the same for all states of a step.
-        self._drive_terms = LatestValues[tuple[float, bytes], np.ndarray](1)
+        self._drive_terms = BoundedCache[tuple[float, bytes], np.ndarray](1)
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:

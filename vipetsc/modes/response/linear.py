@@ -14,7 +14,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_springs
 from vipetsc.modes.response.condensation import driven_points, stops_of
-from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, magnitude
+from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.spectra.responses import LAYOUT, LINEAR, LINEAR_OUTPUTS, OUTPUTS
 
@@ -59,7 +59,7 @@ def linear_states(
         measures = Measures(
             frequency=omega,
             amplitude=amplitude,
-            largest=magnitude(relative[:sites, 1]),
+            largest=np.abs(relative[:sites, 1]),
             fractions=np.full(4, np.nan),
             unstable=0,
             growth=0.0,

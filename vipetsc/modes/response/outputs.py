@@ -10,7 +10,6 @@ and acceleration follow by factors i k Om. Peaks are those of the sum of all har
 converge slowly at its kinks: its peak is taken along each contact episode from the law itself.
 """
 
-import cmath
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -109,7 +108,7 @@ class ResponseOutputs:
                 motion.forces[: len(springs), motion.drive_order]
                 + springs * motion.relative[: len(springs), motion.drive_order]
             )
-            values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
+            values |= {"largest_force": np.array(peaks), "first_force": np.abs(first), "force_lag": lag(first)}
         if self.walls:
             values |= self._on_walls(motion, field)
         return values
@@ -136,11 +135,11 @@ class ResponseOutputs:
         for power, quantity in enumerate(QUANTITIES):
             series = harmonics * rate**power
             values[f"peak_{quantity}"] = largest_values(series)
-            values[f"first_{quantity}"] = magnitude(series[:, motion.drive_order])
+            values[f"first_{quantity}"] = np.abs(series[:, motion.drive_order])
         values["lag"] = lag(harmonics[:, motion.drive_order])
         if self.pairs:
             # The mean square of a velocity is the sum of those of its harmonics. At rest a quotient is 0/0: NaN.
-            speed = magnitude(harmonics * rate)
+            speed = np.abs(harmonics * rate)
             rms = np.sqrt((speed**2).sum(axis=1) / 2)
             source, receiver = np.array(self.pairs).T
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -170,7 +169,7 @@ class ResponseOutputs:
         harmonics = np.array(forces)
         return {
             "largest_wall_force": largest_values(harmonics),
-            "first_wall_force": magnitude(harmonics[:, motion.drive_order]),
+            "first_wall_force": np.abs(harmonics[:, motion.drive_order]),
             "wall_force_lag": lag(harmonics[:, motion.drive_order]),
         }
 
@@ -256,18 +255,9 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
     return largest
 
 
-def magnitude(phasors: np.ndarray) -> np.ndarray:
-    """Magnitude (...) of each of ``phasors`` (...), complex.
-
-    Unlike those of ``np.abs`` its bits do not depend on where the numbers lie in memory.
-    """
-    return np.hypot(phasors.real, phasors.imag)
-
-
 def lag(phasors: np.ndarray) -> np.ndarray:
     """Phase (phasor,) in degrees, from 0 to 360, by which each of ``phasors`` (phasor,) is behind the drive.
 
     It is NaN where a phasor is zero.
     """
-    radians = np.array([cmath.phase(phasor) for phasor in phasors.tolist()])
-    return np.where(phasors != 0, np.mod(-np.degrees(radians), 360.0), np.nan)
+    return np.where(phasors != 0, np.mod(-np.angle(phasors, deg=True), 360.0), np.nan)

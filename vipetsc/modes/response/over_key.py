@@ -24,13 +24,13 @@ from vipetsc.case.nfrc import NfrcCase, NfrcTable
 from vipetsc.case.section import CaseError
 from vipetsc.lattice import Chain
 from vipetsc.modes.balance.harmonics import ForceSeries
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import FlowError, SpecialKind
 from vipetsc.modes.response.condensation import contact_springs
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.stability import Hill, Perturbations
+from vipetsc.modes.stability import Hill, Stability
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5
@@ -52,7 +52,7 @@ class StatesOverKey(SteadyEquations):
 
     def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
         self._build = build
-        self._kept = LatestValues[float, SteadyStates](KEPT_VALUES)
+        self._kept = BoundedCache[float, SteadyStates](KEPT_VALUES)
         low, high = options.range
         self._bounds = low, high
 
@@ -139,10 +139,10 @@ class StatesOverKey(SteadyEquations):
         motion = inner[:-1] * (self.states_at(value).clearance / self.clearance)
         return np.append(motion, value / self.parameter.scale)
 
-    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+    def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
         """The measures of a state ``xi`` (n + 1,) for its file, with the value of the key among its outputs."""
         states, inner = self._at(xi)
-        measures = states.measured(inner, perturbations)
+        measures = states.measured(inner, stability)
         value = self._within(xi[-1]) * self.parameter.scale
         return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
 

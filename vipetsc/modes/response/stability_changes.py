@@ -19,11 +19,11 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcTable
 from vipetsc.modes.balance.harmonics import ForceSeries
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import NoMotionError, SpecialKind
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.response.turning import RangeProblem
-from vipetsc.modes.stability import AT_ZERO, Hill, Perturbations, Stability
+from vipetsc.modes.stability import AT_ZERO, Hill, Stability
 
 BRANCH_POINT = "branch-point"
 PERIOD_DOUBLING = "period-doubling"
@@ -42,7 +42,7 @@ class StatesWithStability(RangeProblem):
 
     def __init__(self, options: NfrcTable) -> None:
         self.options = options
-        self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
+        self._stabilities = BoundedCache[bytes, Stability](KEPT_STATES)
 
     @abstractmethod
     def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
@@ -58,10 +58,10 @@ class StatesWithStability(RangeProblem):
         return self._stabilities.get(xi.tobytes(), evaluate)
 
     @abstractmethod
-    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+    def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
         """The measures of the state ``xi`` (n + 1,) for its file.
 
-        Its growing ``perturbations`` are looked for unless they are given.
+        Its ``stability`` is looked for unless it is given.
         """
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
@@ -171,4 +171,4 @@ class StabilityChanges:
 
         The perturbation with that ``exponent`` neither grows nor decays, and is given as the fastest.
         """
-        return replace(point, measures=self.states.measured(point.xi, Perturbations(unstable, exponent)))
+        return replace(point, measures=self.states.measured(point.xi, Stability(unstable, fastest=exponent)))

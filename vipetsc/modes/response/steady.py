@@ -23,13 +23,13 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import ComplianceError, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.latest import LatestValues
+from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.response.condensation import compliance_of, driven_points, forces_of
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, largest_values
 from vipetsc.modes.response.state import Measures
-from vipetsc.modes.stability import Hill, Perturbations
+from vipetsc.modes.stability import Hill, Stability
 
 # The power of a force counts as rounding below this fraction of amplitude times frequency times displacement, as in a
 # finite lattice without loss: nothing comes in, of which there could be fractions.
@@ -77,7 +77,7 @@ class SteadyStates(SteadyEquations):
         self.outputs = ResponseOutputs(case, self.compliance, self.forces.contacts)
 
         # Along a curve over the amplitude all states have one linear motion and one Hill's determinant.
-        self._motions = LatestValues[float, LinearMotion](KEPT_MOTIONS)
+        self._motions = BoundedCache[float, LinearMotion](KEPT_MOTIONS)
         self._hill: Hill | None = None
         shifted = None
         if like is not None:
@@ -168,10 +168,10 @@ class SteadyStates(SteadyEquations):
         z[:, self.options.subharmonic] = wave.relative * self._unit()
         return LinearMotion(z, wave)
 
-    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+    def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
         """The measures of the state ``xi`` (n + 1,) for its file.
 
-        Its growing ``perturbations`` are looked for unless they are given.
+        Its ``stability`` is looked for unless it is given.
         """
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
@@ -179,10 +179,15 @@ class SteadyStates(SteadyEquations):
         base = self.motion_frequency(xi)
         series = self.balance.series(x, base)
 
-        unstable, fastest = perturbations or self._perturbations(xi)
+        if stability is None:
+            stability = self.stability(xi)
+            # The count is cheaper than the exponents themselves, and most states are stable.
+            if stability.unstable:
+                hill, _ = self.hill_at(xi)
+                stability = stability._replace(fastest=hill.fastest(series))
         rate = complex(np.nan, np.nan)
-        if fastest is not None:
-            rate = fastest
+        if stability.fastest is not None:
+            rate = stability.fastest
         forces = series.forces[:, : z.shape[1]]
         sites = len(self.forces.contacts)
         return Measures(
@@ -190,7 +195,7 @@ class SteadyStates(SteadyEquations):
             amplitude=amplitude,
             largest=largest_values(z[:sites]),
             fractions=self._fractions(omega, amplitude, forces, float(series.loss[:sites].sum())),
-            unstable=unstable,
+            unstable=stability.unstable,
             growth=rate.real,
             sideband=rate.imag,
             closed=series.closed[:sites],
@@ -217,15 +222,6 @@ class SteadyStates(SteadyEquations):
             episodes=series.episodes,
             incident=incident,
         )
-
-    def _perturbations(self, xi: np.ndarray) -> Perturbations:
-        """How many perturbations of a state ``xi`` grow, and which the fastest."""
-        # The count is cheaper than the zeros themselves, and most states are stable.
-        unstable = self.stability(xi).unstable
-        if not unstable:
-            return Perturbations(unstable, 0j)
-        hill, series = self.hill_at(xi)
-        return Perturbations(unstable, hill.fastest(series))
 
     def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
         """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there.

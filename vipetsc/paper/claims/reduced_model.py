@@ -8,7 +8,7 @@ import xarray as xr
 from vipetsc.case import NnmCase
 from vipetsc.io.read import field_interval, nearest_cell, open_run
 from vipetsc.lattice import pass_bands, waves_at
-from vipetsc.modes.branches.kinds import KINDS
+from vipetsc.modes.branches.branch import KINDS
 from vipetsc.modes.system import System
 from vipetsc.paper.claims.criteria import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
 from vipetsc.paper.claims.evidence import AnalysedMember, Evidence, Measurement, MissingEvidence

@@ -7,7 +7,7 @@ Argument = TypeVar("Argument", bound=Hashable)
 Value = TypeVar("Value")
 
 
-class LatestValues(Generic[Argument, Value]):
+class BoundedCache(Generic[Argument, Value]):
     """The ``count`` values that were computed last, found by their arguments.
 
     ``functools.lru_cache`` on a method would do the same, but would keep its object alive, and with it matrices of a
