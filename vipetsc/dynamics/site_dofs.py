@@ -11,8 +11,7 @@ from vipetsc.case import Model
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import SHORTEST_FLIGHT, create_contacts, hold
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.rows import bounds_of
-from vipetsc.lattice import contacts
+from vipetsc.lattice import Chain, contacts
 
 END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
 """An end of a site: components of its displacement and velocity, -1 on ground; its owned cell, else -1; its mass."""
@@ -59,8 +58,18 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
 
 
 def shortest_period(model: Model) -> float:
-    """Period in s of the highest frequency in the lattice and its drives; a sample interval where there is none."""
-    highest = max(bounds_of(model.chain).frequency, *(drive.waveform.frequency for drive in model.drives))
+    """Period in s of the highest frequency in lattice and drives, or of a bound of it; else a sample interval."""
+    chain = model.chain
+    if chain.variation is None:
+        chain = Chain(chain.cell, 1)
+    # Rows of M^-1 K: the springs of a mass on the diagonal, and as much beside it (Gershgorin).
+    coefficients = chain.coefficients(-1, chain.cells)
+    circles = np.zeros((chain.cells, chain.cell.dofs))
+    for coupling in chain.cell.couplings():
+        # A spring to the cell before is stored with that cell.
+        springs = coefficients.stiffness[1 + min(coupling.offset, 0) :][: chain.cells, coupling.spring]
+        circles[:, coupling.mass] += 2 * np.abs(springs) / coefficients.masses[1:, coupling.mass]
+    highest = max(np.sqrt(circles.max()), *(drive.waveform.frequency for drive in model.drives))
     if highest == 0.0:
         return model.sample_interval
     return float(2 * np.pi / highest)
