@@ -70,5 +70,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """All names, including those that are loaded late, for completion and ``help``."""
+    """Return all names, including those that are loaded late, for completion and ``help``."""
     return sorted({*globals(), *__all__})

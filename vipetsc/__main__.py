@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def only_looks_at(arguments: list[str]) -> bool:
-    """Whether a verb only looks at a case or at the program, or help is asked for: one process does it, without MPI.
+    """Return whether a verb only looks at a case or the program, or help is asked for: one process, no MPI.
 
     To start MPI and PETSc takes half a second.
     """
@@ -83,7 +83,7 @@ def only_looks_at(arguments: list[str]) -> bool:
 
 
 def gives_petsc_options(arguments: list[str]) -> bool:
-    """Whether options for PETSc are given: behind ``--``, in the environment or in a file that PETSc reads."""
+    """Return whether options for PETSc are given: behind ``--``, in the environment or in a file that PETSc reads."""
     files = Path.home() / ".petscrc", Path(".petscrc"), Path("petscrc")
     return "--" in arguments or "PETSC_OPTIONS" in os.environ or any(file.exists() for file in files)
 

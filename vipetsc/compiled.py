@@ -49,13 +49,13 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 
 def users_function(function: Callable[..., Any]) -> Any:
-    """A ``function`` of a user's module, compiled where it is called; nothing is kept of it between runs."""
+    """Return a ``function`` of a user's module, compiled where it is called; nothing is kept of it between runs."""
     # A function that the module itself has compiled may raise at a division by zero, which gives inf here.
     return numba.njit(error_model="numpy")(getattr(function, "py_func", function))
 
 
 def c_address(function: Callable[..., Any], signature: str) -> int:
-    """The address of a ``function`` as a C function, for the rest of this process; raises NumbaError."""
+    """Return the address of a ``function`` as a C function, for the rest of this process; raises NumbaError."""
     callback = numba.cfunc(signature)(function)
     _CALLBACKS.append(callback)
     return int(callback.address or 0)
@@ -65,7 +65,7 @@ _CALLBACKS: list[Any] = []  # C functions in use: an address alone does not keep
 
 
 def _kept(decorator: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator of functions by numba's ``decorator``, with its cache where that can be written."""
+    """Return a decorator of functions by numba's ``decorator``, with its cache where that can be written."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         # Numba chooses the folder when it decorates a function, and raises RuntimeError where it finds none. A function
@@ -93,7 +93,7 @@ def _warn() -> None:
 
 @cache
 def sources(room: str) -> str:
-    """A hash of the names, sizes and times of all files from which the kernels of a ``room`` are compiled.
+    """Return a hash of the names, sizes and times of all files from which the kernels of a ``room`` are compiled.
 
     These are its own and those of the rooms below it, among them tables of numbers: compiled code contains constants.
     """
@@ -130,7 +130,7 @@ def clear_if_changed(folder: Path, room: str) -> None:
 
 
 def _is_whole(code: Path) -> bool:
-    """Whether a file of the cache has its end: numba writes pickles, and the last byte of a pickle is a full stop."""
+    """Return whether a file of the cache is whole: numba writes pickles, whose last byte is a full stop."""
     with code.open("rb") as file:
         if not file.seek(0, os.SEEK_END):
             return False

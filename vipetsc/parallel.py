@@ -81,7 +81,7 @@ def wait_for_all(comm: "MPI.Comm") -> None:
 
 
 def all_meet(comm: "MPI.Comm", patience: float) -> bool:
-    """Whether all ranks of ``comm`` call this within ``patience`` s: one that was killed never does."""
+    """Return whether all ranks of ``comm`` call this within ``patience`` s: one that was killed never does."""
     if comm.size == 1:
         return True
     barrier = comm.Ibarrier()
@@ -94,7 +94,7 @@ def all_meet(comm: "MPI.Comm", patience: float) -> bool:
 
 
 def on_one_machine(comm: "MPI.Comm") -> bool:
-    """Whether all ranks of ``comm`` are on one machine, and see its temporary folders; all must call it."""
+    """Return whether all ranks of ``comm`` are on one machine, and see its temporary folders; all must call it."""
     from mpi4py import MPI
 
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
@@ -104,7 +104,7 @@ def on_one_machine(comm: "MPI.Comm") -> bool:
 
 
 def on_root(comm: "MPI.Comm", function: Callable[[], T]) -> T:
-    """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
+    """Return the value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
     # A rank alone keeps the value as it is: a copy of a case, as messages make, would be resolved again.
     if comm.size == 1:
         return _value_or_raise(_attempt(function))
@@ -116,7 +116,7 @@ def on_root(comm: "MPI.Comm", function: Callable[[], T]) -> T:
 
 
 def on_every_rank(comm: "MPI.Comm", function: Callable[[], T]) -> T:
-    """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
+    """Return value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
     attempt = _attempt(function)
     if comm.size == 1:
         return _value_or_raise(attempt)
@@ -131,7 +131,7 @@ def on_every_rank(comm: "MPI.Comm", function: Callable[[], T]) -> T:
 
 
 def divided(comm: "MPI.Comm", jobs: Sequence[Callable[[], T]]) -> list[T]:
-    """The values of all ``jobs``, of which each rank computes every ``comm.size``-th, on all ranks.
+    """Return the values of all ``jobs``, of which each rank computes every ``comm.size``-th, on all ranks.
 
     What the first job that fails raises is raised on all. All ranks must call it with the same number of jobs.
     """
@@ -144,7 +144,7 @@ def divided(comm: "MPI.Comm", jobs: Sequence[Callable[[], T]]) -> list[T]:
 
 
 def smallest(comm: "MPI.Comm", *numbers: float) -> list[float]:
-    """The smallest value that each of the ``numbers`` has on any rank, in one reduction; all ranks must call it."""
+    """Return smallest value that each of the ``numbers`` has on any rank, in one reduction; all ranks must call it."""
     if comm.size == 1:
         return [*numbers]
     from mpi4py import MPI
@@ -173,7 +173,7 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
 
 
 def _sendable(attempt: _Attempt) -> _Attempt:
-    """An ``attempt`` whose error other ranks can raise: where it cannot be copied, a RuntimeError with its text.
+    """Return an ``attempt`` whose error other ranks can raise: where it cannot be copied, a RuntimeError with its text.
 
     An exception whose constructor takes other arguments than it passes on cannot be made again from these.
     """
@@ -190,7 +190,7 @@ def _sendable(attempt: _Attempt) -> _Attempt:
 
 
 def _value_or_raise(attempt: _Attempt) -> Any:
-    """The value of an ``attempt`` that all ranks have; raises its error on all of them."""
+    """Return the value of an ``attempt`` that all ranks have; raises its error on all of them."""
     if attempt.error is not None:
         attempt.error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it too, and reports it for all
         raise attempt.error
@@ -209,7 +209,7 @@ class SharedCounter:
         comm.Barrier()
 
     def draw(self, step: int = 1) -> int:
-        """The count before ``step`` is added to it."""
+        """Return the count before ``step`` is added to it."""
         from mpi4py import MPI
 
         value = np.empty(1, np.int64)
@@ -226,7 +226,7 @@ class SharedCounter:
     @classmethod
     @contextmanager
     def within(cls, comm: "MPI.Comm") -> Iterator[Self]:
-        """A counter for a block that all ranks leave together; one that leaves alone by an error must not wait."""
+        """Yield a counter for a block that all ranks leave together; one that leaves by an error must not wait."""
         counter = cls(comm)
         try:
             yield counter

@@ -80,7 +80,7 @@ def only(names: Sequence[str]) -> Iterator[None]:
 
 
 def registered(kind: str) -> tuple[str, ...]:
-    """Names of the registered parts of a ``kind``: of the modules that the case at hand names, else of all."""
+    """Return names of the registered parts of a ``kind``: of the modules that the case at hand names, else of all."""
     named = _NAMED.get()
     if named is None:
         return tuple(PARTS[kind])
@@ -127,12 +127,12 @@ def number_of(part: RegisteredPart, value: Any, what: str = "value") -> float:
 
 
 def is_file(name: str) -> bool:
-    """Whether the ``name`` of a module is that of a file."""
+    """Return whether the ``name`` of a module is that of a file."""
     return name.endswith(".py")
 
 
 def located(name: str, folder: Path) -> str:
-    """The ``name`` of a module, which for a file is its absolute path; a relative one begins at ``folder``.
+    """Return the ``name`` of a module, which for a file is its absolute path; a relative one begins at ``folder``.
 
     If the file is not there, for instance since results have been moved, a file of that name in the working directory
     takes its place.
@@ -161,7 +161,7 @@ def load(name: str) -> Plugin:
 
 
 def _imported(name: str) -> Plugin:
-    """The module ``name``, imported."""
+    """Return the module ``name``, imported."""
     # Modules that register parts during this import belong to it: the module may import others.
     earlier = _every_module()
     entry: metadata.EntryPoint | None = None
@@ -191,7 +191,7 @@ def _imported(name: str) -> Plugin:
 
 
 def _from_file(path: Path) -> ModuleType:
-    """The module in a file, under a name of its own: files of one name in two folders are two modules."""
+    """Return the module in a file, under a name of its own: files of one name in two folders are two modules."""
     if not path.is_file():
         raise PluginError(f"there is no file {path}, which registers parts of this case")
     name = f"vipetsc_plugin_{sha256(str(path).encode()).hexdigest()[:8]}_{path.stem}"
@@ -208,7 +208,7 @@ def _from_file(path: Path) -> ModuleType:
 
 
 def _every_module() -> set[str]:
-    """The modules of Python that register parts."""
+    """Return the modules of Python that register parts."""
     return {module for parts in PARTS.values() for part in parts.values() for module in part.modules}
 
 
@@ -222,7 +222,7 @@ def _forget(modules: set[str]) -> None:
 
 
 def _reason(error: BaseException, file: str) -> str:
-    """An ``error`` in one line, with the last line of ``file``, else of any file outside this package, before it."""
+    """Return an ``error`` in one line, after the last line of ``file``, else of any file outside this package."""
     text = f"{type(error).__name__}: {error}".rstrip(": ").replace("\n", " ")
     ours = str(Path(__file__).parent)
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(ours)]
@@ -234,7 +234,7 @@ def _reason(error: BaseException, file: str) -> str:
 
 
 def _version(module: ModuleType, entry: metadata.EntryPoint | None) -> str:
-    """The version that a module states, else that of its distribution; empty without one."""
+    """Return the version that a module states, else that of its distribution; empty without one."""
     stated = getattr(module, "__version__", "")
     if stated:
         return str(stated)

@@ -14,7 +14,7 @@ RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
 
 
 def launched_rank() -> int | None:
-    """The rank of this process in its job; None if it was not launched as one of several."""
+    """Return the rank of this process in its job; None if it was not launched as one of several."""
     for name in RANKS:
         rank = os.environ.get(name, "")
         if rank.isdigit():
@@ -40,7 +40,7 @@ def end_now(number: int, frame: FrameType | None) -> None:
 
 
 def has_log() -> bool:
-    """Whether a log takes the lines of this process, as that of the command line does."""
+    """Return whether a log takes the lines of this process, as that of the command line does."""
     return logger.isEnabledFor(logging.INFO) and logger.hasHandlers()
 
 

@@ -79,7 +79,7 @@ class Progress:
             say(f"{self._position()} in {time.monotonic() - self._start:.1f} s")
 
     def _position(self) -> str:
-        """How much of the total is done."""
+        """Return how much of the total is done."""
         percent = 100.0
         if self._total:
             percent = 100 * self._done / self._total
@@ -87,5 +87,5 @@ class Progress:
 
 
 def in_notebook() -> bool:
-    """Whether this process is the kernel of a notebook, whose stderr is no terminal."""
+    """Return whether this process is the kernel of a notebook, whose stderr is no terminal."""
     return "ipykernel" in sys.modules

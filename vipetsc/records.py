@@ -49,7 +49,7 @@ class RecordType(types.Type):
         super().__init__(name=f"{title}-{digest[:16]}")
 
     def field(self, name: str) -> Field | None:
-        """The field with a ``name``, None if there is none."""
+        """Return the field with a ``name``, None if there is none."""
         return next((field for field in self.fields if field.name == name), None)
 
 
@@ -91,7 +91,7 @@ class PartRecords(Record):
 
 
 def record_type(values: Any) -> RecordType:
-    """The type of the record of a named tuple, and of all others with fields of the same types."""
+    """Return the type of the record of a named tuple, and of all others with fields of the same types."""
     fields = []
     length = 0
     for name, value in zip(values._fields, values, strict=True):
@@ -118,12 +118,12 @@ _record_type = cache(RecordType)
 
 @cache
 def _array_type(dtype: np.dtype, dimensions: int) -> Any:
-    """The type of an array of so many ``dimensions`` in a record."""
+    """Return the type of an array of so many ``dimensions`` in a record."""
     return types.Array(numba.from_dtype(dtype), dimensions, "C")
 
 
 def _number_type(value: Any) -> Any:
-    """The type of a number or truth value in a record."""
+    """Return the type of a number or truth value in a record."""
     if isinstance(value, bool | np.bool_):
         return types.boolean
     if isinstance(value, float):
@@ -179,7 +179,7 @@ def _unbox(kind: RecordType, record: Any, c: Any) -> NativeValue:
 
 @intrinsic
 def record_at(typing_context: Any, address: Any, kind: Any) -> Any:
-    """The record of a ``kind`` at an int64 ``address``."""
+    """Return the record of a ``kind`` at an int64 ``address``."""
     result = kind.instance_type
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -189,7 +189,7 @@ def record_at(typing_context: Any, address: Any, kind: Any) -> Any:
 
 
 def _word(context: Any, builder: Any, record: Any, place: Any, kind: Any) -> Any:
-    """The word of a ``record`` at a ``place``, as a value of a ``kind``."""
+    """Return the word of a ``record`` at a ``place``, as a value of a ``kind``."""
     pointer = builder.bitcast(record, context.get_value_type(types.CPointer(kind)))
     word = builder.load(builder.gep(pointer, [context.get_constant(types.int64, place)], inbounds=True))
     # Nothing writes to a record: the optimiser may read a field before a loop instead of in it.
@@ -199,7 +199,7 @@ def _word(context: Any, builder: Any, record: Any, place: Any, kind: Any) -> Any
 
 @intrinsic(prefer_literal=True)
 def _nested(typing_context: Any, record: Any, name: Any) -> Any:
-    """The record in the field ``name`` of another one."""
+    """Return the record in the field ``name`` of another one."""
     field = record.field(name.literal_value)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -211,7 +211,7 @@ def _nested(typing_context: Any, record: Any, name: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _number(typing_context: Any, record: Any, name: Any) -> Any:
-    """The number in the field ``name`` of a record."""
+    """Return the number in the field ``name`` of a record."""
     field = record.field(name.literal_value)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -225,7 +225,7 @@ def _number(typing_context: Any, record: Any, name: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _address(typing_context: Any, record: Any, name: Any) -> Any:
-    """The address of the array in the field ``name`` of a record, for ``numba.carray``."""
+    """Return the address of the array in the field ``name`` of a record, for ``numba.carray``."""
     field = record.field(name.literal_value)
     kind = types.CPointer(field.kind.dtype)
 
@@ -238,7 +238,7 @@ def _address(typing_context: Any, record: Any, name: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _shape(typing_context: Any, record: Any, name: Any) -> Any:
-    """The shape of the array in the field ``name`` of a record."""
+    """Return the shape of the array in the field ``name`` of a record."""
     field = record.field(name.literal_value)
     kind = types.UniTuple(types.int64, field.kind.ndim)
 
@@ -268,7 +268,7 @@ def _declare(name: str) -> None:
 
 @intrinsic
 def _part(typing_context: Any, parts: Any, c: Any) -> Any:
-    """Record ``c`` of those that lie one after another."""
+    """Return record ``c`` of those that lie one after another."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         size = context.get_constant(types.int64, WORD * parts.length)

@@ -282,7 +282,7 @@ def reserve(kind: str, names: Iterable[str]) -> None:
 
 
 def file_digest(file: str) -> str:
-    """SHA-256 of a source ``file``; empty without one, as for code that is typed in."""
+    """Return SHA-256 of a source ``file``; empty without one, as for code that is typed in."""
     path = Path(file)
     if not path.is_file():
         return ""
@@ -290,7 +290,7 @@ def file_digest(file: str) -> str:
 
 
 def _origin(name: str, function: Callable[..., Any]) -> dict[str, Any]:
-    """The fields of the part ``name`` that say where its ``function`` comes from; raises ValueError if it is none."""
+    """Return the fields of the part ``name`` on the source of its ``function``; raises ValueError if it is none."""
     plain = _plain(function)
     file = str(plain.__code__.co_filename)
     # Code that is typed in has no file: the hash is that of the function's own text.
@@ -299,7 +299,7 @@ def _origin(name: str, function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _text_of(function: FunctionType) -> bytes:
-    """The text of a ``function``, or its compiled code where Python keeps no text: at its prompt, and with ``-c``."""
+    """Return the text of a ``function``, or its code where Python keeps no text: at its prompt, and with ``-c``."""
     try:
         return inspect.getsource(function).encode()
     except OSError:
@@ -308,7 +308,7 @@ def _text_of(function: FunctionType) -> bytes:
 
 
 def _plain(function: Callable[..., Any]) -> FunctionType:
-    """The function in Python that numba compiles or a decorator wraps; raises ValueError for what is no function."""
+    """Return function in Python that numba compiles or a decorator wraps; raises ValueError for what is no function."""
     plain = inspect.unwrap(getattr(function, "py_func", function))
     if not isinstance(plain, FunctionType):
         raise ValueError(f"{function!r} is no function written in Python")

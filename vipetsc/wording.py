@@ -11,7 +11,7 @@ EXACT = 17  # digits in which any two doubles differ
 
 
 def shortened(items: Sequence[object]) -> str:
-    """The first of ``items`` between commas, and how many there are if these are not all; "" of an empty list."""
+    """Return first of ``items`` between commas, and how many there are if these are not all; "" of an empty list."""
     shown = ", ".join(map(str, items[:MOST_SHOWN]))
     if len(items) > MOST_SHOWN:
         shown += f", ... ({len(items)})"
@@ -19,20 +19,20 @@ def shortened(items: Sequence[object]) -> str:
 
 
 def system_number(error: Exception) -> int:
-    """The number of the system's error that an ``error`` of Python or HDF5 reports; 0 without one."""
+    """Return the number of the system's error that an ``error`` of Python or HDF5 reports; 0 without one."""
     # HDF5 gives the number in its message alone.
     in_text = re.search(r"errno = (\d+)", str(error))
     return getattr(error, "errno", None) or int(in_text[1] if in_text else 0)
 
 
 def system_reason(error: Exception) -> str:
-    """The system's reason for an ``error`` of Python or HDF5; else the text of the error."""
+    """Return the system's reason for an ``error`` of Python or HDF5; else the text of the error."""
     number = system_number(error)
     return os.strerror(number) if number else str(error)
 
 
 def of_system(error: OSError) -> str:
-    """The message of an ``error``; where it is the system's own, the file, the system's reason, and the remedy."""
+    """Return message of an ``error``; where it is the system's own, the file, the system's reason, and the remedy."""
     # The package's own messages name the file, and may have the number of the system's error.
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return error.strerror or str(error)
@@ -76,7 +76,7 @@ def key_words(path: str) -> str:
 
 
 def with_unit(name: str, unit: str) -> str:
-    """A ``name`` with its ``unit`` in brackets, as "time (s)"; without one where the unit is "1" or empty."""
+    """Return a ``name`` with its ``unit`` in brackets, as "time (s)"; without one where the unit is "1" or empty."""
     if unit in ("", "1"):
         return name
     return f"{name} ({unit})"

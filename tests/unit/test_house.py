@@ -117,6 +117,19 @@ def test_the_way_of_a_run_leads_through_files_and_functions_that_are_there():
         assert re.search(rf"(def|class) {last}\b", (ROOT / path).read_text(encoding="utf-8")), name
 
 
+def test_docstrings_of_functions_begin_with_a_verb():
+    """What a function does is said in the imperative: "Return the pass bands", not "The pass bands"."""
+    nouns = {"The", "A", "An", "Whether", "Problems", "Problem", "Numbers", "Names", "Values", "How", "Why", "What"}
+    wrong = []
+    for file, node in nodes():
+        if not isinstance(node, ast.FunctionDef) or any("property" in ast.unparse(d) for d in node.decorator_list):
+            continue
+        first = (ast.get_docstring(node) or "Return").split()[0]
+        if node.returns is not None and ast.unparse(node.returns) != "None" and first in nouns:
+            wrong.append((file, node.name))
+    assert wrong == []
+
+
 def test_no_two_classes_have_one_name():
     """A name means one thing in the whole package; a private class may repeat one."""
     places = defaultdict(list)

@@ -22,7 +22,7 @@ LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
 def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) -> list[Source]:
-    """The ``drives`` of a lattice as sources of waves; a wall attached to several springs is a single source."""
+    """Return the ``drives`` of a lattice as sources of waves; a wall attached to several springs is a single source."""
     loads: dict[tuple[Waveform, int], np.ndarray] = {}
     for drive in with_unit_amplitude(drives):
         # The waves of springs at one wall interfere, so that their energies do not add: they are one source.
@@ -38,7 +38,7 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
 
 
 def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
-    """The ``drives``, where a burst that is the only one has the amplitude 1.
+    """Return the ``drives``, where a burst that is the only one has the amplitude 1.
 
     Fractions of its energy do not depend on its amplitude, so that ``_first_end`` designs one end for all amplitudes.
     """
@@ -53,7 +53,7 @@ def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
 
 
 def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[EndSection]:
-    """The absorbing sections, of ``cells`` cells each, with dashpots of a ``strength`` in 1/s."""
+    """Return the absorbing sections, of ``cells`` cells each, with dashpots of a ``strength`` in 1/s."""
     sections = []
     if table.end != "right":
         sections.append(absorbing_section(cell, ends, cells, strength, "left"))
@@ -63,12 +63,12 @@ def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, s
 
 
 def reflected_at(omega: float, sections: Sequence[EndSection]) -> float:
-    """Largest fraction of a wave's energy at ``omega`` (rad/s) that any of the ``sections`` reflects; NaN in a gap."""
+    """Return the largest share of a wave's energy at ``omega`` (rad/s) that a section reflects; NaN in a gap."""
     return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
 
 
 def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> float:
-    """Fraction of the energy from ``sources`` that the ``sections`` reflect; each endless sine counts at its frequency.
+    """Return the share of the energy from ``sources`` that ``sections`` reflect, each sine at its frequency.
 
     NaN if nothing arrives.
     """
@@ -88,7 +88,7 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
 def designed_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: Sequence[Drive], cells: int
 ) -> AbsorbingTable:
-    """``table`` with the length and the strength that it does not give, for a lattice of ``cells`` cells.
+    """Return ``table`` with the length and the strength that it does not give, for a lattice of ``cells`` cells.
 
     A length is at most a third of the lattice. Raises ValueError if no end that is tried reflects, of the waves of all
     ``drives``, at most ``table.reflection``.
@@ -117,7 +117,7 @@ def designed_end(
 
 
 def lengths_tried(table: AbsorbingTable, cells: int) -> list[int]:
-    """The lengths in cells that ends by ``table`` are tried with, in a lattice of ``cells``; [] if it is too short."""
+    """Return the lengths in cells of the ends that ``table`` tries, in ``cells`` cells; [] if these are too few."""
     if table.cells:
         return [table.cells]
     # Two such ends leave a third of the lattice between them, or more.
@@ -141,7 +141,7 @@ class TriedEnd(NamedTuple):
 def _first_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int, speed: float
 ) -> TriedEnd:
-    """The first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
+    """Return the first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
     sources = sources_of(drives, cell, ends, cells)
     # Ends are tried from the shortest on, which costs fewest cells, and those of one length from the weakest on, whose
     # gradient reflects least.

@@ -9,7 +9,7 @@ Changes = dict[str, dict[str, Any]]
 
 
 def amplitude_of(case: Case) -> float:
-    """The amplitude of the first drive of a resolved ``case``, or of its motion at t = 0 if nothing is driven.
+    """Return the amplitude of the first drive of a resolved ``case``, or of its motion at t = 0 if nothing is driven.
 
     The amplitude of a mode, of a packet or of a state from a file is its largest displacement in m; that of masses that
     are struck is the speed in m/s of the one that is listed first.
@@ -25,7 +25,7 @@ def amplitude_of(case: Case) -> float:
 
 
 def amplitude_unit(case: Case) -> str:
-    """The unit of ``amplitude_of``."""
+    """Return the unit of ``amplitude_of``."""
     initial = case.initial
     if case.drive.amplitude or initial is None:
         return drive_unit(case.drive)
@@ -35,19 +35,19 @@ def amplitude_unit(case: Case) -> str:
 
 
 def drive_unit(drive: DriveTable) -> str:
-    """The unit of the amplitude of a resolved ``drive``: that of its waveform, or m where it moves a wall."""
+    """Return the unit of the amplitude of a resolved ``drive``: that of its waveform, or m where it moves a wall."""
     if drive.end:
         return "m"
     return drive.record.unit
 
 
 def has_free_amplitude(case: Case) -> bool:
-    """Whether ``amplitude_changes`` can change the amplitude of the case; that of a state from a file is fixed."""
+    """Return whether ``amplitude_changes`` can change the amplitude of the case, which that of a file cannot."""
     return bool(case.drive.amplitude) or case.initial is None or case.initial.kind != "file"
 
 
 def amplitude_changes(case: Case, amplitude: float) -> Changes:
-    """The changes, as ``Case.varied`` takes them, that give a resolved ``case`` another ``amplitude``.
+    """Return the changes, as ``Case.varied`` takes them, that give a resolved ``case`` another ``amplitude``.
 
     Further drives stay as they are; masses that are struck keep the ratios of their velocities. A state from a file has
     a fixed amplitude, and no changes.

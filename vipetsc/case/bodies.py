@@ -8,13 +8,13 @@ from vipetsc.lattice.cell import GROUND, connected_groups
 
 
 def contact_ends(chain: Chain) -> list[tuple[int, int]]:
-    """Numbers of the host and of the resonator of each site: 0 for the ground, masses from 1 on, cell by cell."""
+    """Return the numbers of host and resonator of each site: 0 for the ground, masses from 1 on, cell by cell."""
     # The ground is the number -1 of a contact's ends.
     return [(1 + host, 1 + resonator) for host, resonator in contacts(chain).mass_pairs()]
 
 
 def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
-    """The body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
+    """Return the body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
 
     Springs, which are all within cells or to the ground, join the masses of a body, and so do contacts that are pressed
     at rest. ``gaps`` are the clearances in m of the sites on both sides.

@@ -68,14 +68,14 @@ class Case(CaseFile):
     @classmethod
     @cache
     def sections(cls) -> dict[str, type[Section]]:
-        """Class of each section that the verb reads, in the order of the manual."""
+        """Return the class of each section that the verb reads, in the order of the manual."""
         # No field of a case has this section: a resolved case has the values that were drawn.
         classes = super().sections() | {"disorder": DisorderTable}
         return {name: classes.pop(name) for name in ORDER} | classes
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections, and all problems with them."""
+        """Return the resolved sections, and all problems with them."""
         table, unread = with_samples(with_preset(table))
         sections, problems = super().read(table)
         if unread:
@@ -104,7 +104,7 @@ class Case(CaseFile):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """Problems between keys."""
+        """Yield problems between keys."""
         lattice = sections["lattice"]
         contacts = sections["contacts"]
         drive = sections["drive"]
@@ -144,7 +144,7 @@ class Case(CaseFile):
         yield from _check_sampling(time, cell, valid)
 
     def model(self) -> Model:
-        """The case in the terms of ``vipetsc.lattice``, built once, since a case does not change."""
+        """Return the case in the terms of ``vipetsc.lattice``, built once, since a case does not change."""
         return self._model
 
     @cached_property
@@ -183,7 +183,7 @@ class Case(CaseFile):
         return self.drive.frequency
 
     def _scale(self, chain: Chain, drives: tuple[Drive, ...]) -> float:
-        """Displacement in m of the linear waves of all ``drives`` together, or of the motion at t = 0 if that is more.
+        """Return displacement in m of the linear waves of all ``drives``, or of the motion at t = 0 if that is more.
 
         The sum is a bound, since waves of different drives may cancel.
         """
@@ -198,7 +198,7 @@ class Case(CaseFile):
         return scale
 
     def _tolerances(self, scale: float, frequency: float) -> tuple[float, float]:
-        """Absolute tolerances in m and m/s where waves have the ``scale`` in m and the ``frequency`` in rad/s."""
+        """Return the tolerances in m and m/s where waves have the ``scale`` in m and the ``frequency`` in rad/s."""
         time = self.time
         drive = self.drive
         if time.atol == "scaled":
@@ -219,7 +219,7 @@ class Case(CaseFile):
         overrides: Iterable[str] = (),
         **changes: Mapping[str, Any],
     ) -> "Case":
-        """The lattice run of ``varied_table``, checked and resolved like any other; raises CaseError.
+        """Return the lattice run of ``varied_table``, checked and resolved like any other; raises CaseError.
 
         ``overrides`` are as those of ``load``.
         """
@@ -228,7 +228,7 @@ class Case(CaseFile):
     def varied_table(
         self, *, name: str | None = None, without: Iterable[str] = (), **changes: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """The table of a lattice run like this case with some values changed; the section of another verb is dropped.
+        """Return the table of a run like this case with some values changed; the section of another verb is dropped.
 
         ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None removes a key. Sections
         named in ``without`` begin with their defaults instead of the values of this case.
@@ -254,7 +254,7 @@ class Case(CaseFile):
         return self.contacts.radius
 
     def runs(self) -> list[CaseFile]:
-        """The case itself; verbs that simulate several runs vary it."""
+        """Return the case itself; verbs that simulate several runs vary it."""
         return [self]
 
     @property
@@ -270,12 +270,12 @@ class Case(CaseFile):
         return self.output.figures
 
     def _repr_html_(self) -> str:
-        """The case as a notebook shows it: its numbers, and its cell drawn."""
+        """Return the case as a notebook shows it: its numbers, and its cell drawn."""
         drives = [drive.describe() for _, drive in self.drive.every if drive.amplitude]
         return case_html(self.name, self.model(), self.lattice.ends, drives)
 
     def warnings(self) -> list[str]:
-        """Warnings of settings that are allowed but probably unintended."""
+        """Return warnings of settings that are allowed but probably unintended."""
         return [
             *unit_warnings(self.drive, self.model().chain),
             *loss_warnings(self.lattice),
@@ -284,7 +284,7 @@ class Case(CaseFile):
 
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:
-    """Motion at t = 0 (None for a lattice at rest), and the problems with it."""
+    """Return the motion at t = 0 (None for a lattice at rest), and the problems with it."""
     initial = sections.get("initial")
     drive = sections["drive"]
     if initial is None or not initial.moves:
@@ -296,14 +296,14 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
         frequency, _ = driven_wave(lattice.unit_cell(), drive)
 
     def touching(speed: float) -> float:
-        """The frequency in rad/s of contacts at a ``speed`` in m/s; without sites, half a period is the whole run."""
+        """Return the frequency in rad/s of contacts at a ``speed`` in m/s; without sites, half a period is the run."""
         return contact_frequency(lattice, sections["contacts"], speed) or np.pi / sections["time"].end
 
     return beginning_of(initial, lattice, frequency, touching)
 
 
 def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
-    """Problems that show only in the ``resolved`` sections: of the absorbing end and of the samples."""
+    """Return problems that show only in the ``resolved`` sections: of the absorbing end and of the samples."""
     # Checked a second time: the absorbing end and the wall of a drive have their cells only now.
     driven = [drive.cell for _, drive in resolved["drive"].every if drive.amplitude != 0]
     initial = resolved.get("initial")
@@ -330,7 +330,7 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
 
 
 def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) -> Iterator[Problem]:
-    """The problem of a lossy site that touches its stop and is at rest in the state of a file."""
+    """Yield the problem of a lossy site that touches its stop and is at rest in the state of a file."""
     if beginning is None or beginning.moving is None:
         return
     lattice = sections["lattice"]
@@ -341,7 +341,7 @@ def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) ->
 
 
 def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-    """Problems of a lattice that nothing drives: no motion at t = 0, or a tolerance that refers to the drive.
+    """Yield problems of a lattice that nothing drives: no motion at t = 0, or a tolerance that refers to the drive.
 
     With a drive and a motion at t = 0, the problem of a second frequency.
     """
@@ -365,7 +365,7 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
 
 
 def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
-    """Problems with a window or points outside a lattice of ``cells`` cells like ``cell``; None: those are invalid."""
+    """Yield problems with a window or points outside ``cells`` cells like ``cell``; None: those are invalid."""
     window = output.window
     if window is not None and cells is not None and not 1 <= window[0] <= window[1] <= cells:
         yield Problem("output.window", window, f"must be [first, last] within cells 1 to {cells}")
@@ -375,7 +375,7 @@ def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None,
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
-    """Problems with an interval of samples that does not resolve the bands of ``cell``, or exceeds the run."""
+    """Yield problems with an interval of samples that does not resolve the bands of ``cell``, or exceeds the run."""
     interval = time.sample_interval
     per_period = time.samples_per_period
     if per_period is not None and (interval != "auto" or time.samples is not None):
@@ -391,7 +391,7 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 
 
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
-    """The problem of samples at an ``interval`` in s that is not below the top band's Nyquist interval.
+    """Return the problem of samples at an ``interval`` in s that is not below the top band's Nyquist interval.
 
     For cells that contacts alone join it is that of a cell's highest mode. ``key`` is the key by which the case asks
     for samples, and ``value`` its value.
@@ -409,6 +409,6 @@ def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[P
 
 
 def case_id(case: Case) -> str:
-    """The first 16 digits of the SHA-256 of the resolved case."""
+    """Return the first 16 digits of the SHA-256 of the resolved case."""
     # 64 bits: among a million cases two have one id with a probability of 3e-8.
     return hashlib.sha256(case.to_toml().encode()).hexdigest()[:16]

@@ -80,13 +80,13 @@ class CaseFile(Section):
 
     @classmethod
     def keywords(cls) -> Iterable[str]:
-        """The names of the sections that a case of this verb is built of."""
+        """Return the names of the sections that a case of this verb is built of."""
         return cls.sections()
 
     @classmethod
     @cache  # reading a case asks for the sections of all verbs
     def sections(cls) -> dict[str, type[Section]]:
-        """The class of each section that the verb reads, by the section's name."""
+        """Return the class of each section that the verb reads, by the section's name."""
         classes: dict[str, type[Section]] = {}
         for key, field in cls.model_fields.items():
             # Studies have the section of their own in the field ``options``.
@@ -136,12 +136,12 @@ class CaseFile(Section):
 
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
-        """The resolved case of a parsed table; raises CaseError with all problems."""
+        """Return the resolved case of a parsed table; raises CaseError with all problems."""
         return cls.resolved(cls.fields_of(table, overrides, source))
 
     @classmethod
     def resolved(cls, fields: Mapping[str, Any]) -> Self:
-        """The case with these ``fields``, which are resolved already."""
+        """Return the case with these ``fields``, which are resolved already."""
         case = cls.__new__(cls)
         Section.__init__(case, **fields)
         return case
@@ -193,7 +193,7 @@ class CaseFile(Section):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields other than ``name``, and all problems with the sections they come from."""
+        """Return the fields other than ``name``, and all problems with the sections they come from."""
         fields: dict[str, Any] = {}
         problems: list[Problem] = []
         for key, field in cls.model_fields.items():
@@ -212,7 +212,7 @@ class CaseFile(Section):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
-        """Problems between keys; keys that are not ``valid`` are reported already, and hold their defaults."""
+        """Return problems between keys; keys that are not ``valid`` are reported already, and hold their defaults."""
         return ()
 
     def import_plugins(self) -> None:
@@ -224,11 +224,11 @@ class CaseFile(Section):
             raise CaseError(problems, self.name)
 
     def warnings(self) -> list[str]:
-        """Warnings of settings that are allowed but probably unintended."""
+        """Return warnings of settings that are allowed but probably unintended."""
         return []
 
     def runs(self) -> list["CaseFile"]:
-        """The cases of runs that the verb simulates, as far as they are fixed before it begins."""
+        """Return the cases of runs that the verb simulates, as far as they are fixed before it begins."""
         return []
 
     @property
@@ -254,19 +254,19 @@ class CaseFile(Section):
         return super().__getstate__() | {"__dict__": fields}
 
     def to_toml(self) -> str:
-        """The resolved case as TOML; reading it back gives the same case."""
+        """Return the resolved case as TOML; reading it back gives the same case."""
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
 
 
 # Each measure and picture of a run asks for its case.
 @lru_cache(maxsize=4)
 def _kept_case(kind: type[CaseFile], text: str) -> CaseFile:
-    """The resolved case of a ``kind`` in a ``text`` of TOML."""
+    """Return the resolved case of a ``kind`` in a ``text`` of TOML."""
     return kind.from_toml(text)
 
 
 def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
-    """The names of the sections that some verb's case reads, ``kind`` and its subclasses among them."""
+    """Yield the names of the sections that some verb's case reads, ``kind`` and its subclasses among them."""
     yield from kind.sections()
     # ``__subclasses__`` lists direct subclasses only; the case of ``predict`` derives from that of ``law``.
     for subclass in kind.__subclasses__():
@@ -274,7 +274,7 @@ def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
 
 
 def _check_name(name: Any) -> Iterator[Problem]:
-    """Problems with the name of a case, which names its output folder."""
+    """Yield problems with the name of a case, which names its output folder."""
     if not isinstance(name, str) or not name:
         yield Problem("name", name, "must be a non-empty string")
     elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):

@@ -88,7 +88,7 @@ def with_matrices(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]
 
 
 def _read(files: list[Path]) -> dict[str, np.ndarray]:
-    """The matrices in one NPZ file by their names, or M, K and perhaps C in MatrixMarket files of one each."""
+    """Return the matrices in one NPZ file by their names, or M, K and perhaps C in MatrixMarket files of one each."""
     if len(files) == 1:
         # Arrays outside an archive have no names, and text is no archive: NumPy says so.
         archive = np.load(files[0], allow_pickle=False)
@@ -128,7 +128,7 @@ def _array(archive: Mapping[str, Any], name: str) -> np.ndarray:
 
 
 def _symmetric(name: str, matrix: np.ndarray) -> np.ndarray:
-    """The symmetric part of a ``matrix``; raises MatrixError where it is not all of it."""
+    """Return the symmetric part of a ``matrix``; raises MatrixError where it is not all of it."""
     differs = np.argwhere(np.abs(matrix - matrix.T) > SYMMETRIC * _sizes(matrix))
     if len(differs):
         i, j = differs[0]
@@ -138,7 +138,7 @@ def _symmetric(name: str, matrix: np.ndarray) -> np.ndarray:
 
 
 def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any]:
-    """The keys ``masses``, ``springs`` and ``grounding`` of the cell of these ``matrices``."""
+    """Return the keys ``masses``, ``springs`` and ``grounding`` of the cell of these ``matrices``."""
     size = len(matrices["M"])
     left, right = _boundaries(boundary, size)
     if right and {"K_next", "C_next"} & matrices.keys():
@@ -182,7 +182,7 @@ def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any
 
 
 def _boundaries(boundary: Any, size: int) -> tuple[list[int], list[int]]:
-    """The rows (from 0) of matrices of that ``size`` on the left and on the right boundary; [] where none are given."""
+    """Return rows (from 0) of matrices of that ``size`` on the left and the right boundary; [] if none are given."""
     if boundary is None:
         return [], []
     remedy = f"lattice.cell.boundary = {boundary}: give two lists of as many rows from 1 to {size}, each row once"
@@ -198,7 +198,7 @@ def _boundaries(boundary: Any, size: int) -> tuple[list[int], list[int]]:
 
 
 def _assembled(matrix: np.ndarray, to_next: np.ndarray, left: list[int], right: list[int]) -> _Assembled:
-    """A ``matrix`` whose rows ``right`` are the rows ``left`` of the next cell, or the cell's own and ``to_next``."""
+    """Return a ``matrix`` whose rows ``right`` are rows ``left`` of the next cell, or the cell's and ``to_next``."""
     if not right:
         return _Assembled(matrix, to_next)
     inner = [row for row in range(len(matrix)) if row not in right]
@@ -211,7 +211,7 @@ def _assembled(matrix: np.ndarray, to_next: np.ndarray, left: list[int], right: 
 
 
 def _masses(mass: _Assembled) -> list[float]:
-    """The diagonal of the ``mass`` matrix; raises MatrixError if it has other entries, or none there."""
+    """Return the diagonal of the ``mass`` matrix; raises MatrixError if it has other entries, or none there."""
     masses = np.diag(mass.inside)
     if masses.min() <= 0:
         at = int(masses.argmin()) + 1
@@ -228,12 +228,12 @@ def _masses(mass: _Assembled) -> list[float]:
 
 
 def _significant(values: np.ndarray, matrix: _Assembled) -> np.ndarray:
-    """Whether each of the ``values`` (dof, dof) of a ``matrix`` is more than rounding beside its diagonal."""
+    """Return whether each of the ``values`` (dof, dof) of a ``matrix`` is more than rounding beside its diagonal."""
     return np.asarray(np.abs(values) > ROUNDING * _sizes(matrix.inside))
 
 
 def _sizes(matrix: np.ndarray) -> np.ndarray:
-    """What the entries (dof, dof) of a semidefinite ``matrix`` are at most in magnitude, by its diagonal.
+    """Return what the entries (dof, dof) of a semidefinite ``matrix`` are at most in magnitude, by its diagonal.
 
     Translations and rotations have different units, so that one size for all would be wrong.
     """
@@ -242,7 +242,7 @@ def _sizes(matrix: np.ndarray) -> np.ndarray:
 
 
 def _to_ground(matrix: _Assembled) -> list[float]:
-    """The sums of the rows (dof,) of a ``matrix`` over all cells: what pulls when all moves alike; 0 for rounding."""
+    """Return the sums of the rows (dof,) of a ``matrix`` over all cells: what pulls when all moves alike."""
     blocks = np.concatenate([matrix.inside, matrix.next, matrix.next.T], axis=1)
     sums = blocks.sum(axis=1)
     is_rounding = np.abs(sums) <= ROUNDING * np.abs(blocks).sum(axis=1)

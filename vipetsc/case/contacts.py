@@ -25,31 +25,31 @@ Gaps = tuple[tuple[float, float], ...]  # clearances in m of each site on the si
 
 
 def lists_of(contacts: ContactsTable) -> dict[str, list[Any]]:
-    """The lists over sites, ``contacts.each``, by key."""
+    """Return the lists over sites, ``contacts.each``, by key."""
     if contacts.each is None:
         return {}
     return contacts.each.model_dump(exclude_none=True)
 
 
 def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
-    """The value of a ``key`` of ``[contacts]`` at each of ``count`` sites."""
+    """Return the value of a ``key`` of ``[contacts]`` at each of ``count`` sites."""
     return lists_of(contacts).get(key) or [getattr(contacts, key)] * count
 
 
 def is_rigid_of_sites(contacts: ContactsTable, count: int) -> list[bool]:
-    """Whether each of ``count`` sites has a stop that does not yield."""
+    """Return whether each of ``count`` sites has a stop that does not yield."""
     return [law == RIGID for law in values_of_sites(contacts, "law", count)]
 
 
 def is_all_rigid(contacts: ContactsTable) -> bool:
-    """Whether no site has a stop that yields."""
+    """Return whether no site has a stop that yields."""
     return set(values_of_sites(contacts, "law", 1)) == {RIGID}
 
 
 def check_per_site(
     contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool], valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the laws and the stops of sites with the clearances ``gaps`` in m, ``at_rest`` (site,) at t = 0."""
+    """Yield problems with the laws and stops of sites with clearances ``gaps`` in m, ``at_rest`` (site,) at t = 0."""
     count = len(gaps)
     per_site = lists_of(contacts)
     for key, values in per_site.items():
@@ -78,7 +78,7 @@ def check_per_site(
 
 
 def _check_rigid(contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """Problems with keys that mean nothing to rigid stops, where all sites have these, and with their precompression.
+    """Yield problems with keys that mean nothing to rigid stops, at all sites, and with precompression.
 
     A stiffness or a material may be that of other sites.
     """
@@ -100,7 +100,7 @@ def _check_rigid(contacts: ContactsTable, count: int) -> Iterator[Problem]:
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """Problems with parameters of unused laws, missing parameters, and an unbounded damping."""
+    """Yield problems with parameters of unused laws, missing parameters, and an unbounded damping."""
     # Without sites the values for all sites are checked, here and below: normal modes need no list of sites.
     laws = values_of_sites(contacts, "law", count) or [contacts.law]
     for key, parameter in PARAMETERS.items():
@@ -125,7 +125,7 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
 
 
 def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> Iterator[Problem]:
-    """Problems with the ``laws`` of sites that users' modules register: their parameters, and their formulas."""
+    """Yield problems with the ``laws`` of sites that users' modules register: their parameters, and their formulas."""
     given = values_of_sites(contacts, "parameters", max(count, 1))
     wrong = list(check_law_parameters(path_of(contacts, "parameters"), laws, given))
     yield from wrong
@@ -146,7 +146,7 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
 
 
 def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """The problem of a clearance on a side on which none of ``count`` sites has a stop."""
+    """Yield the problem of a clearance on a side on which none of ``count`` sites has a stop."""
     is_given = contacts.clearance_minus is not None or "clearance_minus" in lists_of(contacts)
     if is_given and count and set(values_of_sites(contacts, "side", count)) == {"plus"}:
         remedy = 'side = "plus" leaves no stop on the minus side; remove clearance_minus'
@@ -154,7 +154,7 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
 
 
 def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
-    """The problem of the first lossy site that touches its stop and is ``at_rest`` (site,) at t = 0.
+    """Yield the problem of the first lossy site that touches its stop and is ``at_rest`` (site,) at t = 0.
 
     ``gaps`` are the clearances in m.
     """
@@ -173,7 +173,7 @@ def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence
 
 
 def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem]:
-    """Problems with contacts that are closed at rest: a second stop, or an unbounded dissipation."""
+    """Yield problems with contacts that are closed at rest: a second stop, or an unbounded dissipation."""
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
     # Only the first problem is given, since similar sites all have the same.
@@ -193,14 +193,14 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
 
 
 def path_of(contacts: ContactsTable, key: str) -> str:
-    """Path of a key, in the lists over sites if it is given there."""
+    """Return the path of a key, in the lists over sites if it is given there."""
     if key in lists_of(contacts):
         return f"contacts.each.{key}"
     return f"contacts.{key}"
 
 
 def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | None:
-    """The lists over sites, with a stiffness in place of a material."""
+    """Return the lists over sites, with a stiffness in place of a material."""
     if contacts.each is None or not lists_of(contacts).keys() & {*MATERIAL}:
         return contacts.each
     # A key without a list has the same value at all sites.
@@ -210,7 +210,7 @@ def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | Non
 
 
 def with_stiffness(contacts: ContactsTable, count: int) -> ContactsTable:
-    """``contacts`` with stiffnesses in place of materials, for all sites and in the lists over ``count`` sites."""
+    """Return ``contacts`` with stiffnesses in place of materials, for all sites and in lists over ``count`` sites."""
     # The radius stays: claims and pictures compare indentations with it.
     update: dict[str, Any] = {"each": resolved_per_site(contacts, count)}
     modulus = contacts.modulus
@@ -222,7 +222,7 @@ def with_stiffness(contacts: ContactsTable, count: int) -> ContactsTable:
 
 
 def contact_of(contacts: ContactsTable) -> Contact:
-    """The law of all sites of a resolved case; the stiffness is 0 where none is given."""
+    """Return the law of all sites of a resolved case; the stiffness is 0 where none is given."""
     if contacts.law == RIGID:
         return Contact(RIGID, 0.0, restitution=contacts.restitution)
     return Contact(
@@ -237,7 +237,7 @@ def contact_of(contacts: ContactsTable) -> Contact:
 
 
 def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
-    """The values of the parameters that the elastic law of ``contacts`` takes."""
+    """Return the values of the parameters that the elastic law of ``contacts`` takes."""
     registered = registered_law(contacts.law)
     if registered:
         given = contacts.parameters or {}
@@ -246,7 +246,7 @@ def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
 
 
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
-    """The law of each site of a resolved case; () if all are equal."""
+    """Return the law of each site of a resolved case; () if all are equal."""
     per_site = lists_of(contacts)
     # Sides and pairs are no part of a law: the gaps and the pairs of the chain hold them.
     keys = [key for key in per_site if key not in SIDES + JOINS]
@@ -274,7 +274,7 @@ def describe_stops(gaps: Gaps) -> list[str]:
 
 
 def _describe_stop(side: str, gap: float) -> str:
-    """Description of the stop on one ``side``: its clearance in mm, touching, or precompressed."""
+    """Return the description of the stop on one ``side``: its clearance in mm, touching, or precompressed."""
     if gap > 0:
         return f"{1e3 * gap:.4g} mm on side {side}"
     if gap == 0:
@@ -283,7 +283,7 @@ def _describe_stop(side: str, gap: float) -> str:
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
-    """The masses (0-based) that each site joins; () if all join the cell's own pair, and no cell has two sites."""
+    """Return masses (0-based) that each site joins; () if all join the cell's own pair, and no cell has two sites."""
     pairs = []
     given = values_of_sites(contacts, "pair", count)
     next_cell = values_of_sites(contacts, "next_cell", count)
@@ -299,7 +299,7 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
 
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
-    """Problems with the pairs of masses that contacts join, in the ``cells`` (1-based) with sites."""
+    """Yield problems with the pairs of masses that contacts join, in the ``cells`` (1-based) with sites."""
     # Lists of another length are reported by ``check_per_site``.
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
         return
@@ -330,7 +330,7 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 
 def check_joined(lattice: LatticeTable, contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """The problem of cells of one's own, valid or not, that neither springs nor contacts, ``count`` sites, join."""
+    """Yield problem of cells of one's own, valid or not, that neither springs nor contacts, ``count`` sites, join."""
     # A single cell has no other one to be joined to.
     if lattice.cell is None or lattice.cells == 1 or not (lattice.cell.springs or count):
         return
@@ -342,7 +342,7 @@ def check_joined(lattice: LatticeTable, contacts: ContactsTable, count: int) -> 
 
 
 def _check_loose(cell: UnitCell, pairs: Sequence[Pair]) -> Iterator[Problem]:
-    """The problem of masses of a ``cell`` that neither springs nor the contacts of ``pairs`` hold in the lattice."""
+    """Yield problem of masses of a ``cell`` that neither springs nor the contacts of ``pairs`` hold in the lattice."""
     # Node 0 stands for the next cell and for the ground: a mass that is not joined to it is part of no lattice.
     joined = [(spring.start + 1, spring.end + 1) for spring in cell.springs]
     for pair in pairs:

@@ -23,7 +23,7 @@ class GridTable(Section):
     count: Annotated[int, Field(ge=2)] = described("number of values, evenly spaced", 37)
 
     def values(self) -> np.ndarray:
-        """The values (count,), rounded to remove errors in the last digits."""
+        """Return the values (count,), rounded to remove errors in the last digits."""
         return np.round(np.linspace(self.first, self.last, self.count), 12)
 
 
@@ -36,7 +36,7 @@ class EtaTable(GridTable):
     )
 
     def values(self) -> np.ndarray:
-        """The values (eta,) below 1, where the host has mass."""
+        """Return the values (eta,) below 1, where the host has mass."""
         eta = super().values()
         return eta[eta < 1]
 
@@ -67,7 +67,7 @@ class DesignCase(CaseFile):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The section, and all problems with it or with ``[lattice]`` in the same file."""
+        """Return the section, and all problems with it or with ``[lattice]`` in the same file."""
         fields, problems = super().read(table)
         lattice = table.get("lattice", {})
         if isinstance(lattice, dict) and ("cell" in lattice or lattice.get("preset", "four-band") != "four-band"):
@@ -82,7 +82,7 @@ class DesignCase(CaseFile):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """Problems between the keys of a valid section."""
+        """Yield problems between the keys of a valid section."""
         if not valid("design"):
             return
         design = sections["design"]

@@ -66,7 +66,7 @@ class DisorderTable(ScatteredQuantities):
     )
 
     def quantities(self) -> dict[str, Deviation]:
-        """Deviations of the scattered quantities except those of ``cells``, by name."""
+        """Return deviations of the scattered quantities except those of ``cells``, by name."""
         deviations = {}
         for name in type(self).model_fields:
             given = getattr(self, name)
@@ -150,7 +150,7 @@ def with_drawn(
     disorder: DisorderTable,
     given: ContactsTable,
 ) -> tuple[dict[str, Any], list[Problem]]:
-    """The ``resolved`` sections with the values that ``disorder`` draws, checked as ``read`` reads a case's table.
+    """Return ``resolved`` sections with the values that ``disorder`` draws, checked as ``read`` reads a case's table.
 
     ``given`` are the contacts before they were resolved.
     """
@@ -168,7 +168,7 @@ def with_drawn(
 def _draw(
     disorder: DisorderTable, values: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, list[float]], list[Problem]]:
-    """Numbers drawn of each quantity about its ``values``, and the problems with them."""
+    """Return numbers drawn of each quantity about its ``values``, and the problems with them."""
     drawn: dict[str, list[float]] = {}
     problems: list[Problem] = []
     quantities = disorder.quantities()

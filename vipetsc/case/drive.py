@@ -48,7 +48,7 @@ AnyDrive = TypeVar("AnyDrive", bound=OneDrive)
 def check_drives(
     drives: DriveTable, lattice: LatticeTable, cell: UnitCell | None, length: int | None, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the keys of each drive: those of its waveform, its frequency, and the place where it acts.
+    """Yield problems with the keys of each drive: those of its waveform, its frequency, and the place where it acts.
 
     ``cell`` and ``length``, the number of cells, are None for an invalid lattice.
     """
@@ -69,7 +69,7 @@ def check_drives(
 
 
 def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
-    """Problems with keys of other waveforms, keys that are missing, and a ramp that is too long."""
+    """Yield problems with keys of other waveforms, keys that are missing, and a ramp that is too long."""
     given = drive.model_dump(exclude_none=True, exclude_defaults=True)
     for key in sorted(drive.foreign & given.keys()):
         yield Problem(f"{path}.{key}", None, f"does not apply to the waveform {drive.kind!r}")
@@ -85,7 +85,7 @@ def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
 
 
 def _check_frequency(drive: OneDrive, path: str, cell: UnitCell | None) -> Iterator[Problem]:
-    """Problems with a wave that is given by several choices or by none, and with a band that the cell lacks."""
+    """Yield problems with a wave that is given by several choices or by none, and with a band that the cell lacks."""
     choices = drive.wave_choices
     needs_band = drive.wavenumber is not None or drive.at is not None
     if len(choices) > 1 or (not choices and drive.amplitude != 0 and drive.is_sine):
@@ -97,7 +97,7 @@ def _check_frequency(drive: OneDrive, path: str, cell: UnitCell | None) -> Itera
 
 
 def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterator[Problem]:
-    """Problems with samples: their number, times that do not grow, a wall that is not at rest first."""
+    """Yield problems with samples: their number, times that do not grow, a wall that is not at rest first."""
     times = np.array(samples.time)
     values = np.array(samples.value)
     if len(times) != len(values) or len(times) < 2:
@@ -117,7 +117,7 @@ def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterato
 def _check_place(
     drive: OneDrive, path: str, lattice: LatticeTable, cell: UnitCell | None, length: int | None
 ) -> Iterator[Problem]:
-    """Problems with a driven mass outside the lattice, and with a wall that is missing or not on a linear spring."""
+    """Yield problems with a driven mass outside the lattice, and with a wall that is missing or on no linear spring."""
     if drive.end is None:
         if length is not None and drive.cell > length:
             yield Problem(f"{path}.cell", drive.cell, f"outside the lattice; cells are numbered from 1 to {length}")
@@ -146,7 +146,7 @@ def _check_place(
 
 
 def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
-    """Pairs of a mass (0-based) of an ``end``'s cell that a spring ties to the wall, and the number of that spring."""
+    """Return pairs of a mass (0-based) of an ``end``'s cell that a spring ties to the wall, and that spring."""
     masses = []
     for number, spring in enumerate(cell.springs):
         if spring.offset:
@@ -157,13 +157,13 @@ def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
 
 
 def _place_at_wall(cell: UnitCell, end: str, cells: int) -> Table:
-    """The keys ``cell`` and ``mass`` (from 1) of the first mass on which the wall at an ``end`` of ``cells`` acts."""
+    """Return the keys ``cell`` and ``mass`` (from 1) of the first mass on which the wall at an ``end`` acts."""
     mass, _ = _end_masses(cell, end)[0]
     return {"cell": {"left": 1, "right": cells}[end], "mass": mass + 1}
 
 
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
-    """The frequency in rad/s of a valid ``drive``: as given, otherwise that of its samples or its half sine.
+    """Return the frequency in rad/s of a valid ``drive``: as given, otherwise that of its samples or its half sine.
 
     For half a sine that is shorter than the lattice can follow, it is the top band's edge, if the cell has bands.
     """
@@ -177,13 +177,13 @@ def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
 
 
 def driven_wave(cell: UnitCell, drive: OneDrive) -> tuple[float, float]:
-    """Frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` sends out."""
+    """Return the frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` sends out."""
     return _wave(cell, drive.frequency, drive.wavenumber, drive.band)
 
 
 @lru_cache
 def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, band: int | None) -> tuple[float, float]:
-    """The wave of ``driven_wave``, by its frequency in rad/s, its wavenumber in a band, or a band's fastest wave."""
+    """Return wave of ``driven_wave``, by its frequency in rad/s, its wavenumber in a band, or a band's fastest wave."""
     if wavenumber is not None and band is not None:
         point = bloch(cell, wavenumber)
         return float(point.frequency[band - 1]), float(abs(point.group_velocity[band - 1]))
@@ -192,12 +192,12 @@ def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, ban
 
 
 def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
-    """Speed in cells/s of the wave of a resolved ``drive``; without a sine, the speed of the fastest wave."""
+    """Return speed in cells/s of the wave of a resolved ``drive``; without a sine, the speed of the fastest wave."""
     return wave_speed(cell, packet_frequency(drive))
 
 
 def packet_frequency(drive: OneDrive) -> float:
-    """Frequency in rad/s of the wave of a resolved ``drive`` that arrives first; infinite without a sine."""
+    """Return the frequency in rad/s of the wave of a resolved ``drive`` that arrives first; infinite without a sine."""
     # A pulse has waves of all frequencies, of which the fastest arrive first.
     if drive.is_sine and drive.frequency:
         return drive.frequency
@@ -206,7 +206,7 @@ def packet_frequency(drive: OneDrive) -> float:
 
 @lru_cache  # members of a sweep send the same waves
 def wave_speed(cell: UnitCell, frequency: float) -> float:
-    """Group velocity in cells/s of the fastest wave at ``frequency`` in rad/s.
+    """Return the group velocity in cells/s of the fastest wave at ``frequency`` in rad/s.
 
     In a gap, or where all waves stand, it is that of the cell's fastest wave at any frequency.
     """
@@ -216,7 +216,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 
 
 def check_waves(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """Problems with the waves of a valid ``drive``, and with what would follow from waves that cells do not have."""
+    """Yield problems with the waves of a valid ``drive``, and with what would follow from waves that do not exist."""
     if cell.joins_cells:
         yield from _check_wave(cell, drive, time)
     else:
@@ -224,7 +224,7 @@ def check_waves(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[
 
 
 def _check_wave(cell: UnitCell, drives: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """Problems with valid drives that send out no wave, or with a wave of the first that never crosses the lattice."""
+    """Yield problems with valid drives that send no wave, or with a first wave that never crosses the lattice."""
     for path, drive in drives.every:
         if not drive.wave_choices:
             continue
@@ -243,7 +243,7 @@ def _check_wave(cell: UnitCell, drives: DriveTable, time: TimeTable) -> Iterator
 
 
 def _check_without_bands(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """Problems with times of a lattice that contacts alone join, which has no bands from which they could follow."""
+    """Yield problems with times of a lattice that contacts alone join, which has no bands to take them from."""
     none = "without springs from cell to cell there are no bands"
     remedy = f"missing; {none} from which it would follow"
     for path, one in drive.every:
@@ -261,7 +261,7 @@ def _check_without_bands(drive: DriveTable, time: TimeTable) -> Iterator[Problem
 
 
 def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: float | None = None) -> DriveTable:
-    """The valid section ``drives`` of a lattice of ``cells`` cells in which every choice is resolved.
+    """Return the valid section ``drives`` of a lattice of ``cells`` cells in which every choice is resolved.
 
     ``frequency`` in rad/s is that of the first drive where the motion at t = 0 gives it.
     """
@@ -274,7 +274,7 @@ def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: fl
 
 
 def resolve_drive(drive: AnyDrive, cell: UnitCell, cells: int, frequency: float | None = None) -> AnyDrive:
-    """The valid ``drive`` with its frequency instead of keys that choose it, with a ramp and the place of a wall."""
+    """Return valid ``drive`` with its frequency instead of keys that choose it, with a ramp and the place of a wall."""
     frequency = float(frequency or frequency_of(cell, drive))
     update: dict[str, Any] = {"frequency": frequency, "wavenumber": None, "band": None, "at": None}
     if drive.kind == DEFAULT:
@@ -288,12 +288,12 @@ def resolve_drive(drive: AnyDrive, cell: UnitCell, cells: int, frequency: float 
 
 
 def build_drives(drives: DriveTable, chain: Chain) -> tuple[Drive, ...]:
-    """The drives of a resolved section."""
+    """Return the drives of a resolved section."""
     return tuple(built for _, drive in drives.every for built in build_drive(drive, chain))
 
 
 def first_built(drives: DriveTable, chain: Chain) -> list[int]:
-    """The number (from 0) in ``build_drives`` of the first drive that is built of each of the ``drives``."""
+    """Return the number (from 0) in ``build_drives`` of the first drive that is built of each of the ``drives``."""
     numbers = []
     count = 0
     for _, drive in drives.every:
@@ -304,7 +304,7 @@ def first_built(drives: DriveTable, chain: Chain) -> list[int]:
 
 
 def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
-    """The drives of a resolved ``drive``: one, or one for each mass that a spring ties to a wall that moves."""
+    """Return the drives of a resolved ``drive``: one, or one for each mass that a spring ties to a wall that moves."""
     waveform = waveform_of(drive)
     if drive.end is None:
         return [Drive(waveform, drive.cell - 1, drive.mass - 1)]

@@ -44,14 +44,14 @@ UNLIKE_CELLS = {"profiles": "profiles", "scatter": "scatter", "absorbing": "abso
 
 
 def refuse_disorder(kind: type[CaseFile], table: Table) -> list[Problem]:
-    """The problem of a section ``[disorder]`` in a ``table`` whose verb does not accept it."""
+    """Return the problem of a section ``[disorder]`` in a ``table`` whose verb does not accept it."""
     if "disorder" not in table:
         return []
     return list(_refusal(kind, "disorder", "disorder"))
 
 
 def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) -> Iterator[Problem]:
-    """Problems of the features of a case that the verb of ``kind`` does not accept; absent ``sections`` have none."""
+    """Yield problems of features of a case that the verb of ``kind`` refuses; absent ``sections`` have none."""
     if "contacts" in sections and valid("contacts"):
         yield from _unlike_sites(kind, sections["contacts"])
 
@@ -67,13 +67,13 @@ def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) ->
 
 
 def _refusal(kind: type[CaseFile], feature: str, key: str, value: Any = None) -> Iterator[Problem]:
-    """The problem of a ``feature`` that a case has by the ``value`` of a ``key``, if the verb does not accept it."""
+    """Yield problem of a ``feature`` that a case has by the ``value`` of a ``key``, if the verb does not accept it."""
     if feature in kind.refuses:
         yield Problem(key, value, f"{kind.refuses[feature]}; {FEATURES[feature]}")
 
 
 def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Problem]:
-    """Problems of sites that differ from one contact of the cell's pair with equal clearances above 0."""
+    """Yield problems of sites that differ from one contact of the cell's pair with equal clearances above 0."""
     for key in ("each", *SIDES, *JOINS):
         value = getattr(contacts, key)
         if value is not None:
@@ -91,7 +91,7 @@ def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Pro
 
 
 def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
-    """Problems of further drives, walls that move, and waveforms."""
+    """Yield problems of further drives, walls that move, and waveforms."""
     if drive.more:
         yield from _refusal(kind, "many drives", "drive.more")
     if drive.end:
@@ -102,7 +102,7 @@ def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
 
 
 def _other_lattices(kind: type[CaseFile], lattice: LatticeTable, moves_wall: bool) -> Iterator[Problem]:
-    """Problems of unlike cells, nonlinear springs, dashpots and rings."""
+    """Yield problems of unlike cells, nonlinear springs, dashpots and rings."""
     for key, feature in UNLIKE_CELLS.items():
         if getattr(lattice, key):
             yield from _refusal(kind, feature, f"lattice.{key}")

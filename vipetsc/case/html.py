@@ -34,7 +34,7 @@ Point = tuple[float, float]
 
 
 def html_table(title: str, rows: Iterable[tuple[str, object]], drawing: str = "") -> str:
-    """A table of names and values under a ``title``, without the rows that have no value; the ``drawing`` below."""
+    """Return a table of names and values under a ``title``, without rows that have no value; the ``drawing`` below."""
     lines = [
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(str(value))}</td></tr>'
         for name, value in rows
@@ -44,7 +44,7 @@ def html_table(title: str, rows: Iterable[tuple[str, object]], drawing: str = ""
 
 
 def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
-    """The case ``name`` as HTML: a table of its lattice, bands, contacts and ``drives`` (in words), its cell drawn."""
+    """Return case ``name`` as HTML: a table of lattice, bands, contacts and ``drives`` (in words), its cell drawn."""
     chain = model.chain
     cell = chain.cell
     rows = [
@@ -71,7 +71,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
 
 
 def _band_edges(cell: UnitCell) -> list[str]:
-    """The edges of the pass bands of a ``cell`` in rad/s, as text; none where contacts alone join the cells."""
+    """Return the edges of the pass bands of a ``cell`` in rad/s, as text; none where contacts alone join the cells."""
     edges = []
     for band in wave_bands(cell):
         low = band.low
@@ -83,7 +83,7 @@ def _band_edges(cell: UnitCell) -> list[str]:
 
 
 def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
-    """The unit cell as SVG: masses by number, springs, the stops of a ``pair``, masses of the next cell dashed."""
+    """Return unit cell as SVG: masses by number, springs, the stops of a ``pair``, masses of the next cell dashed."""
     places = _places(cell)
     shift = max((x for x, _ in places), default=0.0) + COLUMN
     next_places = [_moved(place, shift) for place in places]
@@ -129,7 +129,7 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
 
 
 def _places(cell: UnitCell) -> list[Point]:
-    """The place of each mass: masses on the way through the cell form a row, others are above one that they join."""
+    """Return place of each mass: masses on the way through the cell form a row, others are above one that they join."""
     joined: dict[int, list[int]] = {mass: [] for mass in range(cell.dofs)}
     for spring in cell.springs:
         if not spring.offset and spring.start != GROUND:
@@ -154,7 +154,7 @@ def _places(cell: UnitCell) -> list[Point]:
 
 
 def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
-    """The shortest path from a mass that the cell before is tied to, to one that is tied to the next cell."""
+    """Return the shortest path from a mass that the cell before is tied to, to one that is tied to the next cell."""
     entry = last = 0
     for spring in cell.springs:
         if spring.offset:
@@ -176,12 +176,12 @@ def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
 
 
 def _moved(place: Point, right: float, down: float = 0.0) -> Point:
-    """The ``place`` moved to the ``right`` and ``down``."""
+    """Return the ``place`` moved to the ``right`` and ``down``."""
     return place[0] + right, place[1] + down
 
 
 def _mass(place: Point, number: str, style: str, label: str = "") -> str:
-    """A mass as a circle with its ``number``; a ``label`` is shown under the mouse."""
+    """Return a mass as a circle with its ``number``; a ``label`` is shown under the mouse."""
     x, y = place
     parts = [f'<circle cx="{x:g}" cy="{y:g}" r="{RADIUS:g}" {style}/>']
     if label:
@@ -192,7 +192,7 @@ def _mass(place: Point, number: str, style: str, label: str = "") -> str:
 
 
 def _directions(begin: Point, end: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first point, the vector from it to the second, and the unit vector normal to that."""
+    """Return the first point, the vector from it to the second, and the unit vector normal to that."""
     start = np.array(begin)
     along = np.array(end) - start
     length = float(np.hypot(*along)) or 1.0
@@ -201,7 +201,7 @@ def _directions(begin: Point, end: Point) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _zigzag(begin: Point, end: Point) -> str:
-    """A spring between two masses."""
+    """Return a spring between two masses."""
     start, along, across = _directions(begin, end)
     points = [start]
     for number in range(COILS + 1):
@@ -216,14 +216,14 @@ def _zigzag(begin: Point, end: Point) -> str:
 
 
 def _ground(place: Point) -> str:
-    """The ground at the foot of a spring."""
+    """Return the ground at the foot of a spring."""
     x, y = place
     points = f"{x - RADIUS:.1f},{y:.1f} {x + RADIUS:.1f},{y:.1f}"
     return f'<polyline points="{points}" {STYLE["stop"]}/>'
 
 
 def _stops(host: Point, resonator: Point) -> str:
-    """The clearance between the masses of a contact pair: two stops that face each other, next to their spring."""
+    """Return clearance between the masses of a contact pair: two stops that face each other, next to their spring."""
     start, along, across = _directions(host, resonator)
     # The stops begin inside the circles, which are drawn over them.
     aside = 0.7 * RADIUS

@@ -23,7 +23,7 @@ MOST_VARIED = 10**8
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
-    """The name in ``Variation`` and the column of a quantity; None if the cell has none of that name."""
+    """Return the name in ``Variation`` and the column of a quantity; None if the cell has none of that name."""
     match = QUANTITY.fullmatch(key)
     if match is None:
         return None
@@ -43,7 +43,7 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
 
 
 def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """The values (cells,) that a profile gives in place of the reference cell's ``values`` (cells,).
+    """Return the values (cells,) that a profile gives in place of the reference cell's ``values`` (cells,).
 
     The second result says what is wrong with the profile; it is "" if nothing is.
     """
@@ -72,7 +72,7 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """Numbers (cells,) drawn about the ``values`` (cells,) of the quantity ``key``.
+    """Return numbers (cells,) drawn about the ``values`` (cells,) of the quantity ``key``.
 
     The second result says what is wrong with the deviation; it is "" if nothing is.
     """
@@ -83,12 +83,12 @@ def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tup
 
 
 def _arrays(chain: Chain, start: int, stop: int) -> dict[str, np.ndarray]:
-    """The arrays (cell, ...) of the cells from ``start`` to ``stop`` of ``chain``, by their names in ``Variation``."""
+    """Return the arrays (cell, ...) of cells ``start`` to ``stop`` of ``chain``, by their names in ``Variation``."""
     return chain.coefficients(start, stop)._asdict() | chain.spring_terms(start, stop)._asdict()
 
 
 def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], list[Problem]]:
-    """Arrays (cell, ...) of all cells by their names in ``Variation``, and what is wrong with them.
+    """Return arrays (cell, ...) of all cells by their names in ``Variation``, and what is wrong with them.
 
     They have the profiles and the scatter of the ``lattice`` about its undamped ``cell``; what follows from these, as
     Rayleigh damping and absorbing ends do, is added by ``cell_variation``.
@@ -131,7 +131,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], 
 
 
 def _wrong_values(name: str, column: np.ndarray) -> str:
-    """Problems with the values (cells,) of a quantity called ``name`` in ``Variation``; "" if nothing."""
+    """Return problems with the values (cells,) of a quantity called ``name`` in ``Variation``; "" if nothing."""
     size = np.abs(column)
     if not np.all((size < LARGEST) & ((size > 1 / LARGEST) | (column == 0))):
         return f"is not a number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
@@ -145,7 +145,7 @@ def _wrong_values(name: str, column: np.ndarray) -> str:
 
 
 def cell_variation(lattice: LatticeTable) -> Variation | None:
-    """Quantities that differ from the reference cell in a valid, resolved case; None if nothing may differ."""
+    """Return quantities that differ from the reference cell in a valid, resolved case; None if nothing may differ."""
     if not (lattice.profiles or lattice.scatter or lattice.absorbing):
         return None
 
@@ -180,7 +180,7 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
 
 
 def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """Problems with what differs from a valid cell; ``driven`` are the cells (from 1) from which waves are sent."""
+    """Yield problems with what differs from a valid cell; waves are sent from the ``driven`` cells (from 1)."""
     if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
         yield Problem(
             "lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ, because every rank stores them"
@@ -193,7 +193,7 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
 
 
 def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
-    """Problems with a drive that moves the right wall of a valid lattice, by the ``key`` that names this end.
+    """Return problems with a drive that moves the right wall of a valid lattice, by the ``key`` that names this end.
 
     The springs to the left wall are as the reference cell's, and are checked with it.
     """
@@ -208,7 +208,7 @@ def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
 
 
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a ``driven`` cell."""
+    """Yield problems with an absorbing end that no wave reaches, or that covers half the lattice or a driven cell."""
     if not lattice.undamped_cell().joins_cells:
         remedy = "without springs from cell to cell no linear waves reach an end; remove it"
         yield Problem("lattice.absorbing", None, remedy)

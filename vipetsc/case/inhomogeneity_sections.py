@@ -30,7 +30,7 @@ class Deviation(Section):
         return self
 
     def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:
-        """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
+        """Return values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
         # A generator for each quantity, keyed by seed and name: to scatter one more quantity leaves the others as
         # they were.
         key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])

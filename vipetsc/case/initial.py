@@ -132,7 +132,7 @@ class InitialTable(Section):
         return self.kind != "zero"
 
     def is_at_rest(self, cell: int, ring: int | None = None) -> bool:
-        """Whether all masses of the ``cell`` (from 1) are at rest at t = 0; False if the section does not say so.
+        """Return whether all masses of the ``cell`` (from 1) are at rest at t = 0; False if that is not known.
 
         ``ring`` is the number of cells of a ring, around which a packet may reach.
         """
@@ -146,7 +146,7 @@ class InitialTable(Section):
         return not self.moves
 
     def describe(self) -> str:
-        """Description of the motion; empty for a lattice at rest."""
+        """Return the description of the motion; empty for a lattice at rest."""
         if self.kind == "velocity":
             return self._describe_strikes()
         if self.kind == "file":
@@ -172,11 +172,11 @@ class InitialTable(Section):
         return ""
 
     def _describe_strikes(self) -> str:
-        """The first of the masses that are struck, and the number of all if there are more."""
+        """Return the first of the masses that are struck, and the number of all if there are more."""
         return shortened([f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes])
 
     def packet(self, cell: UnitCell) -> Packet:
-        """The packet, of 1 m; only of that kind."""
+        """Return the packet, of 1 m; only of that kind."""
         assert self.band and self.wavenumber and self.cell and self.width
         return gaussian_packet(
             cell,
@@ -205,7 +205,7 @@ class Beginning(NamedTuple):
 def check_initial(
     initial: InitialTable, lattice: LatticeTable, cell: UnitCell | None, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the keys of the section ``initial``, and with its cells, bands and modes in a ``lattice``.
+    """Yield problems with the keys of the section ``initial``, and with its cells, bands and modes in a ``lattice``.
 
     ``cell`` is the lattice's, None if it is invalid.
     """
@@ -246,7 +246,7 @@ def check_initial(
 
 
 def _check_strikes(initial: InitialTable, cell: UnitCell | None) -> Iterator[Problem]:
-    """Problems with masses that are struck: those that the ``cell`` lacks, one that is struck twice, no velocity."""
+    """Yield problems with masses that are struck: not in the ``cell``, struck twice, or without a velocity."""
     places: set[tuple[int, int]] = set()
     for path, strike in initial.strikes:
         if cell and strike.mass > cell.dofs:
@@ -261,7 +261,7 @@ def _check_strikes(initial: InitialTable, cell: UnitCell | None) -> Iterator[Pro
 def beginning_of(
     initial: InitialTable, lattice: LatticeTable, frequency: float | None, touching: Callable[[float], float]
 ) -> tuple[Beginning | None, list[Problem]]:
-    """The numbers that follow from a valid section with motion, or the problems with it.
+    """Return the numbers that follow from a valid section with motion, or the problems with it.
 
     ``frequency`` in rad/s is that of the case's drive, if it has one. If no springs hold a mass that is struck, its
     frequency is that of a contact, which ``touching`` gives for a speed in m/s.
@@ -279,7 +279,7 @@ def beginning_of(
 
 
 def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """The beginning with a mode, which is given by its number and its amplitude."""
+    """Return the beginning with a mode, which is given by its number and its amplitude."""
     number = initial.number or number_near(chain, initial.near or 0.0)
     omega = mode_frequency(chain, number)
     if omega == 0:
@@ -295,7 +295,7 @@ def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
 
 
 def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """The beginning with a packet, whose size is given by its amplitude."""
+    """Return the beginning with a packet, whose size is given by its amplitude."""
     assert initial.band and initial.wavenumber and initial.cell
     omega = float(bloch(chain.cell, initial.wavenumber).frequency[initial.band - 1])
     if initial.energy:
@@ -308,7 +308,7 @@ def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beg
 def _velocity(
     initial: InitialTable, chain: Chain, frequency: float | None, touching: Callable[[float], float]
 ) -> Beginning:
-    """The beginning with masses that are struck; their amplitude is that of a sine of their speed and frequency."""
+    """Return beginning with masses that are struck; their amplitude is that of a sine of their speed and frequency."""
     _, fastest = max(initial.strikes, key=lambda item: abs(item[1].velocity))
     speed = abs(fastest.velocity)
     if not frequency:
@@ -324,7 +324,7 @@ def _velocity(
 
 
 def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """The beginning with a state in a file, which is given by its path, hash and largest displacement."""
+    """Return the beginning with a state in a file, which is given by its path, hash and largest displacement."""
     # A section with a hash is resolved, and is taken as it is: results are read where that file is gone.
     if initial.sha256 and initial.amplitude and frequency:
         return Beginning(initial, frequency, cell=1)
@@ -345,7 +345,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
 
 
 def _read_state(initial: InitialTable) -> tuple[Path, State, str]:
-    """The path of the file that the section names, the state in it, and its hash; raises CaseError."""
+    """Return the path of the file that the section names, the state in it, and its hash; raises CaseError."""
     try:
         path = resolved_path(str(initial.path))
         return path, State.read(path, initial.time, initial.orbit), file_hash(path)

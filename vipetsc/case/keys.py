@@ -27,7 +27,7 @@ TEXT_WITH_UNIT: Schema = {"type": "string", "pattern": NUMBER_WITH_UNIT.pattern}
 
 
 def unit_of(path: str, case: Table) -> str:
-    """Unit of the key with that ``path``, as in "contacts.clearance", in the table of a ``case``.
+    """Return the unit of the key with that ``path``, as in "contacts.clearance", in the table of a ``case``.
 
     An amplitude of a drive has the unit of its waveform, or m for a wall. The unit is empty for keys without one, and
     where it depends on other keys.
@@ -39,7 +39,7 @@ def unit_of(path: str, case: Table) -> str:
 
 
 def _parameter_of(path: str, case: Table) -> Parameter | None:
-    """The parameter of a registered law or waveform whose key has that ``path``; None for other keys."""
+    """Return the parameter of a registered law or waveform whose key has that ``path``; None for other keys."""
     section, _, key = path.partition(".parameters.")
     if section == "contacts":
         # The law itself may vary: the unit is that of any law that takes the key.
@@ -110,7 +110,7 @@ def _schema_with_units(modules: Sequence[str] = ()) -> Schema:
 
 
 def chapter() -> str:
-    """The manual's chapter with a table of the keys of every section, those of tables within it below it."""
+    """Return the manual's chapter with a table of the keys of every section, those of tables within it below it."""
     schema = _schema_with_units()
     lines = [
         f"# {TITLE}",
@@ -128,7 +128,7 @@ def chapter() -> str:
 
 
 def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator[str]:
-    """The table of one section, and those of the tables in it that were not shown yet."""
+    """Yield the table of one section, and those of the tables in it that were not shown yet."""
     # Several sections may contain the same table, and a table may contain itself.
     if name in shown:
         return
@@ -156,7 +156,7 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
 
 
 def _references(item: Any) -> Iterator[str]:
-    """Names of the classes that the schema of a key refers to."""
+    """Yield names of the classes that the schema of a key refers to."""
     if isinstance(item, dict):
         if "$ref" in item:
             yield item["$ref"].rpartition("/")[2]
@@ -168,7 +168,7 @@ def _references(item: Any) -> Iterator[str]:
 
 
 def _toml(value: Any) -> str:
-    """A default in TOML, as a case file would give it."""
+    """Return a default in TOML, as a case file would give it."""
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, bool):
@@ -179,7 +179,7 @@ def _toml(value: Any) -> str:
 
 
 def _kind(item: Schema) -> str:
-    """Type of a key's value in words, with its bounds."""
+    """Return the type of a key's value in words, with its bounds."""
     # Optional keys are a choice of their type and null, which TOML does not have.
     if "anyOf" in item:
         return " or ".join(_kind(choice) for choice in item["anyOf"] if choice.get("type") != "null")
@@ -204,7 +204,7 @@ def _kind(item: Schema) -> str:
 
 
 def _count(item: Schema) -> str:
-    """Number of items of a list, in words that stand before their type."""
+    """Return the number of items of a list, in words that stand before their type."""
     low = item.get("minItems", 0)
     if low == item.get("maxItems"):
         return f"{low} "

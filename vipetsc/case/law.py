@@ -133,7 +133,7 @@ class SiteKinds(NamedTuple):
     of: tuple[int, ...]
 
     def sites(self, kind: int) -> list[int]:
-        """The sites (from 0) of the ``kind`` of that number."""
+        """Return the sites (from 0) of the ``kind`` of that number."""
         return [site for site, number in enumerate(self.of) if number == kind]
 
 
@@ -159,7 +159,7 @@ class LawCase(Case):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections, and everything that is wrong with them."""
+        """Return the resolved sections, and everything that is wrong with them."""
         sections, problems = super().read(table)
         if problems:
             return sections, problems
@@ -183,7 +183,7 @@ class LawCase(Case):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """Problems between keys."""
+        """Yield problems between keys."""
         yield from super().check(sections, valid)
         if not valid("lattice"):
             return
@@ -194,13 +194,13 @@ class LawCase(Case):
 
     @classmethod
     def _of_sections(cls, sections: Mapping[str, Any], **update: Any) -> Self:
-        """The case of resolved ``sections`` in which the section ``[law]`` is changed."""
+        """Return the case of resolved ``sections`` in which the section ``[law]`` is changed."""
         changed = {**sections, "law": sections["law"].model_copy(update=update)}
         return cls.resolved({"name": "law", **changed})
 
     @classmethod
     def _clearance(cls, sections: Mapping[str, Any], table: Table) -> float | None:
-        """The clearance in m of the law of resolved ``sections``, read from ``table``; None where there is none."""
+        """Return clearance in m of the law of resolved ``sections``, read from ``table``; None where there is none."""
         given = sections["law"].clearance
         contacts = sections["contacts"]
         if given is not None:
@@ -222,7 +222,7 @@ class LawCase(Case):
         return site_kinds(self.varied(contacts={"sites": [1], "clearance": [clearance]}).model())
 
     def _kind(self) -> int:
-        """The number of the kind whose law is computed."""
+        """Return the number of the kind whose law is computed."""
         if self.law.site is not None:
             return self.kinds.of[self.law.site - 1]
         if not self.contacts.sites:
@@ -230,22 +230,22 @@ class LawCase(Case):
         return self.kinds.of[self._nearest_site().number]
 
     def mean_clearance(self, kind: int) -> float:
-        """Geometric mean in m of the lesser clearances of the sites of the ``kind`` of that number."""
+        """Return the geometric mean in m of the lesser clearances of the sites of the ``kind`` of that number."""
         clearances = self.contacts.clearance
         assert isinstance(clearances, list)
         return mean_clearance(self.contacts, clearances, self.kinds.sites(kind))
 
     def warnings(self) -> list[str]:
-        """Warnings about the wave; those about lattice, times and sites do not apply to the runs of a law."""
+        """Return warnings about the wave; those about lattice, times and sites do not apply to the runs of a law."""
         return list(wave_warnings(self.model()))
 
     def fastest(self) -> float:
-        """The largest group velocity of all bands in cells/s."""
+        """Return the largest group velocity of all bands in cells/s."""
         cell = self.lattice.unit_cell()
         return max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
 
     def one_site(self, kind: int | None = None) -> OneSite:
-        """The lattice and the times of the law's runs (see ``studies.ring``), with a site of the kind number ``kind``.
+        """Return lattice and times of the law's runs (see ``studies.ring``), with a site of the kind ``kind``.
 
         By default it is the kind of ``law.site``, and the clearance that of the law.
         """
@@ -287,7 +287,7 @@ class LawCase(Case):
         )
 
     def _nearest_site(self) -> NearestSite:
-        """The nearest site that is not in the driven cell; without any, one in the direction of the farther end."""
+        """Return nearest site that is not in the driven cell; without any, one in the direction of the farther end."""
         drive = self.drive.cell
         cells = self.lattice.cells
         assert isinstance(self.contacts.sites, list)
@@ -306,12 +306,12 @@ class LawCase(Case):
         return NearestSite(distance=abs(offsets[nearest]), towards=int(np.sign(offsets[nearest])), number=nearest)
 
     def _least_distance(self) -> int:
-        """The least number of cells from the drive to the site for which the burst ends before a wave is back."""
+        """Return least number of cells from the drive to the site for which the burst ends before a wave is back."""
         # The fastest wave goes to the site and back in the duration of the burst.
         return int(np.ceil(self.fastest() * self.model().drive.duration / 2))
 
     def _default_distance(self) -> int:
-        """The distance of the nearest site, without sites the length of the burst; at least ``_least_distance``."""
+        """Return distance of the nearest site, without sites the length of the burst; at least ``_least_distance``."""
         model = self.model()
         distance = self._nearest_site().distance
         if not distance:
@@ -320,7 +320,7 @@ class LawCase(Case):
         return max(distance, self._least_distance())
 
     def _place_problems(self) -> list[Problem]:
-        """Problems with the frequency of the wave of a resolved case, and with the distance that the case gives."""
+        """Return problems with the frequency of the wave of a resolved case, and with the distance that it gives."""
         frequency = self.drive.frequency or 0.0
         if not waves_at(self.lattice.unit_cell(), frequency):
             return [Problem("drive.frequency", frequency, "lies in no pass band, so that no wave reaches the site")]
@@ -331,7 +331,7 @@ class LawCase(Case):
         return []
 
     def _size_problems(self) -> list[Problem]:
-        """The problem of runs that are too large, because the wave is too slow."""
+        """Return the problem of runs that are too large, because the wave is too slow."""
         setting = self.one_site()
         if setting.cells * setting.samples <= LARGEST:
             return []
@@ -343,7 +343,7 @@ class LawCase(Case):
 
 
 def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
-    """Problems with the sites of resolved ``contacts`` whose law is to be computed."""
+    """Yield problems with the sites of resolved ``contacts`` whose law is to be computed."""
     sites = contacts.sites
     clearances = contacts.clearance
     assert isinstance(sites, list) and isinstance(clearances, list)
@@ -365,7 +365,7 @@ def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
 
 
 def _given_clearances(table: Table) -> list[float]:
-    """The clearances of a case without sites."""
+    """Return the clearances of a case without sites."""
     contacts = {key: value for key, value in table["contacts"].items() if key == "clearance"}
     clearance = ContactsTable(**contacts).clearance
     if isinstance(clearance, list):
@@ -386,7 +386,7 @@ def lesser_clearances(gaps: Gaps) -> np.ndarray:
 
 
 def site_kinds(model: Model) -> SiteKinds:
-    """The kinds of the sites of a ``model`` whose clearances are above 0."""
+    """Return the kinds of the sites of a ``model`` whose clearances are above 0."""
     number: dict[SiteKind, int] = {}
     of = []
     for law, (plus, minus), pair in zip(model.law_of_sites, model.gaps, model.chain.contact_pairs, strict=True):
@@ -397,14 +397,14 @@ def site_kinds(model: Model) -> SiteKinds:
 
 
 def mean_clearance(contacts: ContactsTable, clearances: Sequence[float], sites: Sequence[int]) -> float:
-    """Geometric mean in m of the lesser clearances of those ``sites`` (from 0), all above 0."""
+    """Return the geometric mean in m of the lesser clearances of those ``sites`` (from 0), all above 0."""
     # Geometric, since the law depends on ratios of amplitudes to clearances.
     lesser = lesser_clearances(gaps_of_sites(contacts, list(clearances)))
     return float(np.exp(np.mean(np.log(lesser[list(sites)]))))
 
 
 def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: int, clearance: float) -> dict[str, Any]:
-    """Changes of ``[contacts]`` that leave a single site of a ``kind`` in ``cell`` (from 1).
+    """Return changes of ``[contacts]`` that leave a single site of a ``kind`` in ``cell`` (from 1).
 
     ``clearance`` in m is its lesser clearance; ``site`` (from 0) is a site of that kind in ``contacts``.
     """

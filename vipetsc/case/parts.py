@@ -69,16 +69,16 @@ class PartName:
         raise PydanticCustomError("literal_error", message, {"expected": expected})
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """The check of a value; names are looked up when it is called."""
+        """Return the check of a value; names are looked up when it is called."""
         return core_schema.no_info_plain_validator_function(self._check)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """The names at this moment."""
+        """Return the names at this moment."""
         return {"enum": list(self.choices), "type": "string"}
 
 
 def module_names(table: Mapping[str, Any]) -> list[str]:
-    """The modules that the ``table`` of a case names; [] if the key is missing or invalid."""
+    """Return the modules that the ``table`` of a case names; [] if the key is missing or invalid."""
     section = table.get("plugins")
     if not isinstance(section, dict):
         return []
@@ -90,12 +90,12 @@ def module_names(table: Mapping[str, Any]) -> list[str]:
 
 
 def relative_modules(table: Mapping[str, Any]) -> list[str]:
-    """The relative names of files among the modules that the ``table`` of a case names."""
+    """Return the relative names of files among the modules that the ``table`` of a case names."""
     return [name for name in module_names(table) if plugins.is_file(name) and not Path(name).is_absolute()]
 
 
 def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """``table`` with absolute paths of files of modules, which a case file in ``folder`` may name by relative ones."""
+    """Return ``table`` with absolute paths of modules' files, which a case file in ``folder`` names."""
     names = module_names(table)
     if not names:
         return table
@@ -103,7 +103,7 @@ def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _located(name: str, folder: Path) -> str:
-    """The ``name`` of a module as `vipetsc.plugins.located` gives it; as it is if no file can have this name."""
+    """Return the ``name`` of a module as `vipetsc.plugins.located` gives it; as it is if no file can have this name."""
     try:
         return plugins.located(name, folder)
     # A name that is too long, links that lead to each other, or a NUL. The import of the module reports it.
@@ -112,7 +112,7 @@ def _located(name: str, folder: Path) -> str:
 
 
 def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
-    """``table`` with a record of the parts of its modules, and what is wrong with these; the modules are imported.
+    """Return ``table`` with a record of the parts of its modules, which are imported, and what is wrong with them.
 
     If a resolved case does not need a module for its physics, the module may be missing: a warning says so, and the
     record stays as it is.
@@ -158,7 +158,7 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
 
 
 def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, RegisteredPart]]:
-    """Pairs of a module and a part that a resolved case uses: parts that it names, and all measures and figures.
+    """Return pairs of a module and a part that a resolved case uses: parts that it names, and all measures and figures.
 
     A module that is missing is left out: results can be read without its measures and figures.
     """
@@ -177,7 +177,7 @@ def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, Registe
 
 
 def missing_parts(table: PluginsTable) -> list[Problem]:
-    """Problems with importing the modules that a resolved case records, for instance on a rank that did not read it.
+    """Return problems with importing the modules that a resolved case records, as on a rank that did not read it.
 
     A module is a problem if it is missing, or if its source is not the one recorded.
     """
@@ -202,7 +202,7 @@ def missing_parts(table: PluginsTable) -> list[Problem]:
 
 
 def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
-    """Kind, name and record of the parts of the module ``name`` on which numbers depend; raises PluginError."""
+    """Return kind, name and record of the parts of the module ``name`` on which numbers depend; raises PluginError."""
     plugin = plugins.load(name)
     rows = []
     for part in plugin.parts:
@@ -213,7 +213,7 @@ def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
 
 
 def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and record of all parts in ``plugins.parts``; the check of types reports entries of another type."""
+    """Yield kind, name and record of all parts in ``plugins.parts``; the check of types reports other entries."""
     for kind, parts in recorded.items():
         if not isinstance(parts, dict):
             continue
@@ -223,13 +223,13 @@ def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str,
 
 
 def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and record of the parts of the module ``name`` in ``plugins.parts``."""
+    """Return kind, name and record of the parts of the module ``name`` in ``plugins.parts``."""
     # Only the last part of the path counts: the file may have been recorded in another folder.
     return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
 
 
 def _texts(table: Mapping[str, Any]) -> set[str]:
-    """All texts in the sections of a case that may name parts."""
+    """Return all texts in the sections of a case that may name parts."""
     texts = set()
     waiting = [table.get(section) for section in NAMING]
     while waiting:

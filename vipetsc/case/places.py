@@ -53,7 +53,7 @@ class PlacesTable(Section):
     mass: int = described("number of the mass in the cell; of contacts: see `pair`", 1, ge=1)
 
     def cells(self, shape: tuple[int, int], plane: PlaneCell) -> np.ndarray:
-        """The cells (n, 2) from 1 of a strip of that ``shape``, its cells along and across."""
+        """Return the cells (n, 2) from 1 of a strip of that ``shape``, its cells along and across."""
         places = np.stack(np.meshgrid(*(np.arange(1, n + 1) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2)
         if self.line is not None:
             begin, end = np.array(self.line)
@@ -125,20 +125,20 @@ class Placing:
         self.problems: list[Problem] = []
 
     def number(self, row: int, mass: int) -> int:
-        """The number in the wide cell, from 1, of the degree of freedom ``mass`` in a ``row``; 0 is the ground."""
+        """Return number in the wide cell, from 1, of the degree of freedom ``mass`` in a ``row``; 0 is the ground."""
         if mass == 0:
             return 0
         return (row - 1) * self.plane.dofs + mass
 
     def read(self, table: Table, key: str) -> Named:
-        """The keys of a ``table`` that name places, checked; those with problems are left out."""
+        """Return the keys of a ``table`` that name places, checked; those with problems are left out."""
         given = {name: table[name] for name in _keys_at(key) if name in table}
         named, problems = read_section(Named, given, key)
         self.problems += problems
         return named
 
     def cells(self, places: Any, key: str) -> list[tuple[int, int]]:
-        """The cells (i, j) of ``places``, each once."""
+        """Return the cells (i, j) of ``places``, each once."""
         rows = places
         if isinstance(places, PlacesTable):
             if (places.centre is None) != (places.radius is None):
@@ -156,11 +156,11 @@ class Placing:
         return list(dict.fromkeys(cells))
 
     def is_inside(self, cell: tuple[int, ...]) -> bool:
-        """Whether a ``cell`` (i, j) lies in the strip."""
+        """Return whether a ``cell`` (i, j) lies in the strip."""
         return all(1 <= at <= size for at, size in zip(cell[:2], self.shape, strict=True))
 
     def spread(self, table: Table, key: str) -> list[Table]:
-        """The tables with ``cell`` and ``mass``, one a place, that a ``table`` with ``place`` or ``places`` is."""
+        """Return tables with ``cell`` and ``mass``, one a place, that a ``table`` with ``place`` or ``places`` is."""
         named = self.read(table, key)
         others = {name: value for name, value in table.items() if name not in _keys_at(key)}
         ways = [named.place is not None, named.places is not None, bool({"cell", "mass"} & table.keys())]
@@ -205,7 +205,7 @@ class Placing:
                 table["amplitude"] = usual[1] * weight
 
     def of_drives(self, table: Table, key: str) -> Table:
-        """A section whose ``more`` has further tables of its kind, with a table for each place."""
+        """Return a section whose ``more`` has further tables of its kind, with a table for each place."""
         more = table.get("more") or []
         if not isinstance(more, list) or not all(isinstance(one, dict) for one in more):
             return table
@@ -218,7 +218,7 @@ class Placing:
         return first | ({"more": others} if others else {})
 
     def of_contacts(self, table: Table) -> Table:
-        """The section ``[contacts]`` with sites and pairs in the wide cell instead of places."""
+        """Return the section ``[contacts]`` with sites and pairs in the wide cell instead of places."""
         named = self.read(table, "contacts")
         if named.places is None:
             if "offset" in table:
@@ -249,7 +249,7 @@ class Placing:
         return others | {"sites": [i for i, _ in cells], "each": each}
 
     def _pair(self, cell: tuple[int, int], pair: Any, offset: list[int]) -> list[int]:
-        """Host and resonator in the wide cell of a contact at ``cell``, whose ``pair`` counts in the plane's cell."""
+        """Return host and resonator in the wide cell of a contact at ``cell``; ``pair`` counts in the plane's."""
         dofs = self.plane.dofs
         if not (isinstance(pair, list) and len(pair) == 2 and all(type(n) is int and 0 <= n <= dofs for n in pair)):
             remedy = f"give [host, resonator] in the cell of the plane, 1 to {dofs}; host 0 is the ground"
@@ -267,7 +267,7 @@ class Placing:
         return [self.number(cell[1], pair[0]), self.number(row, pair[1])]
 
     def of_defects(self, defects: list[DefectTable], edges: Any) -> dict[str, list[float]]:
-        """The profiles along the strip, by the name of the quantity in the wide cell."""
+        """Return the profiles along the strip, by the name of the quantity in the wide cell."""
         profiles: dict[str, list[float]] = {}
         for number, defect in enumerate(defects, 1):
             at = f"lattice.strip.defects[{number}]"
@@ -288,7 +288,7 @@ class Placing:
         return profiles
 
     def _names(self, defect: DefectTable, cells: list[tuple[int, int]], edges: Any) -> Iterator[tuple[str, int, float]]:
-        """Each quantity of a ``defect`` by its name in the wide cell, its cell along the strip, and its usual value."""
+        """Yield each quantity of a ``defect``: its name in the wide cell, its cell along the strip, its value."""
         number = int(defect.quantity.partition("[")[2].partition("]")[0])
         if defect.quantity.startswith("masses") and number <= len(self.plane.masses):
             for i, j in cells:
@@ -307,12 +307,12 @@ class Placing:
 
 
 def _keys_at(key: str) -> tuple[str, ...]:
-    """The keys that name places in the table with the path ``key``."""
+    """Return the keys that name places in the table with the path ``key``."""
     return OF_A_STRIP[key.partition(".")[0]]
 
 
 def without_strip(table: Table) -> Iterator[Problem]:
-    """Problems of keys that name places in a case that has no strip: their types, or that they are there."""
+    """Yield problems of keys that name places in a case that has no strip: their types, or that they are there."""
     remedy = "names places of a strip; give [lattice.strip], or cells"
     for at, one in _placed_tables(table):
         for key in _keys_at(at):
@@ -322,7 +322,7 @@ def without_strip(table: Table) -> Iterator[Problem]:
 
 
 def _placed_tables(table: Table) -> Iterator[tuple[str, Table]]:
-    """The tables of a case that may name places, by the paths of their keys."""
+    """Yield the tables of a case that may name places, by the paths of their keys."""
     for key in ("drive", "initial"):
         section = table.get(key)
         if isinstance(section, dict):

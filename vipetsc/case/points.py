@@ -26,7 +26,7 @@ class PointTable(Section):
 
 
 def masses_remedy(dofs: int) -> str:
-    """The remedy for a mass beyond the ``dofs`` masses of a cell: a sentence on the masses that a cell has."""
+    """Return the remedy for a mass beyond the ``dofs`` masses of a cell: a sentence on the masses that a cell has."""
     if dofs == 1:
         return "a cell has the one mass 1"
     return f"a cell has the masses 1 to {dofs}"
@@ -35,7 +35,7 @@ def masses_remedy(dofs: int) -> str:
 def check_points(
     points: list[PointTable], transmission: list[list[str]], cells: int | None, dofs: int | None
 ) -> Iterator[Problem]:
-    """Problems of ``points``, and of ``transmission``, pairs of their names.
+    """Yield problems of ``points``, and of ``transmission``, pairs of their names.
 
     The lattice has ``cells`` with ``dofs`` masses each; a number that is None is invalid, and not checked.
     """

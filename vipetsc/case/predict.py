@@ -57,7 +57,7 @@ class PredictCase(LawCase):
     } | {"damped wall": "its dashpot adds the rate of the waveform, and waves are composed of the waveform alone"}
 
     def warnings(self) -> list[str]:
-        """Warnings about the waves of the prediction; its runs do not store fields."""
+        """Return warnings about the waves of the prediction; its runs do not store fields."""
         model = self.model()
         warnings = [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
         # Cells to the nearest site, in a ring along the shorter arc.
@@ -73,11 +73,11 @@ class PredictCase(LawCase):
         return warnings
 
     def _place_problems(self) -> list[Problem]:
-        """Problems with the wave, which need not be a burst, and with the distance that the case gives."""
+        """Return problems with the wave, which need not be a burst, and with the distance that the case gives."""
         return self._pulse_problems() or super()._place_problems()
 
     def _pulse_problems(self) -> list[Problem]:
-        """Problems with a wave without an end, or with one that is not narrow in frequency."""
+        """Return problems with a wave without an end, or with one that is not narrow in frequency."""
         model = self.model()
         if not np.isfinite(model.drive.duration):
             remedy = "a prediction is that of a wave that ends; give drive.duration"
@@ -93,7 +93,7 @@ class PredictCase(LawCase):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """Problems between keys."""
+        """Yield problems between keys."""
         yield from super().check(sections, valid)
         if valid("contacts.sites") and sections["contacts"].sites in (0, []):
             yield Problem("contacts.sites", [], "there are no sites; list their cells or give a count")

@@ -42,7 +42,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 
 
 def read_toml(path: str | Path) -> Table:
-    """The table in a TOML file, named after the file if it has no name, with absolute names of files.
+    """Return the table in a TOML file, named after the file if it has no name, with absolute names of files.
 
     Raises CaseError.
     """
@@ -71,7 +71,7 @@ def parsed(text: str, source: str) -> Table:
 
 
 def with_absolute_names(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A copy of the ``table`` of a case file in ``folder``, in which names of files are absolute."""
+    """Return a copy of the ``table`` of a case file in ``folder``, in which names of files are absolute."""
 
     def absolute(value: Any, key: str) -> Any:
         if isinstance(value, dict):
@@ -87,7 +87,7 @@ def with_absolute_names(table: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def relative_names(table: dict[str, Any]) -> list[str]:
-    """The relative names of files in the ``table`` of a case file, in its order."""
+    """Yield the relative names of files in the ``table`` of a case file, in its order."""
 
     def names(value: Any, key: str) -> Iterator[str]:
         if isinstance(value, dict):
@@ -103,7 +103,7 @@ def relative_names(table: dict[str, Any]) -> list[str]:
 
 
 def _absolute_name(name: str, folder: Path) -> str:
-    """The ``name`` of a file of ``folder``, or of the current folder; as it is where neither has the file."""
+    """Return the ``name`` of a file of ``folder``, or of the current folder; as it is where neither has the file."""
     path = Path(name)
     # The folder of the case file first: a case that is moved with its data must not find other data of the same name.
     for place in (folder, Path()):
@@ -149,7 +149,7 @@ def wrong_keys(value: Any, path: str = "") -> Iterator[Problem]:
 
 
 def with_overrides(table: dict[str, Any], overrides: Iterable[str]) -> tuple[dict[str, Any], list[Problem]]:
-    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and the problems.
+    """Return a copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and the problems.
 
     ``section.key=`` removes the key.
     """
@@ -173,7 +173,7 @@ def with_overrides(table: dict[str, Any], overrides: Iterable[str]) -> tuple[dic
 
 
 def has_more_keys(text: str) -> bool:
-    """Whether further lines of a value's ``text`` are keys or sections of TOML."""
+    """Return whether further lines of a value's ``text`` are keys or sections of TOML."""
     try:
         return len(tomllib.loads(f"value = {text}")) > 1
     except (ValueError, RecursionError):
@@ -181,7 +181,7 @@ def has_more_keys(text: str) -> bool:
 
 
 def value_of(text: str) -> Any:
-    """Value written in ``text``: TOML, a number such as .5, or a bare word; None if ``text`` is empty."""
+    """Return the value written in ``text``: TOML, a number such as .5, or a bare word; None if ``text`` is empty."""
     try:
         # TOML first, which distinguishes lists, tables, booleans and quoted text.
         return tomllib.loads(f"value = {text}")["value"]
@@ -237,7 +237,7 @@ def _put(place: Any, key: str, path: str, value: Any) -> list[Problem]:
 
 
 def value_at(table: dict[str, Any], path: str) -> Any:
-    """The value that ``table`` has at ``path``, as ``put`` takes it; None if it has none."""
+    """Return the value that ``table`` has at ``path``, as ``put`` takes it; None if it has none."""
     place: Any = table
     rest = path
     while rest:
@@ -249,7 +249,7 @@ def value_at(table: dict[str, Any], path: str) -> Any:
 
 
 def _divided(place: Any, path: str) -> tuple[str, str]:
-    """The first key of a ``path`` into ``place``, and the rest of the path; a key of a table may have dots itself."""
+    """Return the first key of a ``path`` into ``place``, and the rest of it; a key of a table may have dots itself."""
     dotted: list[str] = []
     if isinstance(place, dict):
         dotted = [key for key in place if "." in key and f"{path}.".startswith(f"{key}.")]
@@ -259,7 +259,7 @@ def _divided(place: Any, path: str) -> tuple[str, str]:
 
 
 def _below(place: Any, key: str, put_missing: bool = False) -> Any:
-    """The value of ``place`` at ``key``, which may name an entry of a list as in "masses[2]".
+    """Return the value of ``place`` at ``key``, which may name an entry of a list as in "masses[2]".
 
     Without a value it is None, or an empty table that is put there (``put_missing``). If ``place`` is no table, it is
     ``place`` itself: ``put`` then reports a value where a section should be.
@@ -318,7 +318,7 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
 
 
 def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
-    """The problem of a key that is not one of ``valid``, with the nearest one that is."""
+    """Return the problem of a key that is not one of ``valid``, with the nearest one that is."""
     parents, dot, key = path.rpartition(".")
     near = nearest(key, valid)
     remedy = f"valid keys: {', '.join(sorted(valid))}"
@@ -328,7 +328,7 @@ def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
 
 
 def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
-    """Numbers anywhere in ``value`` that are so large or small that products of a few of them overflow."""
+    """Yield numbers anywhere in ``value`` that are so large or small that products of a few of them overflow."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _out_of_range(item, f"{path}.{key}")
@@ -341,7 +341,7 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
 
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
-    """The problem behind one of pydantic's errors in section ``name``."""
+    """Return the problem behind one of pydantic's errors in section ``name``."""
     path = name
     for part in item["loc"]:
         # Items count from 1. The names of shapes are no part of a key's path.
@@ -376,7 +376,7 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
 
 
 def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]:
-    """The class of the section to which a ``path`` within the section ``kind`` leads.
+    """Return the class of the section to which a ``path`` within the section ``kind`` leads.
 
     The path has keys, numbers of items and, behind a key that may have several sections, the name of one of these.
     """
@@ -395,7 +395,7 @@ def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]
 
 
 def sections_in(annotation: Any) -> Iterator[type[Section]]:
-    """The classes of sections in a type, those in a union, list or dictionary among them."""
+    """Yield the classes of sections in a type, those in a union, list or dictionary among them."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         yield annotation
     for argument in get_args(annotation):

@@ -27,7 +27,7 @@ POWER_CLOSE = 0.05
 def check_parameters(
     path: str, given: Mapping[str, float], parameters: Mapping[str, Parameter], owner: str
 ) -> Iterator[Problem]:
-    """Problems with numbers ``given`` at a ``path`` for the ``parameters`` of an ``owner``, as 'the law "stop"'."""
+    """Yield problems with numbers ``given`` at a ``path`` for ``parameters`` of an ``owner``, as 'the law "stop"'."""
     for key in sorted(given.keys() - parameters.keys()):
         remedy = f"{owner} takes {', '.join(parameters) or 'no parameters'}"
         yield Problem(f"{path}.{key}", given[key], remedy)
@@ -43,7 +43,7 @@ def check_parameters(
 def check_law_parameters(
     path: str, laws: Sequence[str], given: Sequence[Mapping[str, float] | None]
 ) -> Iterator[Problem]:
-    """Problems with the parameters ``given`` for the ``laws`` (site,) of sites, at a ``path``."""
+    """Yield problems with the parameters ``given`` for the ``laws`` (site,) of sites, at a ``path``."""
     # Parameters that the law of any site takes.
     every: dict[str, Parameter] = {}
     for name in laws:
@@ -109,7 +109,7 @@ def check_law(law: Contact) -> str:
 
 
 def check_factors(path: str, names: Iterable[str], restitutions: Iterable[float]) -> Iterator[Problem]:
-    """Problems with the values of registered factors: those ``names`` (site,) for the ``restitutions`` (site,).
+    """Yield problems with the values of registered factors: those ``names`` (site,) for the ``restitutions`` (site,).
 
     Raises PartError for a factor that fails.
     """

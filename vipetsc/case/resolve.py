@@ -45,7 +45,7 @@ WHOLE = 1e-12  # fraction by which a number of intervals differs from a whole on
 
 
 def with_default_preset(table: Table) -> Table:
-    """``table`` with the four-band preset unless it names another or a cell."""
+    """Return ``table`` with the four-band preset unless it names another or a cell."""
     lattice = table.get("lattice", {})
     if not isinstance(lattice, dict) or "cell" in lattice:
         return table
@@ -53,7 +53,7 @@ def with_default_preset(table: Table) -> Table:
 
 
 def with_preset(table: Table) -> Table:
-    """``table`` with the preset's length, contacts and drive where it does not give them itself.
+    """Return ``table`` with the preset's length, contacts and drive where it does not give them itself.
 
     A lattice that begins in motion has no drive unless the table has a section for one.
     """
@@ -83,7 +83,7 @@ def with_preset(table: Table) -> Table:
 
 
 def _preset_drive(defaults: Table, given: Table) -> Table:
-    """Keys of a preset's drive that apply to a ``given`` one: the paper's burst, or the place of its wave on a band."""
+    """Return the keys of a preset's drive that apply to a ``given`` one: the paper's burst, or its place on a band."""
     # Without an amplitude nothing is driven, and there is the motion at t = 0 alone.
     if given.get("amplitude") == 0:
         return {}
@@ -96,14 +96,14 @@ def _preset_drive(defaults: Table, given: Table) -> Table:
 
 
 def _with_defaults(defaults: Table, given: Table) -> Table:
-    """``given`` with the ``defaults`` that none of its keys replaces."""
+    """Return ``given`` with the ``defaults`` that none of its keys replaces."""
     # For instance, a stiffness replaces the preset's material, and a frequency its wavenumber.
     replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
     return {key: value for key, value in defaults.items() if key not in replaced} | given
 
 
 def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
-    """The cells (1-based) with a contact; [] for a count without a preset to place it."""
+    """Return the cells (1-based) with a contact; [] for a count without a preset to place it."""
     sites = contacts.sites
     if isinstance(sites, list):
         return sites
@@ -119,7 +119,7 @@ def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
 
 
 def cells_of_sites(lattice: LatticeTable, contacts: ContactsTable) -> list[tuple[int, ...]]:
-    """The cells (1-based) whose masses each site joins: its own one, and the next one if the contact reaches there."""
+    """Return the cells (1-based) whose masses each site joins: its own one, and the next one if it reaches there."""
     cells = site_cells(lattice, contacts)
     joined: list[tuple[int, ...]] = [(cell,) for cell in cells]
     # A list over the sites may have another length, which ``check_per_site`` reports.
@@ -131,12 +131,12 @@ def cells_of_sites(lattice: LatticeTable, contacts: ContactsTable) -> list[tuple
 
 
 def _spread(first: float, last: float, count: int) -> list[int]:
-    """``count`` whole numbers evenly from ``first`` to ``last``."""
+    """Return ``count`` whole numbers evenly from ``first`` to ``last``."""
     return [int(cell) for cell in np.round(np.linspace(first, last, count))]
 
 
 def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> list[float]:
-    """Clearances in m of ``count`` sites, log-spaced over a span; the preset's where none are given."""
+    """Return clearances in m of ``count`` sites, log-spaced over a span; the preset's where none are given."""
     given = contacts.clearance
     if isinstance(given, list):
         return given
@@ -153,7 +153,7 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
 
 
 def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
-    """The lattice with its contact sites."""
+    """Return the lattice with its contact sites."""
     cell = lattice.unit_cell()
     sites = site_cells(lattice, contacts)
     return Chain(
@@ -168,7 +168,7 @@ def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
-    """The unit cell, or what is wrong with it."""
+    """Return the unit cell, or what is wrong with it."""
     problems = []
     if lattice.preset is not None and lattice.cell is not None:
         problems.append(Problem("lattice.preset", lattice.preset, "give a preset or [lattice.cell], not both"))
@@ -206,7 +206,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 
 def _check_stability(lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with negative springs and dashpots of a ``cell``, and with ends that its matrices do not have."""
+    """Yield problems with negative springs and dashpots of a ``cell``, and with ends that its matrices do not have."""
     of_matrices = lattice.cell is not None and lattice.cell.from_matrices is not None
     if of_matrices and lattice.ends == "free" and cell.is_grounded:
         # Cut springs leave the ground springs by which a bent or a turned structure is not strained.
@@ -225,7 +225,7 @@ def _check_stability(lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]
 
 
 def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with the loss of bands, or with dashpots that are given in its place."""
+    """Yield problems with the loss of bands, or with dashpots that are given in its place."""
     loss = damping.loss
     bands = {str(number) for number in range(1, cell.dofs + 1)}
     fitted = (damping.grounding, damping.springs)
@@ -243,7 +243,7 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
-    """Problems with the cells of the contacts and with their clearances."""
+    """Yield problems with the cells of the contacts and with their clearances."""
     sites = contacts.sites
     clearance = contacts.clearance
     count = 0
@@ -278,7 +278,7 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
 def check_contacts(
     lattice: LatticeTable, contacts: ContactsTable, initial: InitialTable | None, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the sites of a run that begins with the motion ``initial``, and with the law."""
+    """Yield problems with the sites of a run that begins with the motion ``initial``, and with the law."""
     yield from check_sites(lattice, contacts)
     # A count of sites has no cells where no preset places them.
     sites = site_cells(lattice, contacts)
@@ -296,7 +296,7 @@ def check_contacts(
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
-    """Problems with a stiffness that is missing where there are ``any_sites``, or given twice.
+    """Yield problems with a stiffness that is missing where there are ``any_sites``, or given twice.
 
     It is a number, or follows from the material. A radius may stand beside the number: indentations are compared to it.
     """
@@ -312,7 +312,7 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
 
 
 def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[str, Any]:
-    """The ``sections`` of a valid lattice run in which every choice is resolved, and its initial motion.
+    """Return the ``sections`` of a valid lattice run in which every choice is resolved, and its initial motion.
 
     Raises ValueError if no absorbing end satisfies the bound.
     """
@@ -335,7 +335,7 @@ def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[st
 
 
 def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Beginning | None) -> DriveTable:
-    """The drives; where nothing is driven they have no frequency, and by default the cell of the motion at t = 0."""
+    """Return drives; where nothing is driven they have no frequency, and by default the cell of the motion at t = 0."""
     if beginning is None or drive.amplitude != 0:
         return resolve_drives(drive, cell, cells)
     resolved = resolve_drives(drive, cell, cells, beginning.frequency).model_copy(update={"frequency": None})
@@ -345,7 +345,7 @@ def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Be
 
 
 def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> InitialTable | None:
-    """The motion at t = 0, with its frequency where nothing is driven; None for a lattice at rest."""
+    """Return the motion at t = 0, with its frequency where nothing is driven; None for a lattice at rest."""
     if beginning is None:
         return None
     frequency = None
@@ -355,14 +355,14 @@ def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> Initial
 
 
 def reference_drive(drive: DriveTable, initial: InitialTable | None) -> DriveTable:
-    """The drives to which times and tolerances refer; if nothing is driven, at the frequency of the motion at t = 0."""
+    """Return the drives to which times and tolerances refer; if nothing is driven, with the frequency at t = 0."""
     if drive.frequency is None and initial is not None:
         return drive.model_copy(update={"frequency": initial.frequency})
     return drive
 
 
 def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: float) -> float | None:
-    """Frequency in rad/s of which the shortest contact at a ``speed`` in m/s is half a period; None without sites."""
+    """Return the frequency in rad/s whose half period the shortest contact at a ``speed`` in m/s is, or None."""
     resolved = resolved_contacts(contacts, lattice)
     chain = build_chain(lattice, resolved)
     laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
@@ -372,7 +372,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
 
 
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
-    """The lattice with an absorbing end that suits the ``drive``, and with fitted dashpots."""
+    """Return the lattice with an absorbing end that suits the ``drive``, and with fitted dashpots."""
     update: dict[str, Any] = {}
     # An end whose cells and strength are both given is taken as it is, whatever it reflects.
     absorbing = lattice.absorbing
@@ -389,7 +389,7 @@ def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) 
 
 
 def resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> ContactsTable:
-    """The contacts with a cell and a clearance for every site, and a stiffness in place of a material."""
+    """Return the contacts with a cell and a clearance for every site, and a stiffness in place of a material."""
     sites = site_cells(lattice, contacts)
     resolved = with_stiffness(contacts, len(sites))
     update: dict[str, Any] = {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
@@ -439,7 +439,7 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 
 
 def _round_down(value: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not above ``value``."""
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above ``value``."""
     decade = int(np.floor(np.log10(value)))
     lead = max(m for m in (1, 2, 5) if m * 10.0**decade <= value)
     # Read from text: 5 * 10.0**-6 is not the double nearest to 5e-6.

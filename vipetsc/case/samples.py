@@ -74,13 +74,13 @@ class SamplesTable(Section):
         return WALL_UNITS[self.quantity or "displacement"]
 
     def motion(self) -> Joined:
-        """The curve through the samples, of a wall its displacement."""
+        """Return the curve through the samples, of a wall its displacement."""
         return joined(
             self.time, self.value, self.interpolation, derivative=self.derivative, removes=self.drift != "keep"
         )
 
     def describe_removed(self, amplitude: float) -> str:
-        """A clause on the offset and the drift that are removed, in the unit of the ``amplitude``; "" if none are."""
+        """Return a clause on the offset and drift that are removed, in the unit of the ``amplitude``, or ""."""
         names = "offset", "drift"
         # An acceleration alone has a drift.
         units = self.unit, "m/s^3"
@@ -92,7 +92,7 @@ class SamplesTable(Section):
 
 
 def with_samples(table: Table) -> tuple[Table, list[Problem]]:
-    """``table`` with the samples of the files that its drives name, and what is wrong with these."""
+    """Return ``table`` with the samples of the files that its drives name, and what is wrong with these."""
     drive = table.get("drive")
     if not isinstance(drive, dict):
         return table, []
@@ -109,7 +109,7 @@ def with_samples(table: Table) -> tuple[Table, list[Problem]]:
 
 
 def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
-    """The table of a ``drive`` with the samples of the file that it names, and what is wrong with that."""
+    """Return the table of a ``drive`` with the samples of the file that it names, and what is wrong with that."""
     samples = None
     # Types are not checked yet.
     if isinstance(drive, dict):
@@ -142,7 +142,7 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
 
 
 def _read(path: Path, samples: Table) -> np.ndarray:
-    """Rows (sample, 2) of time in s and value; raises OSError, ValueError, KeyError or TypeError."""
+    """Return rows (sample, 2) of time in s and value; raises OSError, ValueError, KeyError or TypeError."""
     rows = _rows(path, samples)
     factor = samples.get("time_factor")
     # Types are not checked yet.
@@ -153,7 +153,7 @@ def _read(path: Path, samples: Table) -> np.ndarray:
 
 
 def _rows(path: Path, samples: Table) -> np.ndarray:
-    """Rows (sample, 2) of time and value as the file has them, and as ``_read`` raises."""
+    """Return rows (sample, 2) of time and value as the file has them, and as ``_read`` raises."""
     import h5py
 
     dataset = samples.get("dataset")

@@ -23,7 +23,7 @@ MULTIPLE_OF_PI = r"\s*(\d+\.?\d*|\.\d+)?\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
 
 
 def number(value: Any) -> Any:
-    """The number that a text such as "5pi/9" stands for, as wavenumbers may be written; any other value as it is."""
+    """Return number that a text such as "5pi/9" stands for, as wavenumbers may be written; any other value as it is."""
     if not isinstance(value, str):
         return value
     match = re.fullmatch(MULTIPLE_OF_PI, value)
@@ -34,7 +34,7 @@ def number(value: Any) -> Any:
 
 
 def once(values: list[Any]) -> list[Any]:
-    """``values`` if none of them comes twice; raises ValueError."""
+    """Return ``values`` if none of them comes twice; raises ValueError."""
     # A dictionary, so that the message names each value once, and in the order of the list.
     twice = [value for value in dict.fromkeys(values) if values.count(value) > 1]
     if twice:
@@ -51,7 +51,7 @@ MOST_SITES = 10**6
 
 
 def _text(value: Any) -> Any:
-    """A ``value`` of a PETSc option as text, which a case may give as a number or a truth value."""
+    """Return a ``value`` of a PETSc option as text, which a case may give as a number or a truth value."""
     if isinstance(value, bool | int | float):
         return str(value)
     return value
@@ -88,14 +88,14 @@ class Preset:
 
 
 def _four_band_sites(cells: int, count: int) -> tuple[float, float]:
-    """Sites of the four-band lattice are from N/4 to 2N/3 of ``cells`` = N; a single one is at N/3."""
+    """Return the first and last cell of sites of the four-band lattice: N/4 and 2N/3 of ``cells`` = N; N/3 for one."""
     if count == 1:
         return cells / 3, cells / 3
     return cells / 4, 2 * cells / 3
 
 
 def _four_band_clearances(count: int) -> tuple[float, float]:
-    """Clearances of the four-band lattice fall from 10^-2.65 to 10^-2.75 m; a single site has the last one."""
+    """Return the ends of the four-band clearances in m: they fall from 10^-2.65 to 10^-2.75; one site has the last."""
     if count == 1:
         return 10**-2.75, 10**-2.75
     return 10**-2.65, 10**-2.75
@@ -143,7 +143,7 @@ class SpringTable(Section):
     )
 
     def spring(self) -> Spring:
-        """The spring, with 0-based indices."""
+        """Return the spring, with 0-based indices."""
         return Spring(
             start=self.start - 1,
             end=self.end - 1,
@@ -193,7 +193,7 @@ class CellTable(Section):
         return self.from_strip is not None and self.from_strip.motion == "in-plane"
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
-        """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
+        """Return the arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
         springs = tuple(spring.spring() for spring in self.springs)
         # A cell of one mass has no pair: host and resonator are the same mass, which is refused only if a contact joins
         # them.
@@ -221,7 +221,7 @@ class DampingTable(Section):
     )
 
     def fitted(self, cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
-        """The dashpots (dof,) to ground and (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``.
+        """Return the dashpots (dof,) to ground and (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``.
 
         Without a loss they are 0.
         """
@@ -278,7 +278,7 @@ class LatticeTable(Section):
         return keys
 
     def unit_cell(self) -> UnitCell:
-        """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
+        """Return unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
         cell = self.undamped_cell()
         damping = self.damping
         if damping is None or not (damping.mass or damping.stiffness or damping.loss):
@@ -295,7 +295,7 @@ class LatticeTable(Section):
         return replace(cell, springs=springs, grounding=tuple(grounding.tolist()))
 
     def undamped_cell(self) -> UnitCell:
-        """The unit cell without what ``damping`` adds."""
+        """Return the unit cell without what ``damping`` adds."""
         if self.cell is not None:
             return UnitCell(*self.cell.arguments())
 
@@ -379,7 +379,7 @@ class OutputTable(Section):
     )
 
     def of_points(self) -> dict[str, Any]:
-        """The keys about named points and measures, for a run of which nothing else is kept."""
+        """Return the keys about named points and measures, for a run of which nothing else is kept."""
         return self.model_dump(include={"points", "transmission", "lyapunov"}, exclude_none=True)
 
 
@@ -442,5 +442,5 @@ _LOOKS = re.compile(
 
 
 def only_looks(name: str) -> bool:
-    """Whether the PETSc option ``name`` changes no result, and is therefore not part of a case."""
+    """Return whether the PETSc option ``name`` changes no result, and is therefore not part of a case."""
     return bool(_LOOKS.fullmatch(name))

@@ -58,7 +58,7 @@ class CaseError(ValueError):
 
 
 def is_within(key: str, paths: Iterable[str]) -> bool:
-    """Whether ``key`` is one of the ``paths``, or a key or an entry of a list inside one of them."""
+    """Return whether ``key`` is one of the ``paths``, or a key or an entry of a list inside one of them."""
     return any(key == path or key.startswith((f"{path}.", f"{path}[")) for path in paths)
 
 

@@ -40,7 +40,7 @@ class StripSpring(Section):
     cubic: Finite = described("coefficient of the elongation cubed in the force", 0.0, unit="N/m^3")
 
     def spring(self) -> PlaneSpring:
-        """The spring, with 0-based masses and a direction of the length 1."""
+        """Return the spring, with 0-based masses and a direction of the length 1."""
         direction = np.array(self.direction or (1.0, 0.0))
         x, y = (direction / np.hypot(*direction)).tolist()
         return PlaneSpring(
@@ -85,7 +85,7 @@ class StripTable(Section):
     )
 
     def plane_cell(self) -> PlaneCell:
-        """The cell of the plane of a valid section."""
+        """Return the cell of the plane of a valid section."""
         in_plane = self.motion == "in-plane"
         if self.kind == "cell":
             masses = tuple(self.masses or ())
@@ -104,7 +104,7 @@ class StripTable(Section):
         return PlaneCell(named.masses, named.springs, named.vectors, named.positions, in_plane)
 
     def problems(self, ends: Any) -> Iterator[Problem]:
-        """Problems between the keys of the section, in a lattice with these ``ends``."""
+        """Yield problems between the keys of the section, in a lattice with these ``ends``."""
         is_given = self.kind == "cell"
         for key in OF_A_PRESET if is_given else OF_ONES_OWN:
             if getattr(self, key) is not None:
@@ -130,7 +130,7 @@ class StripTable(Section):
                 yield Problem(at, None, "joins a mass to itself; give an offset")
 
     def _in_plane_problems(self, ends: Any) -> Iterator[Problem]:
-        """Problems with motion in the plane."""
+        """Yield problems with motion in the plane."""
         if self.kind == "square":
             remedy = 'the square lattice does not resist shear; use "triangular", or a cell with diagonals'
             yield Problem("lattice.strip.motion", self.motion, remedy)
@@ -182,7 +182,7 @@ def with_strip(table: Table) -> tuple[Table, list[Problem]]:
 
 
 def _written(lattice: Table, cell: Table, strip: StripTable, placing: Placing) -> tuple[Table, list[Problem]]:
-    """The section ``lattice`` with its ``cell`` and its profiles written by a valid ``strip``."""
+    """Return the section ``lattice`` with its ``cell`` and its profiles written by a valid ``strip``."""
     springs = placing.plane.wide_springs(strip.rows, strip.edges)
     if len(springs) > MOST_SPRINGS:
         remedy = f"makes {len(springs)} springs in a wide cell, of at most {MOST_SPRINGS}; use fewer rows"
@@ -201,7 +201,7 @@ def _written(lattice: Table, cell: Table, strip: StripTable, placing: Placing) -
 
 
 def _with_all(table: Table, strip: StripTable, placing: Placing) -> Table:
-    """The ``table`` with its places translated, and profiles and scatter of ``[*]`` given to all masses or springs."""
+    """Return the ``table`` with places translated, and quantities of ``[*]`` given to all masses or springs."""
     cell = table["lattice"]["cell"]
     counts = len(cell.get("masses", ())), len(cell.get("springs", ()))
     table = translated(table, placing)
@@ -215,7 +215,7 @@ def _with_all(table: Table, strip: StripTable, placing: Placing) -> Table:
 
 
 def _spring_table(spring: Spring) -> dict[str, Any]:
-    """The table of a ``spring`` in ``lattice.cell.springs``."""
+    """Return the table of a ``spring`` in ``lattice.cell.springs``."""
     table: dict[str, Any] = {
         "start": spring.start + 1,
         "end": spring.end + 1,

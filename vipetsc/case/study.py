@@ -15,7 +15,7 @@ class StudyCase(CaseFile):
 
     @classmethod
     def keywords(cls) -> Iterable[str]:
-        """The sections of a run, and that of the study."""
+        """Return the sections of a run, and that of the study."""
         # This class itself has no section.
         if not cls.section:
             return [*Case.sections()]
@@ -23,7 +23,7 @@ class StudyCase(CaseFile):
 
     @classmethod
     def divide(cls, table: Table, remedy: str) -> tuple[Table, Table, list[Problem]]:
-        """The table of a run and the study's section, out of ``table``; the problem of a section that is missing.
+        """Return table of a run and the study's section, out of ``table``; the problem of a section that is missing.
 
         The problem's text ends with the ``remedy``.
         """

@@ -79,7 +79,7 @@ class Sweep(StudyCase):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are built by ``member``."""
+        """Return fields, and everything that is wrong with ``[sweep]``; the members' cases are built by ``member``."""
         remedy = "give the keys that vary, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
         table, section, missing = cls.divide(table, remedy)
         if missing:
@@ -124,7 +124,7 @@ class Sweep(StudyCase):
         return tuple(len(next(iter(axis.values()))) for axis in self.axes)
 
     def to_toml(self) -> str:
-        """The sweep as TOML, every range written out; reading it back gives the same sweep."""
+        """Return the sweep as TOML, every range written out; reading it back gives the same sweep."""
         section = self.options.model_dump()
         for axis in self.axes:
             for key, values in axis.items():
@@ -137,14 +137,14 @@ class Sweep(StudyCase):
         return math.prod(self.shape)
 
     def _repr_html_(self) -> str:
-        """The keys that vary and their values, as a notebook shows them."""
+        """Return the keys that vary and their values, as a notebook shows them."""
         rows = [
             (key, shortened([f"{value}" for value in values])) for axis in self.axes for key, values in axis.items()
         ]
         return html_table(f"{self.name}: {self.count} members", rows)
 
     def ids(self) -> list[str]:
-        """A name for every member: a hash of the table and of the values of its keys; equal members have one name."""
+        """Return a name for every member: a hash of the table and of its keys' values; equal members have one name."""
         whole = hashlib.sha256(json.dumps(self.table, sort_keys=True, default=str).encode())
 
         def name(texts: Iterable[str]) -> str:
@@ -162,7 +162,7 @@ class Sweep(StudyCase):
         return [name(chosen) for chosen in itertools.product(*texts)]
 
     def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
-        """The table of the member with that ``index`` on every axis, and the problems of keys that cannot be set."""
+        """Return table of the member with that ``index`` on every axis, and the problems of keys that cannot be set."""
         table = copy.deepcopy(self.table)
         problems: list[Problem] = []
         for axis, i in zip(self.axes, index, strict=True):
@@ -172,7 +172,7 @@ class Sweep(StudyCase):
         return table, problems
 
     def member(self, number: int) -> SweepMember:
-        """The member ``number`` (from 0) in the order of the axes, the last varying fastest."""
+        """Return the member ``number`` (from 0) in the order of the axes, the last varying fastest."""
         if number in self._resolved_members:
             return self._resolved_members[number]
         member = self._resolve_member(number)
@@ -187,7 +187,7 @@ class Sweep(StudyCase):
         return {}
 
     def _resolve_member(self, number: int) -> SweepMember:
-        """The member ``number``, resolved."""
+        """Return the member ``number``, resolved."""
         index = tuple(map(int, np.unravel_index(number, self.shape)))
         table, problems = self.member_table(index)
         if problems:
@@ -198,7 +198,7 @@ class Sweep(StudyCase):
             return SweepMember(index=index, case=None, problems=error.problems)
 
     def chains(self) -> list[list[int]]:
-        """The numbers of members that follow one another: along the last axis, in the order of its values.
+        """Return the numbers of members that follow one another: along the last axis, in the order of its values.
 
         Without ``follow`` each member is a chain of its own.
         """
@@ -226,7 +226,7 @@ class Sweep(StudyCase):
         return case.varied(without=["initial"], **changes)
 
     def number(self, name: str) -> int:
-        """The number of the member ``name``, or of that number; raises CaseError if there is none."""
+        """Return the number of the member ``name``, or of that number; raises CaseError if there is none."""
         ids = self.ids()
         if name in ids:
             return ids.index(name)
@@ -236,7 +236,7 @@ class Sweep(StudyCase):
         raise CaseError([Problem("--member", name, remedy)], self.name)
 
     def case(self, number: int, overrides: Sequence[str] = ()) -> Case:
-        """The case of the member ``number``, changed by ``overrides`` as those of ``Case.load``; raises CaseError."""
+        """Return the case of the member ``number``, with ``overrides`` as of ``Case.load``; raises CaseError."""
         member = self.member(number)
         if member.case is None:
             raise CaseError(member.problems, f"{self.name}, member {number}")
@@ -247,7 +247,7 @@ class Sweep(StudyCase):
         return Case.from_table(table, overrides)
 
     def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
-        """Members in their order, all of them or ``most`` drawn at random.
+        """Return members in their order, all of them or ``most`` drawn at random.
 
         Raises CaseError if none of these is a valid case, if any is not where members follow one another, and if any is
         invalid because of what its disorder draws: the remaining samples would have another distribution.
@@ -267,7 +267,7 @@ class Sweep(StudyCase):
         return members
 
     def tried(self) -> list[SweepMember]:
-        """The members by which a sweep is checked before it begins; raises CaseError as ``members`` does.
+        """Return the members by which a sweep is checked before it begins; raises CaseError as ``members`` does.
 
         Each member resolves all of its sites: where these are many, fewer members are tried, and the others are checked
         when they begin.
@@ -277,7 +277,7 @@ class Sweep(StudyCase):
         return self.members(max(1, min(MOST_TRIED, MOST_TRIED_SITES // max(1, _site_count(table)))))
 
     def warnings(self) -> list[str]:
-        """The problems of members that will fail, as far as they are tried: their cases are invalid."""
+        """Return the problems of members that will fail, as far as they are tried: their cases are invalid."""
         counts = Counter(str(problem) for member in self.tried() for problem in member.problems)
         if not counts:
             return []
@@ -285,7 +285,7 @@ class Sweep(StudyCase):
         return [f"members that will fail: {shortened(problems)}"]
 
     def runs(self) -> list[CaseFile]:
-        """The valid cases among the members that are tried."""
+        """Return the valid cases among the members that are tried."""
         return [member.case for member in self.tried() if member.case]
 
     @property
@@ -295,12 +295,12 @@ class Sweep(StudyCase):
         return isinstance(output, dict) and bool(output.get("figures", True))
 
     def names(self) -> dict[str, str]:
-        """A short name for every key that varies: its last part, or all of it where that is not unique."""
+        """Return a short name for every key that varies: its last part, or all of it where that is not unique."""
         return short_names([key for axis in self.axes for key in axis])
 
 
 def _site_count(table: Table) -> int:
-    """The number of sites that a ``table`` asks for, whose types are not checked yet; 0 where it does not say."""
+    """Return number of sites that a ``table`` asks for, whose types are not checked yet; 0 where it does not say."""
     contacts = table.get("contacts", {})
     if not isinstance(contacts, dict):
         return 0
@@ -315,7 +315,7 @@ def _site_count(table: Table) -> int:
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:
-    """The values of a key as an array (value,): numbers where they all are ("5pi/9" too), else their text."""
+    """Return the values of a key as an array (value,): numbers where they all are ("5pi/9" too), else their text."""
     read = [number(value) for value in values]
     if all(type(value) in (int, float) for value in read):
         return np.array(read)

@@ -21,14 +21,14 @@ Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those
 
 
 def short_names(keys: Sequence[str]) -> dict[str, str]:
-    """A short name for each of ``keys``: its last part, or all of it where that is not unique."""
+    """Return a short name for each of ``keys``: its last part, or all of it where that is not unique."""
     short = {key: key.removesuffix(".count").rpartition(".")[2] for key in keys}
     common = {name for name in short.values() if list(short.values()).count(name) > 1}
     return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
 
 
 def leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Pairs of a key's path, as "a.b.c", and its value in the table ``tree``; a range is one value."""
+    """Yield pairs of a key's path, as "a.b.c", and its value in the table ``tree``; a range is one value."""
     for key, value in tree.items():
         # For the seed { count = n } alone is a range too, and no table.
         if isinstance(value, dict) and not value.keys() & RANGES and path + key != SEED:
@@ -38,7 +38,7 @@ def leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def values_in(value: Any) -> tuple[Any, ...]:
-    """The values of a list or a range, of seeds from 0 for a count alone; raises ValueError with the remedy."""
+    """Return the values of a list or a range, of seeds from 0 for a count alone; raises ValueError with the remedy."""
     if isinstance(value, list) and value:
         return tuple(value)
     if isinstance(value, dict) and value.keys() == {"count"} and type(value["count"]) is int and value["count"] > 0:
@@ -77,7 +77,7 @@ def values_in(value: Any) -> tuple[Any, ...]:
 
 
 def _without_rounding(value: float, largest: float) -> float:
-    """The decimal number from which a ``value`` of a range differs by rounding (5 for 4.999999999999999), or itself.
+    """Return decimal number from which a ``value`` of a range differs by rounding (5 for 4.999999999999999), or itself.
 
     It is 0 for a value within the rounding of ``largest``, the magnitude of the larger summand.
     """
@@ -92,7 +92,7 @@ def _without_rounding(value: float, largest: float) -> float:
 
 
 def axes_of(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
-    """Axes of a sweep, each with the values of a key or of a group that varies together, and problems with groups.
+    """Return the axes of a sweep, each with the values of a key or of keys that vary together, and problems.
 
     ``groups`` lists the keys of each group.
     """

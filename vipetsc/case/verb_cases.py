@@ -30,7 +30,7 @@ SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
-    """The cases of all verbs for which a file has sections, ``run`` first; the built-in case without a file.
+    """Return the cases of all verbs for which a file has sections, ``run`` first; the built-in case without a file.
 
     A file with the section of another verb is read as a run only if it has a section of runs. A sweep may give values
     that the run lacks: then its first valid member takes the place of the run. Raises CaseError with the problems of
@@ -57,7 +57,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
 
 
 def _kinds(table: Table) -> list[type[CaseFile]]:
-    """The cases of the verbs that read a ``table``."""
+    """Return the cases of the verbs that read a ``table``."""
     kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in table]
     if not kinds or SECTIONS_OF_RUNS & table.keys():
         kinds.insert(0, Case)
@@ -65,7 +65,7 @@ def _kinds(table: Table) -> list[type[CaseFile]]:
 
 
 def verbs_of(path: str | Path) -> list[str]:
-    """The verbs of which a case file has the section, or ``run`` if there is none; raises CaseError."""
+    """Return the verbs of which a case file has the section, or ``run`` if there is none; raises CaseError."""
     table, _ = _table(path)
     return [kind.verb for section, kind in OF_SECTION.items() if section in table] or [Case.verb]
 
@@ -73,7 +73,7 @@ def verbs_of(path: str | Path) -> list[str]:
 def disorder_of(
     path: str | Path | None, overrides: Iterable[str], cases: Iterable[CaseFile] = ()
 ) -> tuple[DisorderTable, Case, Case] | None:
-    """Scatter in a valid case file, the case without and with it; for a sweep, those of its first valid member.
+    """Return scatter in a valid case file, the case without and with it; for a sweep, those of its first valid member.
 
     The sweep is taken from the ``cases`` that were read from the file, if it is among them, so that its members are
     resolved once.
@@ -93,7 +93,7 @@ def disorder_of(
 
 
 def _table(path: str | Path | None) -> tuple[Table, str]:
-    """The table of a case file and what it is called; the built-in one without a file."""
+    """Return the table of a case file and what it is called; the built-in one without a file."""
     if path is None:
         return Case.builtin_table, "built-in case"
     return read_toml(path), str(path)

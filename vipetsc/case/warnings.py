@@ -33,7 +33,7 @@ DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt doe
 
 
 def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> list[str]:
-    """The warnings about a run of ``model`` of which ``output`` is kept, with the options ``petsc`` of PETSc."""
+    """Return the warnings about a run of ``model`` of which ``output`` is kept, with the options ``petsc`` of PETSc."""
     return [
         *wave_warnings(model),
         *length_warnings(model),
@@ -46,7 +46,7 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
 
 
 def losses(lattice: LatticeTable) -> np.ndarray:
-    """Loss ratios (band, 4): that requested in ``[lattice.damping]``, NaN without a request; least, mean and largest.
+    """Return loss ratios (band, 4): that of ``[lattice.damping]``, NaN without one; least, mean and largest.
 
     The last three are those of the complex dispersion of the resolved cell over the wavenumbers ``KAPPAS``. If the
     lattice requests no loss, the array is (0, 4).
@@ -60,7 +60,7 @@ def losses(lattice: LatticeTable) -> np.ndarray:
 
 
 def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
-    """The warning of bands whose loss deviates from the request.
+    """Yield the warning of bands whose loss deviates from the request.
 
     It does if the mean deviates by more than ``MISSED``, or the loss at some wavenumber by a factor of 2.
     """
@@ -78,7 +78,7 @@ def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
 
 
 def wave_warnings(model: Model) -> Iterator[str]:
-    """Warnings of evanescent and slow waves."""
+    """Yield warnings of evanescent and slow waves."""
     cell = model.chain.cell
     drive = model.drive
     # A single cell has no waves.
@@ -101,7 +101,7 @@ def wave_warnings(model: Model) -> Iterator[str]:
 
 
 def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
-    """Questions about the units of samples whose spectrum lies far from all waves of the lattice."""
+    """Yield questions about the units of samples whose spectrum lies far from all waves of the lattice."""
     cell = chain.cell
     if not cell.joins_cells:
         return
@@ -137,7 +137,7 @@ def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
 
 
 def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) -> str:
-    """The unit of times in which samples that are largest at ``frequency`` would be waves; empty if there is none."""
+    """Return the unit of times in which samples that are largest at ``frequency`` would be waves; empty if none is."""
     for unit, factor in (("ms", 1e-3), ("us", 1e-6)):
         if lowest <= frequency / factor <= highest:
             largest = f"their spectrum would be largest at {frequency / factor:.4g} rad/s"
@@ -146,7 +146,7 @@ def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) 
 
 
 def length_warnings(model: Model) -> Iterator[str]:
-    """Warnings of waves that are long for the lattice, and of a run that ends before its drive."""
+    """Yield warnings of waves that are long for the lattice, and of a run that ends before its drive."""
     drive = model.drive
     cells = model.chain.cells
     waves = waves_at(model.chain.cell, drive.frequency)
@@ -171,7 +171,7 @@ def length_warnings(model: Model) -> Iterator[str]:
 
 
 def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
-    """Warnings of a wave that returns from an end to the sites, or without sites to the window or the drive."""
+    """Yield warnings of a wave that returns from an end to the sites, or without sites to the window or the drive."""
     chain = model.chain
     drive = model.drive
     at = model.drive_cell
@@ -205,7 +205,7 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 
 def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
-    """Warnings of fields that do not resolve the waves.
+    """Yield warnings of fields that do not resolve the waves.
 
     Sentences on measures that the fields do not allow are word for word those of the analysis, so that a command that
     prints both shows each of them once.
@@ -235,7 +235,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 
 def closing_warnings(model: Model) -> Iterator[str]:
-    """Warnings of waves that close no clearance, and of ones far larger than the clearances."""
+    """Yield warnings of waves that close no clearance, and of ones far larger than the clearances."""
     if not (model.chain.sites and sends_one_wave(model)):
         return
     ratios = wave_over_clearance(model).max(axis=1)
@@ -256,7 +256,7 @@ def closing_warnings(model: Model) -> Iterator[str]:
 
 
 def rigid_warnings(model: Model) -> Iterator[str]:
-    """The warning of rigid stops that may be struck at one instant."""
+    """Yield the warning of rigid stops that may be struck at one instant."""
     if not model.has_rigid_sites:
         return
     masses = model.shared_masses
@@ -269,7 +269,7 @@ def rigid_warnings(model: Model) -> Iterator[str]:
 
 
 def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
-    """Warnings of contacts that samples, or steps of fixed length, do not resolve."""
+    """Yield warnings of contacts that samples, or steps of fixed length, do not resolve."""
     speed = model.scale * model.drive.frequency
     if not model.chain.sites or not speed:
         return

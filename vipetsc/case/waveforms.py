@@ -104,7 +104,7 @@ def _build_samples(drive: "OneDrive") -> Waveform:
 
 
 def _given(value: float | None) -> float:
-    """The value of a key that a resolved drive has."""
+    """Return the value of a key that a resolved drive has."""
     assert value is not None
     return value
 
@@ -197,7 +197,7 @@ reserve(WAVEFORM, WAVEFORMS)
 
 
 def waveform_record(name: str) -> WaveformRecord:
-    """The record of a waveform, shipped or of a user's module; raises KeyError if there is none."""
+    """Return the record of a waveform, shipped or of a user's module; raises KeyError if there is none."""
     # The package's own names first, which no module can register.
     if name in WAVEFORMS:
         return WAVEFORMS[name]
@@ -241,7 +241,7 @@ def waveform_record(name: str) -> WaveformRecord:
 
 
 def is_sine(name: Any) -> bool:
-    """Whether ``name`` is that of a waveform whose frequency the case gives."""
+    """Return whether ``name`` is that of a waveform whose frequency the case gives."""
     # The name may be a value of any type, from a table that is not checked yet.
     is_waveform = isinstance(name, str) and (name in WAVEFORMS or name in PARTS[WAVEFORM])
     return is_waveform and waveform_record(name).frequency is None
@@ -350,7 +350,7 @@ class OneDrive(Section):
         return [given for given in (self.frequency, self.wavenumber, self.at) if given is not None]
 
     def describe(self) -> str:
-        """A description of the resolved drive: amplitude, waveform and place."""
+        """Return a description of the resolved drive: amplitude, waveform and place."""
         about = self.record.describe(self)
         if self.end:
             unit = "m"
@@ -366,5 +366,5 @@ class OneDrive(Section):
 
 
 def waveform_of(drive: OneDrive) -> Waveform:
-    """The waveform of a resolved drive."""
+    """Return the waveform of a resolved drive."""
     return drive.record.build(drive)

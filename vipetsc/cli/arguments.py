@@ -12,17 +12,17 @@ class Argument(NamedTuple):
 
 
 def argument(flag: str, **keywords: Any) -> Argument:
-    """The argument ``flag`` with these keywords of ``add_argument``."""
+    """Return the argument ``flag`` with these keywords of ``add_argument``."""
     return Argument(flag, keywords)
 
 
 def case_with(section: str) -> Argument:
-    """The argument CASE of a verb whose case must have a ``section``, so that there is no built-in one."""
+    """Return the argument CASE of a verb whose case must have a ``section``, so that there is no built-in one."""
     return argument("case", metavar="CASE", help=f"case file (TOML) with a section [{section}]")
 
 
 def output_folder(default: str) -> Argument:
-    """The argument --out of a verb that writes its results to the folder ``default`` if no other is named."""
+    """Return the argument --out of a verb that writes its results to the folder ``default`` if no other is named."""
     return argument("--out", type=Path, metavar="DIR", help=f"output folder; default: {default}")
 
 

@@ -12,7 +12,7 @@ from vipetsc.wording import MOST_SHOWN, counted
 
 
 def lattice_rows(case: Case) -> list[tuple[str, str]]:
-    """Rows of a table, name and text, that describe the lattice, the bands and the contacts of a case."""
+    """Return rows of a table, name and text, that describe the lattice, the bands and the contacts of a case."""
     model = case.model()
     chain = model.chain
     cell = chain.cell
@@ -49,7 +49,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
 
 
 def describe_ends(case: Case) -> str:
-    """Description of the ends; for absorbing ones with the fractions of the energy that they reflect.
+    """Return the description of the ends; for absorbing ones with the fractions of the energy that they reflect.
 
     For each drive these are the fraction at its frequency, and that of all waves that it sends.
     """
@@ -77,7 +77,7 @@ def describe_ends(case: Case) -> str:
 
 
 def describe_losses(case: Case) -> str:
-    """The least, largest and mean loss of each band over its wavenumbers, as text; empty if no loss is prescribed.
+    """Return least, largest and mean loss of each band over its wavenumbers, as text; empty if no loss is prescribed.
 
     The loss is twice the damping ratio. If the case requests a loss of the band, it follows in brackets.
     """

@@ -11,7 +11,7 @@ KEYS = "case-keys"
 
 
 def parts() -> dict[str, list[str]]:
-    """Names of the manual's chapters by the title of their part, as the headings and tables of its index list them."""
+    """Return the names of the manual's chapters by the title of their part, as its index lists them."""
     sections = re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", chapter("index"), flags=re.M | re.S)
     listed = {title: re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", text, flags=re.M) for title, text in sections}
     # The index has no link to the chapter without a file.
@@ -20,24 +20,24 @@ def parts() -> dict[str, list[str]]:
 
 
 def studies() -> list[str]:
-    """Names of the gallery's pages."""
+    """Return names of the gallery's pages."""
     return re.findall(r"\]\((gallery/\S+)\.md\)", chapter("gallery"))
 
 
 def chapter(name: str) -> str:
-    """The Markdown of the chapter ``name``, from its file or from the schema."""
+    """Return the Markdown of the chapter ``name``, from its file or from the schema."""
     if name == KEYS:
         return keys.chapter()
     return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def title(name: str) -> str:
-    """The title of the chapter ``name``."""
+    """Return the title of the chapter ``name``."""
     return chapter(name).partition("\n")[0].removeprefix("# ")
 
 
 def contents() -> str:
-    """Names and titles of the chapters, part by part, as lines of text."""
+    """Return names and titles of the chapters, part by part, as lines of text."""
     listed = parts()
     width = max(map(len, itertools.chain(*listed.values())))
     lines = []

@@ -35,7 +35,7 @@ class Pictures:
     recognise: Callable[[Sequence[Path]], bool] | None = None
 
     def are_of(self, folders: Sequence[Path]) -> bool:
-        """Whether these pictures show the results in ``folders``."""
+        """Return whether these pictures show the results in ``folders``."""
         if self.recognise:
             return self.recognise(folders)
         return len(folders) == 1 and any(folders[0].glob(self.kind.file))
@@ -195,5 +195,5 @@ def _folders_of_branches(folders: Sequence[Path]) -> list[str]:
 
 
 def newest_result(folders: Sequence[Path]) -> float:
-    """Time, as ``st_mtime``, at which the newest file of results in ``folders`` was written."""
+    """Return time, as ``st_mtime``, at which the newest file of results in ``folders`` was written."""
     return max(path.stat().st_mtime for folder in folders for path in folder.glob("*.h5"))

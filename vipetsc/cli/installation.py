@@ -76,7 +76,7 @@ class Check(NamedTuple):
 
 
 def checks(comm: "MPI.Comm") -> list[Check]:
-    """All checks of the machine; all ranks must call it."""
+    """Return all checks of the machine; all ranks must call it."""
     return [
         *map(check_package, PACKAGES),
         check_scalars(),
@@ -130,7 +130,7 @@ def _check_package(package: Package) -> Check:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The leading numbers of a version: (3, 18, 5) of "3.18.5rc1"."""
+    """Return the leading numbers of a version: (3, 18, 5) of "3.18.5rc1"."""
     match = re.match(r"\d+(\.\d+)*", version)
     if match is None:
         return ()
@@ -148,7 +148,7 @@ def check_scalars(scalar: Any = None) -> Check:
 
 
 def loaded_libraries(name: re.Pattern[str]) -> list[str]:
-    """Files of libraries that this process has loaded and whose path matches ``name``; on Linux, elsewhere none."""
+    """Return the files of libraries that this process has loaded and whose path matches ``name``; only on Linux."""
     try:
         loaded = Path("/proc/self/maps").read_text()
     except OSError:

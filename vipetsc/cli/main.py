@@ -161,7 +161,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str], comm: "MPI.Comm
 
 
 def _parser(complete: Mapping[str, Any] | None = None, called: str | None = None, comm: "MPI.Comm" = ALONE) -> Parser:
-    """The parser of all verbs.
+    """Return the parser of all verbs.
 
     ``complete`` says how a shell completes arguments (values of ``shtab``), by the arguments' names or flags. If the
     verb that is ``called`` is known, it alone gets its arguments, since to declare those of all verbs takes longer than

@@ -141,7 +141,7 @@ def reporting(comm: "MPI.Comm", options: argparse.Namespace, is_answer: bool) ->
 
 
 def _open_log(path: Path) -> Output:
-    """The file of ``--log``, to whose end messages are added."""
+    """Return the file of ``--log``, to whose end messages are added."""
     try:
         stream = path.open("a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:

@@ -119,7 +119,7 @@ class Outcome:
 
 
 def study_of(name: str, shown: Callable[[Any], str]) -> Callable[[Any, Work], Outcome]:
-    """The ``study`` of a verb that calls the function called ``name``, as "module:function", and prints its result.
+    """Return ``study`` of a verb that calls the function called ``name``, as "module:function", and prints its result.
 
     ``shown`` gives the text of the result. The module is imported when the verb is called: most calls are of others.
     """
@@ -134,7 +134,7 @@ def study_of(name: str, shown: Callable[[Any], str]) -> Callable[[Any, Work], Ou
 
 
 def summary(data: "xr.Dataset") -> str:
-    """The table of results that a study keeps in its file."""
+    """Return the table of results that a study keeps in its file."""
     return str(data.attrs["summary"])
 
 

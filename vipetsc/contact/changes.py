@@ -103,7 +103,7 @@ class Extremes(NamedTuple):
 
 @kernel
 def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
-    """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) in its mode."""
+    """Return the switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) in its mode."""
     site = contacts[i]
     tolerance = site.tolerance
     if site.mode == FREE:
@@ -142,7 +142,7 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
 
 @kernel
 def _least_pull(site: Any) -> float:
-    """The pull in N on which a stuck ``site`` is released."""
+    """Return the pull in N on which a stuck ``site`` is released."""
     # The force that stops its reduced mass from the speed of the motion within the shortest period.
     force_scale = site.reduced_mass * abs(site.approach) * SHORTEST_FLIGHT / site.flight
     return RELEASED * force_scale
@@ -150,7 +150,7 @@ def _least_pull(site: Any) -> float:
 
 @kernel
 def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -> Switching:
-    """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) at its ``motion`` (3,): w, w', w''.
+    """Return switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) at its ``motion`` (3,): w, w', w''.
 
     The value is -inf if the site's mode has no such function.
     """
@@ -167,7 +167,7 @@ def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -
 
 @kernel
 def _stays_free(site: Any, b: np.ndarray) -> bool:
-    """Whether a free ``site`` is within both clearances all through a step with the Bernstein form ``b`` (6,) of w.
+    """Return whether a free ``site`` is within both clearances in a step with the Bernstein form ``b`` (6,) of w.
 
     False for a site in another mode.
     """
@@ -183,7 +183,7 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> bool:
-    """Whether a site that may rest stays within the tolerance of a landing in the step from ``start`` to ``end`` (3,).
+    """Return whether a site that may rest stays within the tolerance of a landing in a step, ``start`` to ``end`` (3,).
 
     The step has ``h`` seconds; ``b`` (6,) is overwritten.
     """
@@ -207,7 +207,7 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
 
 @kernel
 def _passes_kink(site: Any, b: np.ndarray) -> bool:
-    """Whether a permanent ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
+    """Return whether a permanent ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
     side = side_of(site.mode)
     gap = gap_of(site, side)
     near = MOVED * site.tolerance
@@ -223,7 +223,7 @@ def _passes_kink(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def _next_kink(site: Any, motion: np.ndarray) -> int:
-    """The switching function of a permanent ``site`` that crosses zero next: 0, the masses meet, or 1, they part.
+    """Return switching function of a permanent ``site`` that crosses zero next: 0, the masses meet, or 1, they part.
 
     ``motion`` (3,) are w, w', w'' at present. Where the masses just touch, w' decides.
     """
@@ -237,7 +237,7 @@ def _next_kink(site: Any, motion: np.ndarray) -> int:
 
 @kernel
 def _first_pull(site: Any, start: np.ndarray, end: np.ndarray, h: float, c: np.ndarray) -> float:
-    """Position at which the reaction of a stuck ``site`` first turns to pull in a step of ``h`` seconds, else 2.
+    """Return position at which the reaction of a stuck ``site`` first turns to pull in a step of ``h`` seconds, else 2.
 
     The reaction is the cubic with the values and rates at both ends, ``start`` and ``end`` (3,); ``c`` (4,) is
     overwritten by the Bernstein form of the pull.
@@ -254,7 +254,7 @@ def _first_pull(site: Any, start: np.ndarray, end: np.ndarray, h: float, c: np.n
 def first_change(
     contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray, kinks: bool = False
 ) -> ModeChange:
-    """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
+    """Return first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
     With ``kinks`` a permanent contact that opens or closes counts as well, although its mode stays. ``room`` (2, 6) is
     overwritten.
@@ -303,21 +303,21 @@ def first_change(
 
 @kernel
 def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
-    """Contact force in N at position ``s`` in a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
+    """Return the contact force in N at position ``s`` in a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
     force, _ = contact_force(contacts, i, evaluate(b, s, room), evaluate(d, s, room))
     return side_of(contacts[i].mode) * force
 
 
 @kernel
 def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
-    """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
+    """Return extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     return _extremes(contacts, i, start, end, h, np.empty((4, 6)))
 
 
 # Apart from ``extremes``, since a function that allocates counts references to every row that it looks at.
 @kernel
 def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float, rows: np.ndarray) -> Extremes:
-    """The ``extremes``; ``rows`` (4, 6) are overwritten."""
+    """Return the ``extremes``; ``rows`` (4, 6) are overwritten."""
     b = rows[0]
     d = rows[1, :5]
     recoil = rows[2, :5]
@@ -366,7 +366,7 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
 
 @kernel
 def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
+    """Return the smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
 
     A contact closes if |side w - D| is at most ``MOVED`` tolerances and w approaches; inf if none does.
     """
@@ -383,7 +383,7 @@ def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
 
 @kernel
 def shortest_impact(contacts: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf if none is."""
+    """Return least ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf for none."""
     shortest = np.inf
     for i in range(contacts.size):
         if abs(contacts[i].mode) in (CLOSED, CLIPPED):

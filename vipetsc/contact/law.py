@@ -90,14 +90,14 @@ whether it ``shares`` one of them with another rigid site; the ``approach`` stan
 
 
 def elastic_records(laws: Sequence[Contact]) -> np.ndarray:
-    """Parameters (law,) of dtype ``ELASTIC`` of the elastic laws of ``laws``."""
+    """Return parameters (law,) of dtype ``ELASTIC`` of the elastic laws of ``laws``."""
     # Sites have few different laws, and a factor costs gamma functions: it is computed once for each law.
     rows = {law: _elastic_row(law) for law in dict.fromkeys(laws)}
     return np.array([rows[law] for law in laws], ELASTIC)
 
 
 def _elastic_row(law: Contact) -> tuple[float, ...]:
-    """The values of a record of dtype ``ELASTIC``."""
+    """Return the values of a record of dtype ``ELASTIC``."""
     shipped = law.stiffness, law.onset_exponent, law.duration_factor, 2.0
     registered = registered_law(law.law)
     if registered is None:
@@ -169,19 +169,19 @@ def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: f
 
 @kernel
 def side_of(mode: int) -> int:
-    """The side, 1 or -1, at which a site of a ``mode`` other than ``FREE`` touches."""
+    """Return the side, 1 or -1, at which a site of a ``mode`` other than ``FREE`` touches."""
     return 1 if mode > 0 else -1
 
 
 @kernel
 def gap_of(site: Any, side: int) -> float:
-    """Clearance in m of a ``SITE`` on one side, 1 or -1."""
+    """Return the clearance in m of a ``SITE`` on one side, 1 or -1."""
     return site.clearance if side > 0 else site.clearance_minus
 
 
 @kernel
 def landed_side(site: Any, w: float) -> int:
-    """The side, 1 or -1, of a ``SITE`` on whose clearance ``w`` in m has landed, within the tolerance; 0 if on none."""
+    """Return side, 1 or -1, of a ``SITE`` on whose clearance ``w`` in m has landed, to the tolerance; 0 for none."""
     for side in (1, -1):
         if abs(side * w - gap_of(site, side)) <= site.tolerance:
             return side
@@ -190,13 +190,13 @@ def landed_side(site: Any, w: float) -> int:
 
 @kernel
 def _registered(function: int, law: Any, x: float) -> float:
-    """The value of a registered law's ``function``, an address, at the indentation x in m."""
+    """Return the value of a registered law's ``function``, an address, at the indentation x in m."""
     return call_address(function, x, law.stiffness, law.first, law.second, law.third, law.fourth)
 
 
 @kernel
 def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
-    """f in N and df/dx in N/m at the indentation x in m, continued as an odd function to x < 0.
+    """Return f in N and df/dx in N/m at the indentation x in m, continued as an odd function to x < 0.
 
     ``law`` is a record of dtype ``ELASTIC``.
     """
@@ -211,7 +211,7 @@ def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
 
 @kernel
 def elastic_force(law: Any, x: float) -> float:
-    """The force of ``elastic_force_and_slope``; Hertz's by a square root, which is five times as fast as a power."""
+    """Return force of ``elastic_force_and_slope``; Hertz's by a square root, which is five times as fast as a power."""
     if law.force != 0:
         return np.copysign(_registered(law.force, law, abs(x)), x)
     if law.exponent == 1.5:
@@ -221,7 +221,7 @@ def elastic_force(law: Any, x: float) -> float:
 
 @kernel
 def elastic_energy(law: Any, x: float) -> float:
-    """The integral of f in J from 0 to the indentation x in m; zero for x <= 0."""
+    """Return the integral of f in J from 0 to the indentation x in m; zero for x <= 0."""
     if x <= 0.0:
         return 0.0
     if law.force != 0:
@@ -235,13 +235,13 @@ def elastic_energy(law: Any, x: float) -> float:
 
 @kernel
 def begins_linearly(law: Any) -> bool:
-    """Whether the force begins in proportion to the indentation; else its derivatives are unbounded at the onset."""
+    """Return whether the force begins in proportion to the indentation; else derivatives are unbounded there."""
     return law.exponent == 1.0
 
 
 @kernel
 def impact_time(site: Any, speed: float) -> float:
-    """Contact time in s of a conservative impact of two masses alone on a ``SITE``, at ``speed`` in m/s.
+    """Return the contact time in s of a conservative impact of two masses alone on a ``SITE``, at ``speed`` in m/s.
 
     ``Contact.impact_time`` is the same on arrays; m is the reduced mass. Where the force is a power of the indentation,
     the deepest one is x_m = ((n + 1) m speed^2/(2 kc))^(1/(n + 1)), and the time a factor times x_m/speed (Johnson
@@ -278,7 +278,7 @@ def impact_time(site: Any, speed: float) -> float:
 
 @kernel
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
-    """Force on the host in N and dissipated power in W of site ``i`` in its mode, at ``w`` in m and ``rate`` w' in m/s.
+    """Return force on the host in N and dissipated power in W of site ``i``, at ``w`` in m and ``rate`` w' in m/s.
 
     ``contacts`` (site,) are of dtype ``SITE``. The power of a clipped contact is given as 0: what it dissipates is the
     change of its ``clipped_energy``.
@@ -304,7 +304,7 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
 
 @kernel
 def clipped_energy(site: Any, w: float) -> float:
-    """Elastic energy in J at w in m of a ``SITE`` whose mode is ``CLIPPED``; 0 in any other mode.
+    """Return the elastic energy in J at w in m of a ``SITE`` whose mode is ``CLIPPED``; 0 in any other mode.
 
     No force gives this energy back to the masses: the contact dissipates all of it up to its separation.
     """

@@ -42,7 +42,7 @@ def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> No
 
 @kernel
 def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
-    """Value at s in [0, 1] of the polynomial ``b`` (n <= 6,) by de Casteljau's scheme in ``room`` (6,)."""
+    """Return the value at s in [0, 1] of the polynomial ``b`` (n <= 6,) by de Casteljau's scheme in ``room`` (6,)."""
     for i in range(b.size):
         room[i] = b[i]
     for k in range(1, b.size):
@@ -53,7 +53,7 @@ def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
 
 @kernel
 def _bisect(c: np.ndarray, room: np.ndarray) -> float:
-    """Root in [0, 1] of a polynomial ``c`` (n,) that turns from negative to positive once; ``room`` (6,) is scratch."""
+    """Return the root in [0, 1] of a polynomial ``c`` (n,) that turns positive once; ``room`` (6,) is scratch."""
     low, high = 0.0, 1.0
     # The interval is then 2^-53 long, half the rounding unit of 1.
     for _ in range(53):
@@ -85,7 +85,7 @@ def _copy(source: np.ndarray, target: np.ndarray) -> None:
 
 @kernel
 def _may_turn_positive(c: np.ndarray) -> bool:
-    """Whether any coefficient ``c`` (n,) is positive or NaN; a polynomial nowhere exceeds its largest coefficient."""
+    """Return whether any coefficient ``c`` (n,) is positive or NaN; no value of a polynomial exceeds all of them."""
     may_turn = False
     for coefficient in c:
         # Not "coefficient > 0", which is false for NaN: a motion that is no number must not pass for one without roots.
@@ -95,7 +95,7 @@ def _may_turn_positive(c: np.ndarray) -> bool:
 
 @kernel
 def _count_changes(c: np.ndarray) -> int:
-    """Changes of sign from one coefficient ``c`` (n,) to the next: at least as many as roots in ]0, 1[.
+    """Return changes of sign from one coefficient ``c`` (n,) to the next: at least as many as roots in ]0, 1[.
 
     Zero counts as negative, since a polynomial that touches zero from below has not crossed it.
     """
@@ -107,7 +107,7 @@ def _count_changes(c: np.ndarray) -> int:
 
 @kernel
 def first_upcrossing(b: np.ndarray) -> float:
-    """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
+    """Return the smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 
     ``b`` (n,), n <= 6, are its Bernstein coefficients. Method: see the package's docstring.
     """
@@ -122,7 +122,7 @@ def first_upcrossing(b: np.ndarray) -> float:
 # Apart from ``first_upcrossing``, since a function that allocates counts references to every row that it looks at.
 @kernel
 def _search(b: np.ndarray, stack: np.ndarray, room: np.ndarray) -> float:
-    """The root of ``first_upcrossing`` where the coefficients ``b`` (n,) do not tell it at once.
+    """Return the root of ``first_upcrossing`` where the coefficients ``b`` (n,) do not tell it at once.
 
     ``stack`` (interval, 8) takes the intervals that wait to be searched, the leftmost on top: the n coefficients on
     each, and in the last two columns its beginning and its width. ``room`` (3, 6) is overwritten, too.
@@ -164,7 +164,7 @@ def _search(b: np.ndarray, stack: np.ndarray, room: np.ndarray) -> float:
 
 @kernel
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
-    """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
+    """Return the smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 
     ``b`` (n,), n <= 6, are its Bernstein coefficients. A start within ``tolerance`` of zero is the root that was landed
     on last: it is a crossing, s = 0, only if the polynomial rises from there. Other crossings are then those of the
@@ -228,7 +228,7 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
 
 @kernel
 def shorten(landing: Landing, position: float) -> Landing:
-    """The attempt that ends at a ``position``, from 0 to 1, in the step of the attempt ``landing``."""
+    """Return the attempt that ends at a ``position``, from 0 to 1, in the step of the attempt ``landing``."""
     return Landing(
         length=landing.length * position, longest=landing.longest, residual=landing.residual, attempts=landing.attempts
     )

@@ -78,13 +78,13 @@ class Tracks(NamedTuple):
 
 @kernel
 def in_episode(mode: int) -> bool:
-    """Whether a site of this ``mode`` is in a contact that is logged: neither free nor at rest in contact."""
+    """Return whether a site of this ``mode`` is in a contact that is logged: neither free nor at rest in contact."""
     return mode != FREE and abs(mode) != RESTING
 
 
 @kernel
 def with_room(tracks: Tracks) -> Tracks:
-    """``tracks`` with room in the log for an episode of every site."""
+    """Return ``tracks`` with room in the log for an episode of every site."""
     used = tracks.closed[0]
     wanted = used + tracks.sites.size
     if wanted <= tracks.log.size:
@@ -155,7 +155,7 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
 
 @kernel
 def _is_unresolved(site: Any, motion: np.ndarray, t: float) -> bool:
-    """Whether an impact on a ``site`` with this ``motion`` (3,) at ``t`` in s is within what is resolved of a motion.
+    """Return whether an impact on a ``site`` with this ``motion`` (3,) at ``t`` in s is within the resolution.
 
     By its energy it ends within the tolerance of its landing, and its rebound in the range of a site at rest: it comes
     back there under the acceleration of now, or is so slow that it would take longer than the run so far to leave it.
@@ -219,7 +219,7 @@ def _switch_rigid_sites(
     t: float,
     resting: int,
 ) -> int:
-    """Release rigid sites that are pulled, strike those that approach their stops; see ``switch_sites``.
+    """Return release rigid sites that are pulled, strike those that approach their stops; see ``switch_sites``.
 
     The site ``resting``, if it is not -1, has landed on a stop and sticks there, however it moves.
     """
@@ -255,7 +255,7 @@ def _switch_rigid_sites(
 
 @kernel
 def _approached_side(site: Any, w: float, rate: float) -> int:
-    """The side, 1 or -1, of the stop that a rigid ``site`` at ``w`` in m touches and approaches at ``rate``, else 0."""
+    """Return the side, 1 or -1, of the stop that a rigid ``site`` at ``w`` in m hits at ``rate``, else 0."""
     if site.mode != FREE:
         side = side_of(site.mode)
         return side if side * rate > 0.0 else 0
@@ -407,7 +407,7 @@ def rest_site(
 
 @kernel
 def _approach_speed(site: Any, side: int, w: float, rate: float) -> float:
-    """The speed in m/s with which two masses alone come from the clearance of a ``site`` to ``w`` at ``rate``.
+    """Return the speed in m/s with which two masses alone come from the clearance of a ``site`` to ``w`` at ``rate``.
 
     They do so without loss, so that mu (w'_minus^2 - w'^2)/2 is the elastic energy at w, mu the reduced mass. A contact
     begins where it has landed, within the tolerance, or beyond it: after rest, or at the beginning of a run.
@@ -552,7 +552,7 @@ class ImpactTracker:
         return closed
 
     def clipped_energies(self, motion: np.ndarray) -> np.ndarray:
-        """The ``clipped_energy`` (sites,) in J of all sites at their ``motion`` (sites, 3)."""
+        """Return the ``clipped_energy`` (sites,) in J of all sites at their ``motion`` (sites, 3)."""
         energies = np.zeros(len(self.contacts))
         for i in np.flatnonzero(np.abs(self.contacts["mode"]) == CLIPPED):
             energies[i] = clipped_energy(self.contacts[i], motion[i, 0])
@@ -564,7 +564,7 @@ class ImpactTracker:
         return self.tracks.sites["counts"]
 
     def contact_time(self) -> float:
-        """Shortest duration in s of a contact that is closed now, by its approach velocity; inf if none is.
+        """Return the shortest duration in s of a contact that is closed now, by its approach velocity; inf if none is.
 
         Of permanent contacts those count that close at the motion in ``start``, by the velocity there.
         """
@@ -597,7 +597,7 @@ class ImpactTracker:
             rest_site(self.contacts, self.tracks, i, self.start, energies, self.impulses, t)
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
-        """Episodes (episode,) of dtype ``EPISODE`` that ended since the last call; if ``unfinished``, open ones too.
+        """Return the episodes (episode,) of dtype ``EPISODE`` that ended since the last call; ``unfinished`` ones too.
 
         ``energies`` (sites,) are what the sites have dissipated so far, in J. The separation of an open one is NaN.
         """
@@ -613,7 +613,7 @@ class ImpactTracker:
         return np.concatenate([closed, still_open])
 
     def checkpoint(self) -> np.ndarray:
-        """Sites with their modes, counts and episodes (sites,) of dtype ``TRACKED``."""
+        """Return sites with their modes, counts and episodes (sites,) of dtype ``TRACKED``."""
         sites = self.tracks.sites.copy()
         sites["mode"] = self.contacts["mode"]
         sites["approach"] = self.contacts["approach"]

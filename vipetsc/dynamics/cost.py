@@ -45,7 +45,7 @@ class Cost(NamedTuple):
 
 
 def estimate(plan: RunPlan, ranks: int = 1) -> Cost:
-    """The cost of the run that a ``plan`` says, on so many ranks; every site is assumed to meet the drive's wave."""
+    """Return cost of the run that a ``plan`` says, on so many ranks; every site is assumed to meet the drive's wave."""
     model = plan.model
     seconds = _runge_kutta_seconds(model)
     faster = []
@@ -65,7 +65,7 @@ def estimate(plan: RunPlan, ranks: int = 1) -> Cost:
 
 
 def _runge_kutta_seconds(model: Model) -> float:
-    """CPU time in s of ``ts`` for ``model`` on one rank."""
+    """Return CPU time in s of ``ts`` for ``model`` on one rank."""
     step = step_seconds(model.chain.cells * model.chain.cell.dofs)
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
     steps = SAMPLED_STEPS * model.samples * steps_per_sample
@@ -73,7 +73,7 @@ def _runge_kutta_seconds(model: Model) -> float:
 
 
 def _propagator_seconds(model: Model, series: StepSeries) -> float:
-    """CPU time in s of the propagator, with steps of ``series``, for ``model`` on one rank."""
+    """Return CPU time in s of the propagator, with steps of ``series``, for ``model`` on one rank."""
     steps = model.samples * round(model.sample_interval / series.interval)
     own_cells, own_tables = series.own_rows()
     numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1)

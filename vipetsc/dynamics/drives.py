@@ -37,7 +37,7 @@ class Drives(NamedTuple):
 
 
 def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
-    """The record of the ``drives`` with the ``numbers``, where -1 stands for no drive; all are off."""
+    """Return the record of the ``drives`` with the ``numbers``, where -1 stands for no drive; all are off."""
     tables = [np.zeros(0, PIECE)]
     rows = np.zeros(len(numbers), DRIVE)
     for row, number in zip(rows, numbers, strict=True):
@@ -69,7 +69,7 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
 
 @kernel
 def drive_force(drives: Drives, i: int, t: float) -> float:
-    """Force in N of drive ``i`` at time t in s: a burst's by the paper's Eq. (3), else that of the piece that is on."""
+    """Return the force in N of drive ``i`` at t in s: a burst's by the paper's Eq. (3), else that of its piece."""
     drive = drives.rows[i]
     if drive.damping != 0.0:
         return _waveform_rate(drives, i, t)
@@ -88,7 +88,7 @@ def drive_force(drives: Drives, i: int, t: float) -> float:
 
 @kernel
 def _waveform_rate(drives: Drives, i: int, t: float) -> float:
-    """Derivative of what ``drive_force`` returns for a drive without dashpot."""
+    """Return the derivative of what ``drive_force`` returns for a drive without dashpot."""
     drive = drives.rows[i]
     if drive.first >= drive.last:
         if t <= 0.0 or t >= drive.duration:
@@ -147,7 +147,7 @@ def select_pieces(drives: Drives, t: float) -> None:
 
 @kernel
 def drive_end(drives: Drives, i: int, begin: float, interval: float, position: float) -> float:
-    """Position in the step of ``interval`` s from ``begin`` on up to which drive ``i`` is smooth.
+    """Return the position in the step of ``interval`` s from ``begin`` on up to which drive ``i`` is smooth.
 
     For a drive that is over at the ``position`` it is a number below that. The piece that begins at the ``position``,
     to rounding, is turned on. A burst's end stays its end.
@@ -166,7 +166,7 @@ def drive_end(drives: Drives, i: int, begin: float, interval: float, position: f
 
 @kernel
 def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
-    """Energy in J of a wall's spring at time t in s, its mass at u in m, beyond that of one to a wall at rest.
+    """Return energy in J of a wall's spring at time t in s, its mass at u in m, beyond that of one to a wall at rest.
 
     The wall's work is that of the force k U on the mass and this energy. It is 0 where drive ``i`` is a force.
     """
@@ -180,7 +180,7 @@ def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
 
 @kernel
 def dashpot_power(drives: Drives, i: int, t: float, v: float) -> float:
-    """Power in W of a moving wall's dashpot at time t in s, its mass at v in m/s, beyond that of one to a wall at rest.
+    """Return the power in W of a moving wall's dashpot at t in s, its mass at v in m/s, beyond that at rest.
 
     It is c (U' - v)^2 - c v^2, and 0 where drive ``i`` is no dashpot.
     """
@@ -194,7 +194,7 @@ def dashpot_power(drives: Drives, i: int, t: float, v: float) -> float:
 
 @kernel
 def drive_forces(drives: Drives, times: np.ndarray) -> np.ndarray:
-    """Forces (drive, t) in N of all drives at the ``times`` (t,) in s."""
+    """Return forces (drive, t) in N of all drives at the ``times`` (t,) in s."""
     forces = np.zeros((drives.rows.size, times.size))
     for i in range(drives.rows.size):
         for k in range(times.size):

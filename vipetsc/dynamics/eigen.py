@@ -43,7 +43,7 @@ class NearModes(NamedTuple):
 
 
 def load_slepc() -> Any:
-    """The module ``slepc4py.SLEPc``, which begins with PETSc's options; raises CaseError where it is missing."""
+    """Return the module ``slepc4py.SLEPc``, which begins with PETSc's options; raises CaseError where it is missing."""
     try:
         from slepc4py import SLEPc
     except ImportError as error:
@@ -54,7 +54,7 @@ def load_slepc() -> Any:
 
 
 def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
-    """The ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
+    """Return the ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
 
     After them further ones are sought, until none is nearer: a Krylov space may miss copies of a mode. Raises CaseError
     where modes lie so close, as at the edge of a band, that not all can be separated.
@@ -128,7 +128,7 @@ def _solve_directly(st: Any) -> None:
 
 
 def _mode(matrices: LatticeMatrices, value: float, vector: PETSc.Vec) -> tuple[float, np.ndarray, float]:
-    """Frequency, shape and residual of a mode."""
+    """Return frequency, shape and residual of a mode."""
     residual = matrices.stiffness * vector
     momentum = matrices.mass * vector
     shape = vector.array_r.reshape(-1, matrices.chain.cell.dofs) / np.sqrt(vector.dot(momentum))

@@ -43,7 +43,7 @@ ENERGY_SUMS = 5
 
 @kernel
 def _multiples(energy: float, unit: float) -> tuple[np.int64, np.int64]:
-    """An ``energy`` in J as a multiple of ``unit`` and one of unit/2^52."""
+    """Return an ``energy`` in J as a multiple of ``unit`` and one of unit/2^52."""
     multiple = energy * (1.0 / unit)
     whole = np.rint(multiple)
     # An energy that is not finite or far beyond the scale is cut off at LARGEST, where the guard ends the run.
@@ -100,7 +100,7 @@ def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energie
 
 @kernel
 def _contact_energy(site: Any, w: float) -> float:
-    """Elastic energy in J of a ``SITE`` at w, beyond that of the static state where a load holds it pressed."""
+    """Return elastic energy in J of a ``SITE`` at w, beyond that of the static state where a load holds it pressed."""
     energy = elastic_energy(site.elastic, max(w - site.clearance, -w - site.clearance_minus))
     if site.preload != 0.0:
         energy -= elastic_energy(site.elastic, -min(site.clearance, site.clearance_minus)) + site.preload * w
@@ -200,7 +200,7 @@ class Energies:
 
 
 def parts(sums: np.ndarray) -> np.ndarray:
-    """The ``sums`` (sample, energy, 2) of a rank as floats (part and energy, sample), to be added to those of others.
+    """Return the ``sums`` (sample, energy, 2) of a rank as floats (part and energy, sample), to add to others'.
 
     An energy has four parts: the upper and lower ones of the whole multiple and of the remainder.
     """
@@ -212,7 +212,7 @@ def parts(sums: np.ndarray) -> np.ndarray:
 
 
 def joined(total: np.ndarray) -> np.ndarray:
-    """Energies (energy, sample) in units of sums of ``parts``; the same for any division of the cells among ranks."""
+    """Return energies (energy, sample) in units of sums of ``parts``; the same for any division among ranks."""
     upper, lower, fine_upper, fine_lower = np.split(total.astype(np.int64), 4)
     fine_upper, fine_lower = _carried(fine_upper, fine_lower, _FINE_PART_BITS)
     lower, fine_upper = _carried(lower, fine_upper, _FINE_BITS - _FINE_PART_BITS)
@@ -254,13 +254,13 @@ class EnergyMeter:
         self.negligible = _NEGLIGIBLE * scale
 
     def sums(self, y: np.ndarray) -> np.ndarray:
-        """The sums (5, 2) of ``measure`` over the rank's part ``y`` of a state, whose ghosts are up to date."""
+        """Return the sums (5, 2) of ``measure`` over the rank's part ``y`` of a state, whose ghosts are up to date."""
         sums = np.zeros((ENERGY_SUMS, 2), np.int64)
         measure(y, self.lattice, self.unit, sums)
         return sums
 
     def total(self, sums: np.ndarray, work: np.ndarray) -> Energies:
-        """Energies over all ranks: ``sums`` (sample, energy, 2) of ``measure``, ``work`` (sample, drive) in J.
+        """Return energies over all ranks: ``sums`` (sample, energy, 2) of ``measure``, ``work`` (sample, drive) in J.
 
         All ranks must call it.
         """

@@ -61,15 +61,15 @@ class Engine(ABC):
 
     @abstractmethod
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
-        """Episodes closed since the last call that this rank logs, of dtype ``EPISODE``; ``unfinished`` ones, too."""
+        """Return the episodes closed since the last call that this rank logs, as ``EPISODE``; ``unfinished`` too."""
 
     @abstractmethod
     def statistics(self) -> dict[str, Any]:
-        """Statistics of the engine's work, summed over ranks; all must call it."""
+        """Return statistics of the engine's work, summed over ranks; all must call it."""
 
     @abstractmethod
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """The data that a resumed run needs for the same bits: this rank's cells and sites, and common values."""
+        """Return data that a resumed run needs for the same bits: this rank's cells and sites, and common values."""
 
     @abstractmethod
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:

@@ -15,7 +15,7 @@ from vipetsc.dynamics.springs import inverse_mass, nonlinear_force_on, spring_ac
 
 @kernel
 def acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
-    """Acceleration in m/s^2 of a ``mass`` of an owned ``cell`` at t in s: by its springs, a contact ``force``, drives.
+    """Return the acceleration in m/s^2 of a ``mass`` of a ``cell`` at t in s by springs, a contact ``force``, drives.
 
     ``y`` (component,) is the rank's part of the state, with ghosts. Of each drive the piece acts that is on.
     """

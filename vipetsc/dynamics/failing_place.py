@@ -6,7 +6,7 @@ from vipetsc.dynamics.observers import Setup
 
 
 def failing_place(setup: Setup) -> str:
-    """The place of a failure in words, at the engine's state; all ranks must call it.
+    """Return the place of a failure in words, at the engine's state; all ranks must call it.
 
     It is the cell that moves fastest, or is not finite, with the site nearest to it.
     """

@@ -61,7 +61,7 @@ def _check_stops(model: Model, motion: np.ndarray) -> None:
 
 
 def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement and velocity (cell, dof) at t = 0 of the ``cells``, the same to the last bit on any partition.
+    """Return displacement and velocity (cell, dof) at t = 0 of the ``cells``, to the bit on any partition.
 
     All ranks of ``comm`` must call it. Raises CaseError on all if the state's file is gone or has changed.
     """
@@ -92,7 +92,7 @@ def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarr
 
 
 def _read_fields(initial: Any, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
-    """The fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
+    """Return the fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
     path = Path(str(initial.path))
 
     def check() -> None:

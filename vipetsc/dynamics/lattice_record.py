@@ -76,7 +76,7 @@ class LatticeRecord(NamedTuple):
 
 
 def create_record(model: Model, layout: Layout) -> Record:
-    """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
+    """Return the record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
     chain = model.chain
     cell = chain.cell
     shape = _create_shape(chain, layout)
@@ -110,7 +110,7 @@ def create_record(model: Model, layout: Layout) -> Record:
 
 
 def empty_record() -> LatticeRecord:
-    """A record of no cells."""
+    """Return a record of no cells."""
     none = np.zeros(0)
     return LatticeRecord(
         shape=Shape(**{name: kind() for name, kind in get_type_hints(Shape).items()}),
@@ -133,7 +133,7 @@ LATTICE = record_type(empty_record())
 
 
 def _create_shape(chain: Chain, layout: Layout) -> Shape:
-    """Sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
+    """Return sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
     damping = -1
     if layout.integrates_damping:
         damping = 2 * layout.dofs * layout.owned
@@ -152,7 +152,7 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
 
 
 def _spring_laws(chain: Chain, layout: Layout) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
-    """Nonlinear parts of the rank's springs; by the number of each spring that has one, its first law and stride."""
+    """Return nonlinear parts of the rank's springs; by the number of each such spring its law and stride."""
     if chain.is_linear:
         return np.zeros(0, SPRING_LAW), {}
     # One law of each spring where cells have equal ones; else one for each cell, from that before the first one on.
@@ -170,7 +170,7 @@ def _spring_laws(chain: Chain, layout: Layout) -> tuple[np.ndarray, dict[int, tu
 
 
 def _couplings(cell: UnitCell, layout: Layout, laws: dict[int, tuple[int, int]]) -> np.ndarray:
-    """The couplings (coupling,) of dtype ``COUPLING`` of a ``cell``, whose springs have the ``laws``."""
+    """Return the couplings (coupling,) of dtype ``COUPLING`` of a ``cell``, whose springs have the ``laws``."""
     left_ghost, right_ghost = layout.ghost_places()
     couplings = cell.couplings()
     rows = np.zeros(len(couplings), COUPLING)
@@ -197,7 +197,7 @@ def _couplings(cell: UnitCell, layout: Layout, laws: dict[int, tuple[int, int]])
 
 
 def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The last four arrays of ``LatticeRecord`` of a rank's cells."""
+    """Return the last four arrays of ``LatticeRecord`` of a rank's cells."""
     if chain.linearised().is_uniform() and not layout.damped:
         none = np.zeros(0)
         return none, none, none, none

@@ -102,7 +102,7 @@ class Layout:
         return np.where((masses == WALL)[:, None], -1, components)
 
     def state_indices(self, cells: ArrayLike) -> np.ndarray:
-        """Global indices (cell, 2 dofs) of the displacements and then of the velocities of ``cells``, mass by mass."""
+        """Return global indices (cell, 2 dofs) of displacements and then velocities of ``cells``, mass by mass."""
         cells = np.asarray(cells, np.int64)
         rank = np.searchsorted(self.ranges[:, 1], cells, side="right")
         start, stop = self.ranges[rank].T
@@ -111,7 +111,7 @@ class Layout:
         return ((self.offsets[rank] + cells - start)[:, None] + mass_offsets).astype(PETSc.IntType)
 
     def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
-        """A zero state with ghosts for the neighbouring cells; all ranks must call it.
+        """Return a zero state with ghosts for the neighbouring cells; all ranks must call it.
 
         It has its components in ``array`` (component,) if one is given: the rank's own, then those of the ghosts.
         """
@@ -123,7 +123,7 @@ class Layout:
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
     def losses(self, y: np.ndarray) -> np.ndarray:
-        """Energies (contact,) in J that the ``contacts`` have dissipated, 0 for those that other ranks own.
+        """Return energies (contact,) in J that the ``contacts`` have dissipated, 0 for those that other ranks own.
 
         ``y`` (component,) is the rank's part of the state.
         """
@@ -139,11 +139,11 @@ class Layout:
         y[self.per_cell * self.owned : self.dissipated] = np.where(np.array(self.drives) == 0, work, 0.0)
 
     def motion(self, y: np.ndarray) -> np.ndarray:
-        """Displacements and velocities (cell, 2 dofs) of the part ``y`` of the state."""
+        """Return displacements and velocities (cell, 2 dofs) of the part ``y`` of the state."""
         return y[: 2 * self.dofs * self.owned].reshape(2 * self.dofs, self.owned).T.copy()
 
     def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
-        """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), ``dashpots`` (cell,), and the ledger.
+        """Return the part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), ``dashpots`` (cell,), ledger.
 
         ``dashpots`` in J is empty where their dissipation is not integrated.
         """
@@ -182,12 +182,12 @@ class Layout:
 
 
 def cell_cuts(cells: int, ranks: int) -> list[int]:
-    """The first cell (rank + 1) of every rank, and ``cells``: equal blocks, of which the first may have one more."""
+    """Return first cell (rank + 1) of every rank, and ``cells``: equal blocks, of which the first may have one more."""
     return [r * (cells // ranks) + min(r, cells % ranks) for r in range(ranks + 1)]
 
 
 def _sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Numbers of the sites of the cells ``start`` to ``stop``, and of all that act on a mass there."""
+    """Return numbers of the sites of the cells ``start`` to ``stop``, and of all that act on a mass there."""
     elements = contacts(chain)
     owned = (elements.cell >= start) & (elements.cell < stop)
     # A site's host is in its own cell; its resonator may be in the next one, which another rank may own.
@@ -197,7 +197,7 @@ def _sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...],
 
 
 def join(checkpoints: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str | None]) -> dict[str, np.ndarray]:
-    """The tables (row,) named in ``keys`` of all ranks' ``checkpoints``, one after the other.
+    """Return the tables (row,) named in ``keys`` of all ranks' ``checkpoints``, one after the other.
 
     ``keys`` gives the field by which the rows of a table are put in order, None for the order of the ranks.
     """

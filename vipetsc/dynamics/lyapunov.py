@@ -101,12 +101,12 @@ class LargestExponent(Observer):
             self.last = float(block.times[-1])
 
     def _sticks(self) -> bool:
-        """Whether a site of the run sticks to a rigid stop; all ranks must call it."""
+        """Return whether a site of the run sticks to a rigid stop; all ranks must call it."""
         modes = self.setup.engine.checkpoint()["sites"]["mode"]
         return any(self.setup.layout.comm.allgather(bool(np.any(np.abs(modes) == STUCK))))
 
     def _norm(self, cells: np.ndarray) -> float:
-        """The size of a state or a deviation, from the own ``cells`` (cell, 2 dof); all ranks must call it."""
+        """Return the size of a state or a deviation, from the own ``cells`` (cell, 2 dof); all ranks must call it."""
         displacements, velocities = np.split(np.abs(cells), 2, axis=1)
         largest = max(velocities.max(initial=0.0), self._frequency * displacements.max(initial=0.0))
         return float(self.setup.layout.comm.allreduce(float(largest), MPI.MAX))
@@ -193,7 +193,7 @@ class LargestExponent(Observer):
             self._companion.destroy()
 
     def statistics(self) -> dict[str, Any]:
-        """``lyapunov`` in 1/s, the largest exponent, and ``lyapunov_error``, the standard error of its mean."""
+        """Return ``lyapunov`` in 1/s, the largest exponent, and ``lyapunov_error``, the standard error of its mean."""
         if self._why_none():
             return {}
         counted = self._counted()
@@ -205,12 +205,12 @@ class LargestExponent(Observer):
         return {"lyapunov": float(growth / duration), "lyapunov_error": float(np.std(rates, ddof=1) / np.sqrt(PARTS))}
 
     def _counted(self) -> np.ndarray:
-        """The rows of ``growth`` in the part of the run that counts."""
+        """Return the rows of ``growth`` in the part of the run that counts."""
         growth = np.array(self.growth).reshape(-1, 3)
         return growth[growth[:, 0] > COUNTS_FROM * self.setup.model.end]
 
     def _why_none(self) -> str:
-        """The reason for which the run has no exponent; empty where it has one."""
+        """Return the reason for which the run has no exponent; empty where it has one."""
         intervals = len(self._counted())
         if self._reason or intervals >= LEAST_INTERVALS:
             return self._reason
@@ -219,7 +219,7 @@ class LargestExponent(Observer):
         )
 
     def warnings(self) -> list[str]:
-        """A sentence on why there is no exponent."""
+        """Return a sentence on why there is no exponent."""
         why = self._why_none()
         if why:
             return [f"no Lyapunov exponent: {why}"]
@@ -227,7 +227,7 @@ class LargestExponent(Observer):
 
 
 def _nothing_of(samples: Samples, count: int) -> Samples:
-    """Room for the first ``count`` of ``samples`` in which an engine leaves what every sample has, and no fields."""
+    """Return room for the first ``count`` of ``samples`` with what every sample has, and without fields."""
     return samples._replace(
         sums=np.zeros_like(samples.sums[:count]),
         work=np.zeros_like(samples.work[:count]),

@@ -71,13 +71,13 @@ class LatticeMatrices:
             raise CaseError([Problem("lattice.cells", self.chain.cells, f"makes matrices of {remedy}")])
 
     def _matrix(self, rows: csr_matrix) -> PETSc.Mat:
-        """The matrix of which this rank has the ``rows``, allocated for exactly their entries."""
+        """Return the matrix of which this rank has the ``rows``, allocated for exactly their entries."""
         first_entries = rows.indptr.astype(PETSc.IntType)
         columns = rows.indices.astype(PETSc.IntType)
         return PETSc.Mat().createAIJ((rows.shape, rows.shape), csr=(first_entries, columns, rows.data), comm=self.comm)
 
     def vector(self, cells: np.ndarray | None = None) -> PETSc.Vec:
-        """A vector of this rank's ``cells`` (cell, dof), zero if none are given."""
+        """Return a vector of this rank's ``cells`` (cell, dof), zero if none are given."""
         vector = self.stiffness.createVecRight()
         if cells is not None:
             vector.array[:] = np.ravel(cells)

@@ -39,7 +39,7 @@ REMEDIES = {
 
 
 def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) -> dict[str, float]:
-    """Bytes that a run of ``model`` by ``engine`` takes on the fullest of ``ranks``, by the key that they grow with.
+    """Return bytes that a run of ``model`` by ``engine`` takes on the fullest of ``ranks``, by the key they grow with.
 
     The parts are the engine's states, the sites, a chunk of fields and losses (on rank 0 gathered from all cells), and
     the energies of all samples. The memory with which a process begins is not included.
@@ -57,7 +57,7 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
 
 
 def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
-    """Bytes of the engine's states on a rank, and of the numbers of cells that differ."""
+    """Return bytes of the engine's states on a rank, and of the numbers of cells that differ."""
     chain = model.chain
     cell = model.chain.cell
     owned = -(-chain.cells // ranks)
@@ -80,7 +80,7 @@ def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
 
 
 def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: int) -> int:
-    """Bytes of the copies of a chunk of fields and losses on the fullest rank."""
+    """Return bytes of the copies of a chunk of fields and losses on the fullest rank."""
     chain = model.chain
     recorded = len(recorded_cells(output, chain.cells))
     per_cell = len(output.fields) * chain.cell.dofs
@@ -94,7 +94,7 @@ def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: in
 
 
 def memory_available() -> int:
-    """Bytes that this process may still take: what the machine has left, within the process's own limit."""
+    """Return bytes that this process may still take: what the machine has left, within the process's own limit."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))

@@ -42,7 +42,7 @@ def bind_symbols() -> None:
 
 @intrinsic
 def _pointer(typing_context: Any, address: Any, dtype: Any) -> Any:
-    """The int64 ``address`` as a pointer to elements of a ``dtype``."""
+    """Return the int64 ``address`` as a pointer to elements of a ``dtype``."""
     kind = types.CPointer(dtype.dtype)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -53,5 +53,5 @@ def _pointer(typing_context: Any, address: Any, dtype: Any) -> Any:
 
 @inlined
 def array_at(address: int, length: int, dtype: Any) -> Any:
-    """The array (length,) of a ``dtype`` at an int64 address."""
+    """Return the array (length,) of a ``dtype`` at an int64 address."""
     return numba.carray(_pointer(address, dtype), (length,))

@@ -82,7 +82,7 @@ class Observer:
         """Pass the data collected since the last checkpoint to the run's output."""
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """The data with which a resumed run goes on to the same bits; equal on all ranks, whose number may change."""
+        """Return the data with which a resumed run has the same bits; equal on all ranks, whose number may change."""
         return {key: np.array(getattr(self, key)) for key in self.saved}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -94,11 +94,11 @@ class Observer:
         """End the observation; a run ``stopped`` on request will be resumed from the checkpoint just written."""
 
     def statistics(self) -> dict[str, Any]:
-        """Numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
+        """Return numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
         return {}
 
     def warnings(self) -> list[str]:
-        """Warnings about a result that needs care; those of rank 0 count."""
+        """Return warnings about a result that needs care; those of rank 0 count."""
         return []
 
 
@@ -199,7 +199,7 @@ class Ledger(Observer):
             self.last_even_power = float(powers[even][-1])
 
     def statistics(self) -> dict[str, Any]:
-        """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end.
+        """Return ``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end.
 
         Where the loss of dashpots is what the balance leaves, ``damping_quadrature`` in J is that of the trapezoidal
         rule, and ``damping_quadrature_error`` its estimated error.
@@ -218,7 +218,7 @@ class Ledger(Observer):
         return numbers
 
     def warnings(self) -> list[str]:
-        """A sentence where the balance has a larger error than a trajectory of the tolerance asked explains."""
+        """Return a sentence where the balance has a larger error than a trajectory of the tolerance asked explains."""
         error = self.statistics()["ledger_error"]
         rtol = self.setup.model.rtol
         bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)

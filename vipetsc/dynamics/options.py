@@ -15,7 +15,7 @@ RENAMING_VERSION = (3, 25)
 
 
 def with_database(case: Case) -> Case:
-    """The ``case`` with the options of ``ts`` in PETSc's database, where a script has put them."""
+    """Return the ``case`` with the options of ``ts`` in PETSc's database, where a script has put them."""
     database = PETSc.Options().getAll()
     names = [name for name in database if name.startswith("ts_") and not only_looks(name)]
     given = {name: database[name] or "true" for name in names} | case.petsc_options
@@ -25,7 +25,7 @@ def with_database(case: Case) -> Case:
 
 
 def name_in_petsc(name: str, version: tuple[int, ...] | None = None) -> str:
-    """The name that the option ``name`` of a case has in PETSc, of this ``version`` or as it is installed."""
+    """Return the name that the option ``name`` of a case has in PETSc, of this ``version`` or as it is installed."""
     version = version or PETSc.Sys.getVersion()
     if version < RENAMING_VERSION:
         return name
@@ -34,7 +34,7 @@ def name_in_petsc(name: str, version: tuple[int, ...] | None = None) -> str:
 
 
 def given_first_step(default: float) -> float:
-    """The first step of ``ts`` in PETSc's database; must be read before ``setFromOptions``, which removes a name."""
+    """Return first step of ``ts`` in PETSc's database; must be read before ``setFromOptions``, which removes a name."""
     database = PETSc.Options()
     for name in ("ts_time_step", "ts_dt"):
         if database.hasName(name):
@@ -105,7 +105,7 @@ def _is_refused(options: Mapping[str, str]) -> bool:
 
 
 def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Errors in ``options``, by name, after a time stepper has read them; raises PETSc.Error if it cannot."""
+    """Return errors in ``options``, by name, after a time stepper has read them; raises PETSc.Error if it cannot."""
     ts = PETSc.TS().create(PETSc.COMM_SELF)
     ts.setType(PETSc.TS.Type.RK)
     # A case keeps the later name where it has both.
@@ -134,7 +134,7 @@ def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 def _is_step(value: str) -> bool:
-    """Whether a time step may have the ``value``; a text that is no number is PETSc's to refuse."""
+    """Return whether a time step may have the ``value``; a text that is no number is PETSc's to refuse."""
     try:
         return 0 < float(value) < float("inf")
     except ValueError:

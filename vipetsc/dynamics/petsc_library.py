@@ -9,7 +9,7 @@ import numpy as np
 
 
 def refused_scalars(scalar: Any = None) -> str | None:
-    """Why a PETSc whose numbers are of the type ``scalar`` cannot be used, or None: kernels read real doubles.
+    """Return why a PETSc whose numbers are of the type ``scalar`` cannot be used, or None: kernels read real doubles.
 
     By default it is the installed one.
     """
@@ -23,6 +23,6 @@ def refused_scalars(scalar: Any = None) -> str | None:
 
 
 def petsc_library() -> ctypes.CDLL:
-    """The PETSc library to which petsc4py is linked; compiled code, too, finds its functions once this was called."""
+    """Return the PETSc library of petsc4py; compiled code, too, finds its functions once this was called."""
     # The handle of the extension module also finds PETSc's symbols; a library found by name might be another PETSc.
     return ctypes.CDLL(PETSc.__file__, mode=ctypes.RTLD_GLOBAL)

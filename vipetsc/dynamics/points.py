@@ -37,7 +37,7 @@ class PointMotion:
         self.pushes = np.array(pushes, np.int64).reshape(-1, 3)
 
     def gather(self, motion: np.ndarray) -> dict[str, np.ndarray]:
-        """Displacement, velocity and acceleration (t, point) by name, on rank 0; none elsewhere. Collective.
+        """Return displacement, velocity and acceleration (t, point) by name, on rank 0; none elsewhere. Collective.
 
         ``motion`` (t, 3, own point) are the samples of this rank.
         """

@@ -10,11 +10,11 @@ CHUNK_BYTES = 64 * 2**20
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:
-    """Cells (0-based) whose fields are recorded, of a lattice with so many ``cells``."""
+    """Return cells (0-based) whose fields are recorded, of a lattice with so many ``cells``."""
     first, last = output.window or (1, cells)
     return range(first - 1, last, output.every)
 
 
 def chunk_samples(sample_bytes: int) -> int:
-    """Number of samples in a chunk, if rank 0 stores ``sample_bytes`` of fields for each."""
+    """Return the number of samples in a chunk, if rank 0 stores ``sample_bytes`` of fields for each."""
     return min(max(CHUNK_BYTES // max(sample_bytes, 1), 1), CHUNK_SAMPLES)

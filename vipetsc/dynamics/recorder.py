@@ -108,7 +108,7 @@ class Recorder(Observer):
         self._fields = self.setup.output.fields_of_chunk(self._shape)
 
     def next_samples(self, number: int, most: int) -> Samples:
-        """Arrays for the samples from ``number`` on: as many as fit in the chunk, and ``most`` at most."""
+        """Return arrays for the samples from ``number`` on: as many as fit in the chunk, and ``most`` at most."""
         meter = self.setup.meter
         output = self.setup.case.output
         here = slice(self._held, self._held + most)
@@ -187,7 +187,7 @@ class Recorder(Observer):
         self._begin_chunk()
 
     def _gather(self, episodes: np.ndarray) -> dict[str, np.ndarray]:
-        """Fields, losses and ``episodes`` of the chunk of all ranks, on rank 0; nothing on the others."""
+        """Return fields, losses and ``episodes`` of the chunk of all ranks, on rank 0; nothing on the others."""
         comm = self.setup.layout.comm
         recording = self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
@@ -209,7 +209,7 @@ class Recorder(Observer):
         return chunk | dict(zip(recording.fields, all_cells, strict=True))
 
     def _gather_fields(self) -> np.ndarray:
-        """The fields (field, row, dof, cell) of the chunk of all ranks, on rank 0; the others return their own."""
+        """Return fields (field, row, dof, cell) of the chunk of all ranks, on rank 0; the others return their own."""
         comm = self.setup.layout.comm
         part = self._fields[:, : self._rows]
         # One rank's fields may be large: they are not copied.
@@ -262,7 +262,7 @@ class Recorder(Observer):
         return "no contact: nothing reached the site"
 
     def warnings(self) -> list[str]:
-        """Sentences on sites without contact, and on indentations beyond the range of Hertz's theory."""
+        """Return sentences on sites without contact, and on indentations beyond the range of Hertz's theory."""
         if note := self._note_on_contacts():
             return [note]
 
@@ -275,7 +275,7 @@ class Recorder(Observer):
 
 
 def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
-    """The arrays of ``GIVEN``: numbers of ``recorded`` cells, masses and sites, and properties of differing cells."""
+    """Return the arrays of ``GIVEN``: numbers of ``recorded`` cells, masses, sites; properties of differing cells."""
     chain = model.chain
     given = {
         "cell": recorded + 1,
@@ -293,7 +293,7 @@ def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _places(points: list[PointTable]) -> dict[str, np.ndarray]:
-    """The arrays of ``GIVEN`` that say where ``points`` are; none without points."""
+    """Return the arrays of ``GIVEN`` that say where ``points`` are; none without points."""
     if not points:
         return {}
     return {

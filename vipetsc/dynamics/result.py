@@ -46,7 +46,7 @@ class Result:
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], *, resumable: bool, folder: Path | None) -> "Result":
-        """The result that the ``attributes`` of a run's file state."""
+        """Return the result that the ``attributes`` of a run's file state."""
         return cls(
             complete=attributes["complete"],
             resumable=resumable,
@@ -71,7 +71,7 @@ class Result:
         return vipetsc.plot(self, name)
 
     def _repr_html_(self) -> str:
-        """The ending, warnings and some numbers, as a notebook shows them."""
+        """Return the ending, warnings and some numbers, as a notebook shows them."""
         rows = [(text, self.statistics.get(key)) for key, text in SHOWN.items()]
         rows += [("run", self.folder or "in memory, as `dataset`")]
         rows += [("warning", warning) for warning in self.warnings]

@@ -296,7 +296,7 @@ class Run:
         return block, failure
 
     def block(self, samples: Samples, count: int) -> Block:
-        """The block of the first ``count`` of ``samples``, with energies of all ranks; all ranks must call it."""
+        """Return block of the first ``count`` of ``samples``, with energies of all ranks; all ranks must call it."""
         energies = self.setup.meter.total(samples.sums[:count], samples.work[:count])
         times = np.arange(samples.number, samples.number + count) * self.setup.model.sample_interval
         return Block(

@@ -48,7 +48,7 @@ class Samples(NamedTuple):
     spent: np.ndarray
 
     def recorded_rows(self, samples: int) -> int:
-        """How many of the first ``samples`` samples have recorded fields."""
+        """Return how many of the first ``samples`` samples have recorded fields."""
         # The stride divides ceil(n/stride) of the numbers below n.
         return -(-(self.number + samples) // self.stride) + -self.number // self.stride
 
@@ -115,7 +115,7 @@ def _take_clipped(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray,
 
 @kernel
 def _is_finite(samples: Samples, k: int) -> bool:
-    """Whether all energies of sample ``k`` are numbers, and below where their sums saturate."""
+    """Return whether all energies of sample ``k`` are numbers, and below where their sums saturate."""
     finite = True
     for i in range(samples.sums.shape[1]):
         finite &= samples.sums[k, i, 0] < LARGEST

@@ -20,7 +20,7 @@ SITE_DOFS = np.dtype([("host", END), ("resonator", END), ("ledger", np.int64)])
 
 
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
-    """Records (site,) of dtype ``SITE`` of the sites with these ``numbers`` (site,) in the lattice, from 0.
+    """Return records (site,) of dtype ``SITE`` of the sites with these ``numbers`` (site,) in the lattice, from 0.
 
     Sites are free, or of the mode ``PERMANENT`` where they touch or are pressed at rest. A number below 0 stands for a
     site without stops.
@@ -58,7 +58,7 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
 
 
 def shortest_period(model: Model) -> float:
-    """Period in s of the highest frequency in lattice and drives, or of a bound of it; else a sample interval."""
+    """Return the highest frequency's period in s, or a bound of it, in lattice and drives; else a sample interval."""
     chain = model.chain
     if chain.variation is None:
         chain = Chain(chain.cell, 1)
@@ -93,7 +93,7 @@ def _describe_rigid_sites(sites: np.ndarray, numbers: np.ndarray, model: Model) 
 
 
 def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:
-    """Records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``."""
+    """Return records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``."""
     elements = contacts(model.chain)
     chosen = np.array(layout.contacts, np.int64)
     site_dofs = np.zeros(len(chosen), SITE_DOFS)
@@ -112,7 +112,7 @@ def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:
 
 @kernel
 def relative_motion(y: np.ndarray, site_dofs: np.ndarray, i: int) -> tuple[float, float]:
-    """w = u_resonator - u_host in m of site ``i`` in the state ``y`` (component,), and w' in m/s.
+    """Return w = u_resonator - u_host in m of site ``i`` in the state ``y`` (component,), and w' in m/s.
 
     ``site_dofs`` (site,) are of dtype ``SITE_DOFS``.
     """

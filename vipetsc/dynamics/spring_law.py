@@ -17,23 +17,23 @@ SPRING_LAW = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
 
 
 def spring_laws(springs: Sequence[Spring]) -> np.ndarray:
-    """Parameters (spring,) of dtype ``SPRING_LAW`` of ``springs``."""
+    """Return parameters (spring,) of dtype ``SPRING_LAW`` of ``springs``."""
     return np.array([(spring.quadratic, spring.cubic) for spring in springs], SPRING_LAW)
 
 
 @kernel
 def nonlinear_force(law: Any, z: float) -> float:
-    """Force in N at the elongation z in m of a spring with a ``law`` of dtype ``SPRING_LAW``."""
+    """Return the force in N at the elongation z in m of a spring with a ``law`` of dtype ``SPRING_LAW``."""
     return z * z * (law.quadratic + law.cubic * z)
 
 
 @kernel
 def nonlinear_slope(law: Any, z: float) -> float:
-    """Derivative in N/m of ``nonlinear_force`` by the elongation z in m."""
+    """Return the derivative in N/m of ``nonlinear_force`` by the elongation z in m."""
     return (2.0 * law.quadratic + 3.0 * law.cubic * z) * z
 
 
 @kernel
 def nonlinear_energy(law: Any, z: float) -> float:
-    """Integral in J of ``nonlinear_force`` from 0 to the elongation z in m."""
+    """Return the integral in J of ``nonlinear_force`` from 0 to the elongation z in m."""
     return z * z * z * (law.quadratic / 3.0 + 0.25 * law.cubic * z)

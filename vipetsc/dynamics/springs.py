@@ -28,13 +28,13 @@ CHUNK = 512
 
 @kernel
 def is_varied(lattice: LatticeRecord) -> bool:
-    """Whether each cell has its own masses, springs and dashpots."""
+    """Return whether each cell has its own masses, springs and dashpots."""
     return lattice.inverse_masses.size > 0
 
 
 @kernel
 def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """1/m in 1/kg of a ``mass`` in an owned ``cell``."""
+    """Return 1/m in 1/kg of a ``mass`` in an owned ``cell``."""
     if is_varied(lattice):
         return lattice.inverse_masses[mass * lattice.shape.cells + cell]
     return lattice.masses[mass].inverse_mass
@@ -42,7 +42,7 @@ def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
 
 @kernel
 def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
-    """Where ``stiffness`` and ``damping`` have the spring of a ``coupling`` of the owned ``cell``."""
+    """Return where ``stiffness`` and ``damping`` have the spring of a ``coupling`` of the owned ``cell``."""
     # A spring between two cells is listed with the left one. Each spring's row of the tables therefore begins with the
     # cell before the first owned one, whose springs reach it.
     left = cell + min(coupling.offset, 0)
@@ -51,7 +51,7 @@ def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
 
 @kernel
 def _stiffness(lattice: LatticeRecord, coupling: Any, cell: int) -> float:
-    """Stiffness in N/m of the spring of a ``coupling`` of the owned ``cell``."""
+    """Return the stiffness in N/m of the spring of a ``coupling`` of the owned ``cell``."""
     if is_varied(lattice):
         return lattice.stiffness[_table_entry(lattice, coupling, cell)]
     return coupling.stiffness
@@ -59,7 +59,7 @@ def _stiffness(lattice: LatticeRecord, coupling: Any, cell: int) -> float:
 
 @kernel
 def _other_end(lattice: LatticeRecord, coupling: Any, cell: int) -> tuple[int, int]:
-    """Where the state has displacement and velocity of the other mass of a ``coupling`` of the owned ``cell``.
+    """Return where the state has displacement and velocity of the other mass of a ``coupling`` of the owned ``cell``.
 
     ``WALL`` or ``NOTHING`` where there is no mass. Ghosts have velocities only where there are dashpots or contacts
     join cells (``Layout.ghost_rows``).
@@ -74,7 +74,7 @@ def _other_end(lattice: LatticeRecord, coupling: Any, cell: int) -> tuple[int, i
 
 @kernel
 def _value(y: np.ndarray, component: int) -> float:
-    """Displacement or velocity that ``y`` has at a ``component``; zero in a wall."""
+    """Return the displacement or velocity that ``y`` has at a ``component``; zero in a wall."""
     if component < 0:
         return 0.0
     return y[component]
@@ -82,7 +82,7 @@ def _value(y: np.ndarray, component: int) -> float:
 
 @kernel
 def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Acceleration in m/s^2 of one mass of an owned ``cell`` by its springs and dashpots.
+    """Return the acceleration in m/s^2 of one mass of an owned ``cell`` by its springs and dashpots.
 
     ``y`` (component,) is the rank's part of the state, with ghosts. The sums are those of the chunked loops, bit for
     bit.
@@ -205,7 +205,7 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
 
 @kernel
 def _elongation(y: np.ndarray, lattice: LatticeRecord, coupling: Any, cell: int) -> float:
-    """Elongation in m of the spring of a ``coupling`` of the owned ``cell``; 0 of one beyond a free end."""
+    """Return the elongation in m of the spring of a ``coupling`` of the owned ``cell``; 0 of one beyond a free end."""
     other, _ = _other_end(lattice, coupling, cell)
     if other == NOTHING:
         return 0.0
@@ -214,7 +214,7 @@ def _elongation(y: np.ndarray, lattice: LatticeRecord, coupling: Any, cell: int)
 
 @kernel
 def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Force in N on one mass of an owned ``cell`` by the nonlinear parts of its springs.
+    """Return the force in N on one mass of an owned ``cell`` by the nonlinear parts of its springs.
 
     ``y`` (component,) is the rank's part of the state, with ghosts.
     """
@@ -287,7 +287,7 @@ def spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies:
 
 @kernel
 def _cells_with(coupling: Any, first: int, cells: int) -> int:
-    """How many of so many ``cells`` from ``first`` on have the energy of the spring of a ``coupling``.
+    """Return how many of so many ``cells`` from ``first`` on have the energy of the spring of a ``coupling``.
 
     A spring is there twice, once for each of its masses. It counts at its start, and at its end if it starts on the
     ground, or in the wall on the left, next to which there is the first cell.

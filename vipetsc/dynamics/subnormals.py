@@ -45,5 +45,5 @@ def subnormals_as_zero() -> Iterator[None]:
 
 @cache
 def _c_library() -> ctypes.CDLL:
-    """The library of C that this process uses."""
+    """Return the library of C that this process uses."""
     return ctypes.CDLL(None)

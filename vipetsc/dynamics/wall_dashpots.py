@@ -26,7 +26,7 @@ class WallDashpots:
         self._spent = np.zeros(len(model.drives))
 
     def spent(self, number: int, count: int) -> np.ndarray:
-        """The integrals (sample, drive) in J from t = 0 to ``count`` samples from ``number`` on."""
+        """Return the integrals (sample, drive) in J from t = 0 to ``count`` samples from ``number`` on."""
         spent = np.zeros((count, len(self._spent)))
         if not self._waveforms or not count:
             return spent
@@ -46,7 +46,7 @@ class WallDashpots:
 
 
 def _integrals(damping: float, waveform: Waveform, times: np.ndarray) -> np.ndarray:
-    """The integrals (interval,) in J between each two of the ``times`` (interval + 1,) in s."""
+    """Return the integrals (interval,) in J between each two of the ``times`` (interval + 1,) in s."""
     breaks = waveform.breaks
     ends = np.union1d(times, breaks[(breaks > times[0]) & (breaks < times[-1])])
     if len(ends) < 2:

@@ -6,17 +6,17 @@ __version__ = "1.0"
 
 
 def force(x: float, k: float, b: float) -> float:
-    """Elastic force in N."""
+    """Return the elastic force in N."""
     return k * x * (1 + b * x**2)
 
 
 def slope(x: float, k: float, b: float) -> float:
-    """Derivative of the force in N/m."""
+    """Return the derivative of the force in N/m."""
     return k * (1 + 3 * b * x**2)
 
 
 def energy(x: float, k: float, b: float) -> float:
-    """Integral of the force from 0 to x in J."""
+    """Return the integral of the force from 0 to x in J."""
     return k * x**2 * (1 / 2 + b * x**2 / 4)
 
 

@@ -61,7 +61,7 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
 
 
 def _gap_label(plus: float, minus: float) -> str:
-    """The clearances in mm of a site's stops by their side, a line each; a stop that touches is 0."""
+    """Return the clearances in mm of a site's stops by their side, a line each; a stop that touches is 0."""
     lines = []
     for side, gap in (("+", plus), ("-", minus)):
         if np.isfinite(gap):

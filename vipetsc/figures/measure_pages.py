@@ -199,7 +199,7 @@ def _seed_dimension(ensemble: xr.Dataset) -> str:
 
 
 def is_on_request(name: str) -> bool:
-    """Whether the measure ``name``, perhaps of a point, has pages only where it is asked for."""
+    """Return whether the measure ``name``, perhaps of a point, has pages only where it is asked for."""
     return name in ON_REQUEST or name.partition("/")[0] in ON_REQUEST
 
 

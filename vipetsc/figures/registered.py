@@ -21,7 +21,7 @@ RESULTS = tuple(kind.file for kind in KINDS if kind != PAPER)
 
 
 def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, Callable[..., Any]], str]:
-    """The functions of registered figures of a ``source`` by name, and a message why modules cannot be imported, or "".
+    """Return functions of registered figures of a ``source`` by name, and why modules cannot be imported, or "".
 
     The modules are those that the case of the results in the first of ``folders`` names. Sources are those of
     ``vipetsc.io.kinds``, functions those of ``vipetsc.figures.registry.FigureSpec``.
@@ -47,7 +47,7 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
 
 
 def _modules(folder: Path) -> list[str]:
-    """The modules that the case of the results in ``folder`` names; none if they cannot be read."""
+    """Return the modules that the case of the results in ``folder`` names; none if they cannot be read."""
     for pattern in RESULTS:
         # All branches of a folder have one case: the first one stands for them.
         for path in sorted(folder.glob(pattern))[:1]:
@@ -61,7 +61,7 @@ def _modules(folder: Path) -> list[str]:
 
 
 def drawn(part: FigurePart, *results: Any) -> Figure:
-    """The figure of a ``part``; raises PartError for one that fails, or returns something else."""
+    """Return the figure of a ``part``; raises PartError for one that fails, or returns something else."""
     figure = plugins.call(part, part.function, *results)
     if not isinstance(figure, Figure):
         raise PartError(f"the figure {part.name!r} of {part.file} returns {figure!r}; a Figure is needed")

@@ -89,7 +89,7 @@ class Strip(NamedTuple):
         return self._positions(i, j)
 
     def _positions(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The positions x and y (...) of places (i, j), in units of the vector along the strip."""
+        """Return the positions x and y (...) of places (i, j), in units of the vector along the strip."""
         (x1, y1), (x2, y2) = self.plane.vectors
         return i * x1 + j * x2, i * y1 + j * y2
 
@@ -125,12 +125,12 @@ def is_strip(run: xr.Dataset) -> bool:
 
 
 def _places(masses: list[tuple[int, int]], dofs: int) -> np.ndarray:
-    """The places (n, 2), from 1, of masses by their cell and their number in the wide cell, both from 0."""
+    """Return the places (n, 2), from 1, of masses by their cell and their number in the wide cell, both from 0."""
     return np.array([(cell + 1, mass // dofs + 1) for cell, mass in masses], int).reshape(-1, 2)
 
 
 def _symmetric(values: np.ndarray) -> Normalize:
-    """Colours from minus to plus the largest magnitude of ``values``."""
+    """Return colours from minus to plus the largest magnitude of ``values``."""
     largest = float(np.abs(values).max()) or 1.0
     return Normalize(-largest, largest)
 
@@ -210,7 +210,7 @@ def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def _content(strip: Strip, run: xr.Dataset, row: int) -> np.ndarray:
-    """The energies (k1, k2) in J of all branches at a sample; fields that end are tapered towards their ends."""
+    """Return the energies (k1, k2) in J of all branches at a sample; fields that end are tapered towards their ends."""
     fields = [strip.by_cell(run[name][row].values) for name in ("displacement", "velocity")]
     for axis, is_ring in enumerate(strip.rings):
         if not is_ring:

@@ -111,17 +111,17 @@ class LeftOut:
 
 
 def band_colour(number: int) -> str:
-    """The colour of pass band ``number`` (from 1) in every picture."""
+    """Return the colour of pass band ``number`` (from 1) in every picture."""
     return BAND_COLOURS[(number - 1) % len(BAND_COLOURS)]
 
 
 def band_look(number: int) -> dict[str, Any]:
-    """The colour and the dashes of pass band ``number`` (from 1), for curves that greyscale print must tell apart."""
+    """Return colour and dashes of pass band ``number`` (from 1), for curves that grey print must tell apart."""
     return {"color": band_colour(number), "ls": BAND_DASHES[(number - 1) % len(BAND_DASHES)]}
 
 
 def band_number(part: str) -> int | None:
-    """The number of the pass band that a ``part`` of the frequency axis is, 2 for "band 2"; None for a gap.
+    """Return the number of the pass band that a ``part`` of the frequency axis is, 2 for "band 2"; None for a gap.
 
     Of bands that overlap, as in "band 2+3", it is the lowest.
     """
@@ -132,7 +132,7 @@ def band_number(part: str) -> int | None:
 
 
 def part_label(part: str) -> str:
-    """The name of a ``part`` of the frequency axis in a picture; of many bands that overlap, the first and the last."""
+    """Return the name of a ``part`` of the frequency axis in a picture; of many bands, the first and last."""
     kind, _, numbers = part.partition(" ")
     bands = numbers.split("+")
     if kind != "band" or len(bands) < 4:
@@ -162,12 +162,12 @@ def _settings(file: str) -> dict[str, Any]:
 
 
 def with_prefix(value: float, unit: str) -> str:
-    """A value in four digits with its unit and an SI prefix: 20 kN/m, 2.5 g."""
+    """Return a value in four digits with its unit and an SI prefix: 20 kN/m, 2.5 g."""
     return EngFormatter(unit)(float(f"{value:.4g}"))
 
 
 def new_figure(width: float, height: float, heading: str = "") -> Figure:
-    """An empty figure of ``width`` x ``height`` inches under a ``heading``, which needs no display and no pyplot."""
+    """Return an empty figure of ``width`` x ``height`` inches under a ``heading``, without display or pyplot."""
     figure = Figure(figsize=(width, height))
     # The canvas that measures text for the layout prints it too, and remembers what it has measured.
     FigureCanvasAgg(figure)

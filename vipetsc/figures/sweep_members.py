@@ -86,7 +86,7 @@ class MemberRun(NamedTuple):
         return Labels.of(self.case, self.varied)
 
     def shown(self, name: str = "") -> Shown:
-        """The run and its analysis, from which pictures of the member are drawn, under a ``name`` on the page."""
+        """Return run and its analysis, from which pictures of the member are drawn, under a ``name`` on the page."""
         return Shown(name or self.labels.member, [self.run, self.analysis])
 
     @classmethod

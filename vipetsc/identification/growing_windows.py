@@ -39,7 +39,7 @@ SIDES = {"clearance": [0], "clearance_minus": [1]}
 
 
 def reached_by(misfit: Misfit, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
-    """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met.
+    """Return the largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met.
 
     ``z`` (coordinate,) are the model's coordinates, ``ends`` (record,) times of the records' clocks in s. Raises
     CaseError, MotionError.
@@ -56,7 +56,7 @@ def reached_by(misfit: Misfit, z: np.ndarray, ends: Sequence[float]) -> np.ndarr
 
 
 def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.ndarray) -> float:
-    """The largest motion in m towards the stops of a clearance if none of them is met, else NaN.
+    """Return the largest motion in m towards the stops of a clearance if none of them is met, else NaN.
 
     ``reached`` (site, 2) is that of ``reached_by``. The result is NaN for other parameters than clearances.
     """
@@ -75,7 +75,7 @@ def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.
 
 
 def motion_without(misfit: Misfit, z: np.ndarray, number: int, ends: Sequence[float], highest: np.ndarray) -> float:
-    """The largest motion in m towards the stops of a clearance, where the record does not need them; else NaN.
+    """Return the largest motion in m towards the stops of a clearance, where the record does not need them; else NaN.
 
     The record is explained as well with the clearance ``number`` at its upper bound in ``highest`` (coordinate,) as at
     ``z`` (coordinate,), where a contact may just graze. The result is NaN for other parameters than clearances.
@@ -91,7 +91,7 @@ def motion_without(misfit: Misfit, z: np.ndarray, number: int, ends: Sequence[fl
 
 
 def other_contacts(misfit: Misfit, z: np.ndarray, ends: Sequence[float], highest: np.ndarray) -> np.ndarray | None:
-    """The coordinates (coordinate,) with those clearances, of the ones tried, that lower the misfit; None if none does.
+    """Return the coordinates (coordinate,) with those clearances, of the ones tried, that lower the misfit, or None.
 
     The search begins at ``z`` (coordinate,), with windows up to ``ends`` (record,) in s; ``highest`` (coordinate,) are
     the upper bounds.
@@ -118,7 +118,7 @@ def other_contacts(misfit: Misfit, z: np.ndarray, ends: Sequence[float], highest
 def _clearances_tried(
     misfit: Misfit, z: np.ndarray, free: np.ndarray, number: int, ends: Sequence[float]
 ) -> list[np.ndarray]:
-    """The coordinates ``z`` (coordinate,) with other values of the clearance ``number``, a list of arrays.
+    """Return the coordinates ``z`` (coordinate,) with other values of the clearance ``number``, a list of arrays.
 
     The values are fractions of the motion at ``free`` (coordinate,), where the clearance is at its upper bound.
     """
@@ -277,7 +277,7 @@ class GrowingWindows:
         )
 
     def deviance(self, z: np.ndarray) -> float:
-        """Minus twice the log-likelihood at ``z`` (coordinate,) but for a constant: of two fits the lower is better.
+        """Return minus twice the log-likelihood at ``z`` (coordinate,) up to a constant: the lower fit is better.
 
         It is the sum of squared residuals over the noise, plus 2 log(noise) for every datum, plus the initial states'
         prior.
@@ -288,7 +288,7 @@ class GrowingWindows:
         return total
 
     def _every(self) -> list[int]:
-        """The numbers of all coordinates."""
+        """Return the numbers of all coordinates."""
         return list(range(self.misfit.size))
 
     def _fit_linear_parts(self, z: np.ndarray, windows: list[Window]) -> np.ndarray:
@@ -378,11 +378,11 @@ class GrowingWindows:
                 ends = self.last
 
     def _first(self) -> list[float]:
-        """The first time in s of each record's clock."""
+        """Return the first time in s of each record's clock."""
         return [float(record.times[0]) for record in self.misfit.records]
 
     def _first_lengths(self) -> list[float]:
-        """The largest lengths (record) in s of the first window in each record: longer if the unknowns need more data.
+        """Return the longest first windows (record) in s in each record: longer if the unknowns need more data.
 
         ``_ends`` keeps to them in records whose initial state is estimated.
         """
@@ -397,7 +397,7 @@ class GrowingWindows:
         return lengths
 
     def _ends(self, z: np.ndarray, impacts: int, lengths: Sequence[float]) -> list[float]:
-        """Times in s of the records' clocks at the model's contact number ``impacts`` + 1, or the last times.
+        """Return times in s of the records' clocks at the model's contact number ``impacts`` + 1, or the last times.
 
         A window of a record whose initial state is estimated has its length of ``lengths`` (record,) in s at most: as
         long as that state is not found, the model has few contacts or none.
@@ -414,7 +414,7 @@ class GrowingWindows:
         return ends
 
     def onsets(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
-        """The onsets (episode,) in s of the model's contacts in record ``number``, by its clock.
+        """Return the onsets (episode,) in s of the model's contacts in record ``number``, by its clock.
 
         They are those from the record's first sample to its time ``end``; none where the model has no motion.
         """
@@ -425,7 +425,7 @@ class GrowingWindows:
         return onset[onset > self.misfit.records[number].times[0]]
 
     def _window(self, z: np.ndarray, ends: Sequence[float]) -> Window:
-        """The window up to ``ends`` (record,) in s with its misfit at ``z``."""
+        """Return the window up to ``ends`` (record,) in s with its misfit at ``z``."""
         impacts = []
         for number, (record, end) in enumerate(zip(self.misfit.records, ends, strict=True)):
             if end >= record.times[0]:
@@ -440,7 +440,7 @@ class GrowingWindows:
         )
 
     def solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
-        """The coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds.
+        """Return coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds.
 
         The fit begins at ``z`` (coordinate,), of which the ``active`` coordinates are fitted, to data up to ``ends``
         (record,) in s. Raises CaseError, MotionError, and what ``check`` raises.
@@ -513,18 +513,18 @@ class GrowingWindows:
             self.misfit.noise[number] = np.where(self._is_given[number], self.misfit.noise[number], estimated)
 
     def freedom(self, z: np.ndarray) -> float:
-        """Degrees of freedom of the residuals at ``z`` (coordinate,): data less what is fitted to them, at least 1."""
+        """Return degrees of freedom of the residuals at ``z`` (coordinate,): data less what is fitted, at least 1."""
         count = sum(record.values.size for record in self.misfit.records)
         return max(count - self._fitted(z), 1.0)
 
     def noise_freedom(self, z: np.ndarray) -> float:
-        """Degrees of freedom of the noise at ``z`` (coordinate,): those of the residuals, inf if all noise is given."""
+        """Return the degrees of freedom of the noise at ``z`` (coordinate,); inf if all noise is given."""
         if all(map(all, self._is_given)):
             return np.inf
         return self.freedom(z)
 
     def _fitted(self, z: np.ndarray) -> float:
-        """How many numbers are fitted to the data at ``z``: one a parameter, less than one a coordinate of a state.
+        """Return how many numbers are fitted to the data at ``z``: one a parameter, less than one a state's coordinate.
 
         The prior holds a state in part.
         """

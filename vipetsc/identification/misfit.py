@@ -62,7 +62,7 @@ class InitialState(NamedTuple):
 
 
 def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, float]]) -> InitialState:
-    """The initial state of ``model`` in coordinates that have the indices from ``first`` on.
+    """Return the initial state of ``model`` in coordinates that have the indices from ``first`` on.
 
     A sensor is the mass (0-based), the order of the derivative of its displacement that is measured, and the root mean
     square of what was measured.
@@ -109,7 +109,7 @@ Job = Callable[[], np.ndarray]
 
 
 def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
-    """The values (...) of all ``jobs``, which this rank computes alone."""
+    """Return the values (...) of all ``jobs``, which this rank computes alone."""
     return [job() for job in jobs]
 
 
@@ -165,16 +165,16 @@ class Misfit:
         return len(self.plan.parameters)
 
     def model(self, z: np.ndarray, number: int) -> Model:
-        """The model of record ``number`` (from 0) at ``z`` (coordinate,); raises CaseError if it is impossible."""
+        """Return model of record ``number`` (from 0) at ``z`` (coordinate,); raises CaseError if it is impossible."""
         return self._trials[number].case(self.values(z)).model()
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """The values (parameter,) at the coordinates ``z`` (coordinate,)."""
+        """Return the values (parameter,) at the coordinates ``z`` (coordinate,)."""
         parameters = self.plan.parameters
         return np.array([p.from_coordinate(x) for p, x in zip(parameters, z[: self.count], strict=True)])
 
     def offset(self, z: np.ndarray, number: int) -> float:
-        """The time in s of the record ``number``'s clock at which its drive begins, at ``z`` (coordinate,)."""
+        """Return the time in s of the record ``number``'s clock at which its drive begins, at ``z`` (coordinate,)."""
         offset = self.plan.options.records[number].offset
         if not isinstance(offset, list):
             return offset
@@ -186,7 +186,7 @@ class Misfit:
         )
 
     def motion(self, z: np.ndarray, number: int, end: float) -> RecordedMotion:
-        """The motion of record ``number`` at ``z`` (coordinate,), at its sensors, up to ``end`` in s of its clock.
+        """Return motion of record ``number`` at ``z`` (coordinate,), at its sensors, up to ``end`` in s of its clock.
 
         The latest ``KEPT`` motions are kept. Raises CaseError, MotionError.
         """
@@ -195,11 +195,11 @@ class Misfit:
         return self._kept_motion(tuple(z.tolist()), number, samples)
 
     def _new_motion(self, z: tuple[float, ...], number: int, samples: int) -> RecordedMotion:
-        """The ``motion`` at ``z`` over so many ``samples``, computed; a cache needs a tuple of numbers."""
+        """Return the ``motion`` at ``z`` over so many ``samples``, computed; a cache needs a tuple of numbers."""
         return self.respond(np.array(z), number, self.watched[number], self.records[number].times[:samples])
 
     def respond(self, z: np.ndarray, number: int, watched: Sequence[int], times: np.ndarray) -> RecordedMotion:
-        """The motion of record ``number`` at ``z`` (coordinate,), of the masses ``watched`` (mass,).
+        """Return the motion of record ``number`` at ``z`` (coordinate,), of the masses ``watched`` (mass,).
 
         It is sampled at the even ``times`` (sample,) in s of the record's clock, from its first one on. Raises
         CaseError, MotionError.
@@ -210,7 +210,7 @@ class Misfit:
         return sampled.respond(times, self.offset(z, number), self._state(z, number))
 
     def _state(self, z: np.ndarray, number: int) -> State | None:
-        """The state at the first sample of record ``number``, at ``z`` (coordinate,), if it is estimated."""
+        """Return the state at the first sample of record ``number``, at ``z`` (coordinate,), if it is estimated."""
         state = self.states.get(number)
         if state is None:
             return None
@@ -219,7 +219,7 @@ class Misfit:
         return displacement, velocity
 
     def predicted(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
-        """Values of the model at the sensors of a record (sample, sensor), at ``z`` (coordinate,).
+        """Return values of the model at the sensors of a record (sample, sensor), at ``z`` (coordinate,).
 
         ``end`` in s is a time of the record's clock. Raises CaseError, MotionError.
         """
@@ -234,7 +234,7 @@ class Misfit:
         return values
 
     def _force(self, z: np.ndarray, number: int, end: float, sensor: SensorTable) -> np.ndarray:
-        """The force (sample,) in N of the drive at a ``sensor`` of record ``number``, at ``z`` (coordinate,)."""
+        """Return the force (sample,) in N of the drive at a ``sensor`` of record ``number``, at ``z`` (coordinate,)."""
         case = self._trials[number].case(self.values(z))
         model = case.model()
         # The model has a drive for each spring to a moved wall, and so may have more of them than the case.
@@ -246,7 +246,7 @@ class Misfit:
         return drive_forces(drives, since)[place] * (since > 0)
 
     def residuals(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
-        """Residuals (datum,) over the noise at ``z`` (coordinate,), up to times ``ends`` (record,) in s of the records.
+        """Return residuals (datum,) over the noise at ``z`` (coordinate,), up to ``ends`` (record,) in s.
 
         Data are ordered by record, sample, sensor; a record with an end of -inf is left out. Residuals of a record are
         ``REJECTED``, or more if the noise is very small, where the model is impossible or its motion cannot be
@@ -268,7 +268,7 @@ class Misfit:
     def jacobian(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], is_rough: bool = False
     ) -> np.ndarray:
-        """Derivatives (datum, active) of ``residuals``, rough or exact; raises CaseError, MotionError."""
+        """Return derivatives (datum, active) of ``residuals``, rough or exact; raises CaseError, MotionError."""
 
         def column(number: int, p: int) -> np.ndarray:
             slope = self.difference(z, p, partial(self.predicted, number=number, end=ends[number]), is_rough)
@@ -290,7 +290,7 @@ class Misfit:
     def difference(
         self, z: np.ndarray, p: int, function: Callable[[np.ndarray], np.ndarray], is_rough: bool = False
     ) -> np.ndarray:
-        """The derivative of a ``function`` of the coordinates by coordinate ``p``, at ``z`` (coordinate,).
+        """Return the derivative of a ``function`` of the coordinates by coordinate ``p``, at ``z`` (coordinate,).
 
         It is a central difference; a rough one is between ``z``, where the motion is known, and a coordinate above. At
         a bound both are between the bound and a coordinate inside.
@@ -310,7 +310,7 @@ class Misfit:
         return (function(above) - function(below)) / (above[p] - below[p])
 
     def acts_on(self, p: int, number: int) -> bool:
-        """Whether the motion or the clock of record ``number`` may depend on coordinate ``p``."""
+        """Return whether the motion or the clock of record ``number`` may depend on coordinate ``p``."""
         if p >= self.count:
             state = self.states.get(number)
             return state is not None and p in state.indices
@@ -318,7 +318,7 @@ class Misfit:
         return parameter.quantity != "offset" or parameter.members == (number,)
 
     def cost(self, z: np.ndarray, ends: Sequence[float]) -> float:
-        """The sum of squares at ``z`` (coordinate,) of residuals over the noise and of the initial states' prior.
+        """Return sum of squares at ``z`` (coordinate,) of residuals over the noise and of the initial states' prior.
 
         The residuals are those up to ``ends`` (record,) in s.
         """
@@ -326,16 +326,16 @@ class Misfit:
         return float(np.sum(data**2)) + float(np.sum((self.prior() @ z) ** 2))
 
     def _used(self, ends: Sequence[float]) -> list[int]:
-        """The numbers of the records that have samples up to ``ends``."""
+        """Return the numbers of the records that have samples up to ``ends``."""
         return [n for n, (record, end) in enumerate(zip(self.records, ends, strict=True)) if record.times[0] <= end]
 
     def prior(self) -> np.ndarray:
-        """The slopes (state coordinate, coordinate) of the prior's residuals, which are coordinates over ``WIDTH``.
+        """Return slopes (state coordinate, coordinate) of the prior's residuals, which are coordinates over ``WIDTH``.
 
         They keep initial states finite.
         """
         return np.eye(self.size)[self.count :] / WIDTH
 
     def whole_jacobian(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
-        """The ``jacobian`` (residual, coordinate), with the rows of the ``prior`` behind those of data."""
+        """Return the ``jacobian`` (residual, coordinate), with the rows of the ``prior`` behind those of data."""
         return np.vstack([self.jacobian(z, ends, range(self.size)), self.prior()])

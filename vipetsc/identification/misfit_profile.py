@@ -50,7 +50,7 @@ class MisfitProfile(NamedTuple):
     slopes: np.ndarray
 
     def outwards(self, number: int, middle: float, side: Side) -> np.ndarray:
-        """Numbers (place,) of the places of parameter ``number`` on one ``side`` of the coordinate ``middle``.
+        """Return numbers (place,) of the places of parameter ``number`` on one ``side`` of the coordinate ``middle``.
 
         The nearest comes first. A place at the middle itself counts as one above it.
         """
@@ -61,7 +61,7 @@ class MisfitProfile(NamedTuple):
 
 
 def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
-    """The profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
+    """Return the profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
     slopes = windows.misfit.whole_jacobian(z, windows.last)
     uncertainty = uncertainty_of(slopes)
     errors = uncertainty.errors
@@ -80,7 +80,7 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
 def profile_costs(
     windows: GrowingWindows, z: np.ndarray, profile: MisfitProfile, number: int, side: Side
 ) -> list[float]:
-    """The least costs at the places of parameter ``number`` on one ``side`` of the fit ``z`` (coordinate,).
+    """Return the least costs at the places of parameter ``number`` on one ``side`` of the fit ``z`` (coordinate,).
 
     The nearest place comes first. Raises CaseError, MotionError.
     """
@@ -137,5 +137,5 @@ def _follow(windows: GrowingWindows, held: _Held, number: int, value: float) -> 
 
 
 def _contacts(windows: GrowingWindows, z: np.ndarray) -> list[int]:
-    """The numbers of the model's contacts, one a record."""
+    """Return the numbers of the model's contacts, one a record."""
     return [len(windows.onsets(z, number, end)) for number, end in enumerate(windows.last)]

@@ -69,7 +69,7 @@ class SampledModel:
     touches: bool = True
 
     def respond(self, times: np.ndarray, begin: float, state: State | None = None) -> RecordedMotion:
-        """The motion at the even ``times`` (sample,) in s, whose drive begins at ``begin`` in s of the same clock.
+        """Return motion at the even ``times`` (sample,) in s, whose drive begins at ``begin`` in s of the same clock.
 
         The lattice begins there too, at rest or in the motion of the model; or it is in ``state`` at the first time.
         Raises MotionError if it cannot be followed to the last time.
@@ -106,7 +106,7 @@ class SampledModel:
         return RecordedMotion(motion, run.onset + zero, run.site, run.side, self._reached(run, interval / parts))
 
     def _at_rest(self, samples: int) -> RecordedMotion:
-        """The motion at so many ``samples`` before anything begins."""
+        """Return the motion at so many ``samples`` before anything begins."""
         none = np.zeros(0, int)
         return RecordedMotion(
             motion=np.zeros((samples, len(self.watched), 3)),
@@ -147,7 +147,7 @@ class SampledModel:
         )
 
     def _reached(self, run: "_Run", interval: float) -> np.ndarray:
-        """The largest w and -w (site, 2) of a ``run``, at its samples and between them."""
+        """Return the largest w and -w (site, 2) of a ``run``, at its samples and between them."""
         chain = self.model.chain
         reached = np.zeros((len(chain.sites), 2))
         s = BETWEEN[:, None]
@@ -175,7 +175,7 @@ class _Run(NamedTuple):
 
 
 def shifted(drive: Drive, late: float) -> list[Drive]:
-    """Drives that together are ``drive`` as it would be if it began ``late`` s later, or earlier if that is negative.
+    """Return drives that together are ``drive`` as if it began ``late`` s later, or earlier if negative.
 
     A tone burst, which begins at t = 0, becomes its three sines.
     """
@@ -194,12 +194,12 @@ def shifted(drive: Drive, late: float) -> list[Drive]:
 
 
 def _sines(burst: ToneBurst) -> list[tuple[float, float]]:
-    """The sines whose sum is [1 - cos(Om t/Nc)] sin(Om t): their frequency over Om, their weight."""
+    """Return the sines whose sum is [1 - cos(Om t/Nc)] sin(Om t): their frequency over Om, their weight."""
     return [(1.0, 1.0), (1 + 1 / burst.cycles, -0.5), (1 - 1 / burst.cycles, -0.5)]
 
 
 def _sine(burst: ToneBurst, factor: float, weight: float) -> np.ndarray:
-    """The piece (1,) of one sine of a ``burst``."""
+    """Return the piece (1,) of one sine of a ``burst``."""
     table = np.zeros(1, PIECE)
     table[COEFFICIENTS[0]] = weight * burst.window_amplitude
     table["frequency"] = factor * burst.frequency
@@ -207,7 +207,7 @@ def _sine(burst: ToneBurst, factor: float, weight: float) -> np.ndarray:
 
 
 def fastest(chain: Chain) -> float:
-    """An upper bound in rad/s of the frequencies of the lattice without contacts."""
+    """Return an upper bound in rad/s of the frequencies of the lattice without contacts."""
     # No eigenvalue of a symmetric matrix exceeds the largest sum of magnitudes in a row (Gershgorin). The matrix is
     # K_ij/(m_i m_j)^(1/2), whose eigenvalues are the squared frequencies.
     roots = 1 / np.sqrt(chain.masses())

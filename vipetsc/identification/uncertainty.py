@@ -29,7 +29,7 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
-    """The uncertainty by the ``jacobian`` J (datum, parameter) of residuals over the noise: covariance (J^T J)^-1."""
+    """Return the uncertainty by the ``jacobian`` J (datum, parameter) of weighted residuals: (J^T J)^-1."""
     # With fewer data than parameters rows of zeros stand for those that are missing: without them the singular value
     # decomposition would leave out as many directions, along which the data determine nothing.
     missing = jacobian.shape[1] - len(jacobian)
@@ -53,7 +53,7 @@ def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
 
 
 def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
-    """A Jacobian (count, count) of the first ``count`` coordinates, with the others left free.
+    """Return a Jacobian (count, count) of the first ``count`` coordinates, with the others left free.
 
     Its uncertainty is that of these coordinates by the whole ``jacobian`` J (datum, coordinate): its product with its
     transpose is the Schur complement A - B D^-1 B^T of J^T J, with the blocks A of these coordinates and D of the
@@ -67,7 +67,7 @@ def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
 
 
 def quantile(confidence: float, freedom: float = np.inf) -> float:
-    """Number of standard errors on either side of a value in an interval of that ``confidence``.
+    """Return the number of standard errors on either side of a value in an interval of that ``confidence``.
 
     ``freedom`` are the degrees of freedom of the noise: data less what is fitted to them where the noise is estimated
     from their residuals (Student's t), infinite where it is given (normal errors).
@@ -76,7 +76,7 @@ def quantile(confidence: float, freedom: float = np.inf) -> float:
 
 
 def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: float) -> np.ndarray:
-    """Standard errors (mass, parameter) with one more sensor at each mass.
+    """Return standard errors (mass, parameter) with one more sensor at each mass.
 
     ``uncertainty`` is that without this sensor. ``slopes`` (sample, mass, parameter) are derivatives of what the sensor
     measures, ``noise`` is the standard deviation of its errors, in the same unit.

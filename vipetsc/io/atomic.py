@@ -16,7 +16,7 @@ from vipetsc.wording import system_number, system_reason
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails.
+    """Yield a temporary path that replaces ``path`` when the block succeeds and vanishes when it fails.
 
     Raises an OSError that names ``path`` if the temporary file cannot be written or renamed.
     """
@@ -52,7 +52,7 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Whether there is a ``process`` of that number on this host."""
+    """Return whether there is a ``process`` of that number on this host."""
     try:
         # The signal 0 is not sent: the system only looks whether it could be.
         os.kill(process, 0)
@@ -65,7 +65,7 @@ def _is_running(process: int) -> bool:
 
 
 def unwritten(path: Path, error: Exception) -> UnwrittenError:
-    """An error with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
+    """Return an error with the number of ``error``, of Python or HDF5, that names the file that was not written."""
     remedy = "after the cause is removed, the same command continues"
     return UnwrittenError(system_number(error), f"{path} could not be written: {system_reason(error)}; {remedy}")
 

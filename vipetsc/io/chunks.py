@@ -125,7 +125,7 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def small_variables(output: Chunks) -> dict[str, Any]:
-    """The variables of ``GIVEN`` and of all that rank 0 has of every sample, by name, as a dataset takes them.
+    """Return the variables of ``GIVEN`` and of all that rank 0 has of every sample, by name, as a dataset takes them.
 
     The fields' own times are left out where the fields are of every sample.
     """
@@ -136,7 +136,7 @@ def small_variables(output: Chunks) -> dict[str, Any]:
 
 
 def run_dataset(output: Chunks, variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> xr.Dataset:
-    """The dataset of a run's ``variables``, with its case and the ``attributes`` as its own."""
+    """Return the dataset of a run's ``variables``, with its case and the ``attributes`` as its own."""
     import xarray as xr
 
     return xr.Dataset(variables, attrs={"case": output.case, **attributes})
@@ -150,7 +150,7 @@ class Description(NamedTuple):
 
 
 def described(name: str, data: Container[Any]) -> Description:
-    """The description of the variable ``name`` of ``LARGE`` in a file that holds the small variables ``data``.
+    """Return the description of the variable ``name`` of ``LARGE`` in a file that holds the small variables ``data``.
 
     Fields are over ``time`` if the file has no times of the fields alone.
     """
@@ -161,7 +161,7 @@ def described(name: str, data: Container[Any]) -> Description:
 
 
 def coordinates(name: str) -> dict[str, str]:
-    """The attribute that makes the onset, by the CF conventions, a coordinate of an episode's other variables."""
+    """Return attribute that makes the onset, by the CF conventions, a coordinate of an episode's other variables."""
     if name.startswith("impacts/") and name != "impacts/onset":
         return {"coordinates": "onset"}
     return {}

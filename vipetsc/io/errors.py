@@ -7,7 +7,7 @@ OF_PATHS = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
 
 
 def is_of_file_system(error: Exception) -> bool:
-    """Whether an ``error`` is one of the file system, as a full disk, and says nothing about what a file holds."""
+    """Return whether an ``error`` is of the file system, as a full disk, and says nothing about a file's content."""
     return isinstance(error, OSError) and bool(error.errno) and error.errno not in OF_PATHS
 
 

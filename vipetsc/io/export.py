@@ -54,7 +54,7 @@ def write_xdmf(folder: Path) -> Path | None:
 
 
 def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str], rows: int | None) -> str:
-    """The text of a frame's grid, in which ``{row}`` and ``{time}`` are to be filled in.
+    """Return the text of a frame's grid, in which ``{row}`` and ``{time}`` are to be filled in.
 
     ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``cells`` are those recorded,
     ``rows`` the number of those of a strip, None for a chain.
@@ -89,7 +89,7 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str], row
 
 
 def has_xdmf(folder: Path) -> bool:
-    """Whether ``run.xdmf`` exists and is not older than ``run.h5``."""
+    """Return whether ``run.xdmf`` exists and is not older than ``run.h5``."""
     mesh = folder / "run.xdmf"
     run = folder / "run.h5"
     return mesh.exists() and mesh.stat().st_mtime_ns >= run.stat().st_mtime_ns
@@ -103,7 +103,7 @@ def _child(parent: Xml.Element, tag: str, text: str | None = None, **attributes:
 
 
 def _words(values: Iterable[float]) -> str:
-    """Numbers separated by blanks, in 17 digits, which tell all doubles apart."""
+    """Return numbers separated by blanks, in 17 digits, which tell all doubles apart."""
     return " ".join(f"{value:.17g}" for value in values)
 
 
@@ -163,7 +163,7 @@ def write_curves(path: Path) -> list[Path]:
 
 
 def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Columns (design,) for the variables, objectives and constraints of a search, by their labels.
+    """Return columns (design,) for the variables, objectives and constraints of a search, by their labels.
 
     There are no columns if ``data`` are not a search, or ``dims``, those of a table, are not those of its designs.
     """
@@ -180,7 +180,7 @@ def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr
 
 
 def _columns_of_responses(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Columns (point,) of a frequency response for each mass, contact or wall, by variable and label.
+    """Return columns (point,) of a frequency response for each mass, contact or wall, by variable and label.
 
     There are no columns if ``data`` are no response, or ``dims``, those of a table, are not those of its points.
     """
@@ -226,7 +226,7 @@ def _write_impacts(source: Path) -> Path:
 
 
 def _numbers(analysis: xr.Dataset) -> dict[str, list[Any]]:
-    """Columns of a table with a row for each number in an ``analysis``, and for each part of the frequency axis."""
+    """Return columns of a table with a row for each number in an ``analysis``, and each part of the frequency axis."""
     rows = []
     for name, item in analysis.data_vars.items():
         unit = item.attrs.get("units", "1")

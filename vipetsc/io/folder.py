@@ -195,14 +195,14 @@ def _holds_another_kind(path: Path, kind: ResultKind) -> bool:
 
 
 def _results(folder: Path) -> list[Path]:
-    """The files and folders in ``folder`` whose names do not begin with a dot."""
+    """Return the files and folders in ``folder`` whose names do not begin with a dot."""
     return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
 
 
 def _problem(
     folder: Path, kind: ResultKind, text: str, difference: Difference | None, extend: Obstacle | None
 ) -> str | None:
-    """Message why the results in ``folder`` are not results of ``text``; None if they are."""
+    """Return the message why the results in ``folder`` are not results of ``text``; None if they are."""
     earlier = _text_of(folder / kind.marker)
     if difference:
         return difference(earlier)
@@ -238,7 +238,7 @@ def _problem(
 
 
 def _shown(value: Any) -> str:
-    """A value as a message shows it; of one long word, such as a hash, its beginning."""
+    """Return a value as a message shows it; of one long word, such as a hash, its beginning."""
     text = str(value)
     if len(text) > 60 and " " not in text:
         return f"{text[:16]}..."
@@ -246,12 +246,12 @@ def _shown(value: Any) -> str:
 
 
 def _text_of(path: Path) -> str:
-    """The text of a file; where another program damaged it, bytes that are no UTF-8 become replacement characters."""
+    """Return the text of a file; bytes that are not UTF-8, in a damaged one, become replacement characters."""
     return path.read_text(encoding="utf-8", errors="replace")
 
 
 def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """The keys of a case with their sections, and their values."""
+    """Yield the keys of a case with their sections, and their values."""
     for key, value in table.items():
         if isinstance(value, dict):
             yield from _keys(value, f"{path}{key}.")
@@ -260,7 +260,7 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def provenance(comm: "MPI.Comm") -> dict[str, Any]:
-    """Record of versions, date, host, command and number of ranks, as attributes that every output carries.
+    """Return record of versions, date, host, command and number of ranks, as attributes that every output carries.
 
     Two runs of one command differ in it.
     """
@@ -268,7 +268,7 @@ def provenance(comm: "MPI.Comm") -> dict[str, Any]:
 
 
 def origin() -> dict[str, Any]:
-    """The record of ``provenance`` without the ranks, for results that one rank computes alone.
+    """Return the record of ``provenance`` without the ranks, for results that one rank computes alone.
 
     ``petsc_options`` are those of PETSc's database, given on the command line; those of a case are in the case's text.
     """
@@ -300,7 +300,7 @@ def origin() -> dict[str, Any]:
 
 @cache
 def revision() -> str:
-    """The commit of the package's sources by git, with a "+" if they were changed since; else "none"."""
+    """Return the commit of the package's sources by git, with a "+" if they were changed since; else "none"."""
     root = Path(vipetsc.__file__).parents[1]
     # An installed package may lie in a repository that is not its own.
     if not ((root / ".git").exists() and (root / "pyproject.toml").exists()):

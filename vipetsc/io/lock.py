@@ -127,7 +127,7 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
 
 
 def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
-    """The descriptor of the locked file, and the other process that has the lock; one of them or both are None.
+    """Return the descriptor of the locked file, and the other process that has the lock; one of them or both are None.
 
     Both are None if this process has the lock already, or the file system has no locks.
     """
@@ -159,7 +159,7 @@ def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
 
 
 def _is_file(descriptor: int, path: Path) -> bool:
-    """Whether the open file of a ``descriptor`` is the one of that name."""
+    """Return whether the open file of a ``descriptor`` is the one of that name."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

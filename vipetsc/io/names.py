@@ -21,6 +21,6 @@ def resolved_path(text: str) -> Path:
 
 
 def file_hash(path: str | Path) -> str:
-    """The SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -44,14 +44,14 @@ NO_COORDINATE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
-    """``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""
+    """Return ``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""
     import xarray as xr
 
     return xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name, **attributes})
 
 
 def tabulated(layout: Mapping[str, tuple[str, str, str]], values: Mapping[str, Any]) -> Variables:
-    """``values`` by name as variables, whose dimensions (separated by blanks), units and texts ``layout`` gives."""
+    """Return ``values`` by name as variables, with dimensions (separated by blanks), units and texts of ``layout``."""
     variables = {}
     for name, value in values.items():
         dims, units, long_name = layout[name]
@@ -180,7 +180,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
 
 
 def root_attributes(path: str | Path, kind: str, needs: Sequence[str] = ()) -> dict[str, Any]:
-    """The attributes of a file's root, for readers of nothing else: ``open_netcdf`` looks at every variable.
+    """Return the attributes of a file's root, for readers of nothing else: ``open_netcdf`` looks at every variable.
 
     Parameters and errors are those of ``open_netcdf``.
     """
@@ -197,7 +197,7 @@ def root_attributes(path: str | Path, kind: str, needs: Sequence[str] = ()) -> d
 
 
 def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFileError:
-    """The error that reports that a file cannot be opened as HDF5, because of ``error``."""
+    """Return the error that reports that a file cannot be opened as HDF5, because of ``error``."""
     reason = system_reason(error)
     if "unable to lock" in str(error):
         reason = "another program has it open for writing"
@@ -227,7 +227,7 @@ def naming_spoilt(opened: Callable[[], Iterable[xr.Dataset]]) -> Iterator[None]:
 
 
 def _spoilt(data: xr.Dataset) -> list[str]:
-    """Sentences on variables of ``data`` that hold numbers that are not finite, and on dimensions without entries."""
+    """Return sentences on variables of ``data`` with numbers that are not finite, and on empty dimensions."""
     file = data.encoding.get("source", "the file")
     floats = [(name, values) for name, values in data.variables.items() if values.dtype.kind in "fc"]
     infinite = [str(name) for name, values in floats if not np.isfinite(values).all()]
@@ -247,7 +247,7 @@ def _refuse_other_kinds(path: str | Path, kind: str, missing: Sequence[str]) -> 
 
 
 def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
-    """The variables of all groups of the file that ``files`` opens, and the groups' attributes, by their paths."""
+    """Return variables of all groups of the file that ``files`` opens, and the groups' attributes, by their paths."""
     import xarray as xr
     from xarray.core import indexing
 
@@ -283,12 +283,12 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
 
 
 def _path(*parts: str) -> str:
-    """The path of ``parts`` in a file, as names of variables and of attributes have it."""
+    """Return the path of ``parts`` in a file, as names of variables and of attributes have it."""
     return "/".join(parts).strip("/")
 
 
 def _nodes(path: str, group: h5py.Group) -> Iterator[tuple[str, Node]]:
-    """The ``group`` at a ``path``, its datasets, and then each group in it with its own contents, by their paths.
+    """Yield the ``group`` at a ``path``, its datasets, and then each group in it with its own contents, by their paths.
 
     Soft links are left out: they lead to coordinates of other groups.
     """
@@ -308,13 +308,13 @@ def _nodes(path: str, group: h5py.Group) -> Iterator[tuple[str, Node]]:
 
 
 def _stored_attributes(node: Node) -> dict[str, Any]:
-    """The attributes of a group or a dataset, without the lists of the scales of a dataset and of what a scale has."""
+    """Return the attributes of a group or dataset, without the lists of scales and of what a scale has."""
     lists = {"REFERENCE_LIST", "DIMENSION_LIST"}
     return {name: _attribute(node.attrs[name]) for name in node.attrs if name not in lists}
 
 
 def _dimensions(path: str, dataset: h5py.Dataset, stored: Mapping[str, Any], paths: Mapping[Node, str]) -> list[str]:
-    """The names of the dimensions of a ``dataset`` at a ``path``, with ``stored`` attributes.
+    """Return the names of the dimensions of a ``dataset`` at a ``path``, with ``stored`` attributes.
 
     The dimension of an axis is named by the path of the scale that is attached to it, which ``paths`` has; a scale has
     the dimension of its own path. An axis without a scale is a dimension that no other dataset has.
@@ -332,7 +332,7 @@ def _dimensions(path: str, dataset: h5py.Dataset, stored: Mapping[str, Any], pat
 
 
 def _attribute(value: Any) -> Any:
-    """The ``value`` of an attribute: texts as str, several in a list; an array of one number as that number."""
+    """Return the ``value`` of an attribute: texts as str, several in a list; an array of one number as that number."""
     if isinstance(value, bytes):
         return value.decode("utf-8", "surrogateescape")
     if isinstance(value, h5py.Empty):

@@ -48,7 +48,7 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 
 def with_point_names(run: xr.Dataset) -> xr.Dataset:
-    """The ``run`` with the names of its points, from its case, as the coordinate ``point``, so that ``sel`` takes them.
+    """Return the ``run`` with the names of its points, from its case, as the coordinate ``point``, for ``sel``.
 
     Other results come back as they are.
     """
@@ -60,7 +60,7 @@ def with_point_names(run: xr.Dataset) -> xr.Dataset:
 
 
 def with_rows(run: xr.Dataset) -> xr.Dataset:
-    """The ``run`` of a strip of the plane with the ``row`` and the ``mass`` of each dof, and the row of each site.
+    """Return ``run`` of a strip of the plane with the ``row`` and the ``mass`` of each dof, and the row of each site.
 
     Both count from 1; ``mass`` is the degree of freedom in a cell of the plane. Other results come back as they are.
     """
@@ -81,7 +81,7 @@ def with_rows(run: xr.Dataset) -> xr.Dataset:
 
 
 def with_part_names(analysis: xr.Dataset) -> xr.Dataset:
-    """The ``analysis``, of a run or of a sweep, with the names of the parts of the frequency axis as their coordinate.
+    """Return the ``analysis`` of a run or sweep with the names of the parts of the frequency axis as coordinate.
 
     A part is, for instance, "band 2". Other results come back as they are.
     """
@@ -94,7 +94,7 @@ def with_part_names(analysis: xr.Dataset) -> xr.Dataset:
 
 
 def _renamed(data: xr.Dataset, dimension: str, names: list[str]) -> xr.Dataset:
-    """The ``data`` with ``names`` as the coordinate of a ``dimension``."""
+    """Return the ``data`` with ``names`` as the coordinate of a ``dimension``."""
     attributes = data[dimension].attrs
     named = data.assign_coords({dimension: (dimension, np.array(names, dtype=object), attributes)})
     # A dataset that is made from another one does not close its file.
@@ -128,14 +128,14 @@ def open_results(path: str | Path) -> xr.Dataset:
 
 
 def field_time(run: xr.Dataset) -> np.ndarray:
-    """Times (t,) in s of the fields of a ``run``: those of all samples, or of every n-th."""
+    """Return times (t,) in s of the fields of a ``run``: those of all samples, or of every n-th."""
     if "field_time" in run:
         return run["field_time"].values
     return run["time"].values
 
 
 def field_interval(run: xr.Dataset) -> float:
-    """Interval in s between the fields of a ``run``; NaN for a single field."""
+    """Return the interval in s between the fields of a ``run``; NaN for a single field."""
     time = field_time(run)
     if len(time) < 2:
         return np.nan
@@ -143,19 +143,19 @@ def field_interval(run: xr.Dataset) -> float:
 
 
 def first_site(run: xr.Dataset) -> int | None:
-    """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
+    """Return the index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     case = tomllib.loads(run.attrs["case"])
     lattice = case["lattice"]
     return Topology(lattice["cells"], lattice["ends"]).nearest_index(run["sites/cell"].values, case["drive"]["cell"])
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:
-    """Index (0-based) of the recorded cell nearest to ``cell`` (1-based)."""
+    """Return the index (0-based) of the recorded cell nearest to ``cell`` (1-based)."""
     return int(np.argmin(np.abs(run["cell"].values - cell)))
 
 
 def open_ensemble(folder: str | Path) -> xr.Dataset:
-    """The ensemble of the sweep in ``folder``, read completely: measures with one dimension per swept axis.
+    """Return the ensemble of the sweep in ``folder``, read completely: measures with one dimension per swept axis.
 
     A dimension is named after the first key of its axis; further keys of a zipped axis are coordinates over it. The
     variable ``number`` counts the members from 0, the attribute ``folder`` is the path of the sweep's. Raises OSError
@@ -174,7 +174,7 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
 
 
 def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
-    """The ``ensemble`` without its axis of disorder samples, if it has one, its measures being means over the samples.
+    """Return the ``ensemble`` without its axis of disorder samples, if any, measures being means over these.
 
     A measure of which there is no mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
     """
@@ -191,7 +191,7 @@ def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
 
 
 def select(data: Selectable, **wanted: Any) -> Selectable:
-    """The part of ``data`` at the ``wanted`` values of swept keys, the first of several; axes without a value stay.
+    """Return part of ``data`` at the ``wanted`` values of swept keys, the first of several; axes without a value stay.
 
     For example ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Of keys that vary together, along one
     axis, one member must have all values. Numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate
@@ -222,12 +222,12 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
 
 
 def axes(ensemble: xr.Dataset) -> tuple[str, ...]:
-    """Names of the sweep's axes in the order of its case."""
+    """Return names of the sweep's axes in the order of its case."""
     return tuple(map(str, ensemble["status"].dims))
 
 
 def member_folder(member: xr.Dataset) -> Path:
-    """The folder that has the ``run.h5`` and ``analysis.h5`` of one member if its fields were kept."""
+    """Return the folder that has the ``run.h5`` and ``analysis.h5`` of one member if its fields were kept."""
     return Path(member.attrs["folder"]) / str(member["member"].item())
 
 
@@ -248,7 +248,7 @@ def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.
 
 
 def whole_members(ensemble: xr.Dataset) -> Iterator[tuple[xr.Dataset, Path]]:
-    """The members whose fields were kept, and their folders."""
+    """Yield the members whose fields were kept, and their folders."""
     if not tomllib.loads(ensemble.attrs["case"])["sweep"]["fields"]:
         return
     for index in np.ndindex(*ensemble["status"].shape):

@@ -26,14 +26,14 @@ class Line(NamedTuple):
     length: int
 
     def record(self) -> Record:
-        """The record, read from the file."""
+        """Return the record, read from the file."""
         with self.path.open("rb") as file:
             file.seek(self.start)
             return _parsed(file.read(self.length))
 
 
 def _parsed(line: bytes) -> Record:
-    """The record in a ``line``, without its checksum."""
+    """Return the record in a ``line``, without its checksum."""
     return cast(Record, json.loads(line[:-CHECK_LENGTH] + b"}"))
 
 

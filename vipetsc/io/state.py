@@ -79,7 +79,7 @@ class State(NamedTuple):
         return state
 
     def on(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement in m and velocity in m/s, each (cell, dof), of cells ``start`` to ``stop`` - 1, from 0."""
+        """Return displacement in m and velocity in m/s, each (cell, dof), of cells ``start`` to ``stop`` - 1."""
         inside = (self.cell > start) & (self.cell <= stop)
         rows = self.cell[inside] - 1 - start
         u, v = np.zeros((2, stop - start, self.velocity.shape[1]))
@@ -88,12 +88,12 @@ class State(NamedTuple):
         return u, v
 
     def moving(self) -> frozenset[int]:
-        """The cells (1-based) of which some mass moves or is displaced."""
+        """Return the cells (1-based) of which some mass moves or is displaced."""
         is_moving = np.any((self.displacement != 0) | (self.velocity != 0), axis=1)
         return frozenset(self.cell[is_moving].tolist())
 
     def frequency(self) -> float | None:
-        """Frequency in rad/s of the orbit, of the run's drive or of the motion that it began with.
+        """Return the frequency in rad/s of the orbit, of the run's drive or of the motion that it began with.
 
         None for a state alone.
         """
@@ -105,7 +105,7 @@ class State(NamedTuple):
         return None
 
     def largest(self, frequency: float) -> tuple[float, int]:
-        """Largest amplitude in m of a motion with ``frequency`` in rad/s in this state, and its cell, from 1.
+        """Return largest amplitude in m of a motion with ``frequency`` in rad/s in this state, and its cell, from 1.
 
         The amplitude of a mass is taken as |u| or |v| / frequency, the larger; 0 and cell 1 of a state without cells.
         """
@@ -117,7 +117,7 @@ class State(NamedTuple):
 
 
 def _row(values: np.ndarray, wanted: float | None, reach: float, path: str | Path, noun: str) -> int:
-    """The row of ``values`` (row,) nearest to ``wanted``, by default the last one.
+    """Return the row of ``values`` (row,) nearest to ``wanted``, by default the last one.
 
     Raises ValueError, with a message that calls the values of the file ``path`` a ``noun``, if none is within ``reach``
     or there are none.

@@ -84,7 +84,7 @@ class RunFolder:
         write_text(stamp, source_key())
 
     def ending(self) -> dict[str, Any] | None:
-        """The root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.
+        """Return the root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.
 
         A ``summary.json`` that is missing is written again. Raises FolderError on all ranks if ``run.h5`` cannot be
         read.
@@ -92,7 +92,7 @@ class RunFolder:
         return on_root(self.comm, self._read_ending)
 
     def _read_ending(self) -> dict[str, Any] | None:
-        """The attributes, on one rank; see ``ending``."""
+        """Return the attributes, on one rank; see ``ending``."""
         path = self.folder / "run.h5"
         # Chunks next to a run.h5 are those of a run that was begun anew, and has not ended.
         if not path.exists() or any(self._parts.glob("*")):
@@ -111,7 +111,7 @@ class RunFolder:
         return attributes
 
     def extension_obstacle(self, then: float, now: float) -> str | None:
-        """Why the run in the folder, which was to end at ``then`` in s, cannot go on to ``now``; None if it can.
+        """Return why the run in the folder, which was to end at ``then`` in s, cannot go on to ``now``; None if it can.
 
         What a longer extension has begun before it was killed is dropped. For one rank.
         """
@@ -175,7 +175,7 @@ class RunFolder:
         write_text(self.folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
+        """Return array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         return np.empty(shape)
 
     def append(self, chunk: Arrays) -> None:
@@ -222,7 +222,7 @@ class RunFolder:
         return on_every_rank(self.comm, lambda: [StoredArrays(path) for path in paths])
 
     def _last_complete_state(self) -> tuple[int, int]:
-        """Number of the last complete checkpoint, and of the ranks that wrote it; (-1, 0) if there is none.
+        """Return the number of the last complete checkpoint, and of the ranks that wrote it; (-1, 0) if there is none.
 
         Files of later chunks and checkpoints are removed.
         """
@@ -311,7 +311,7 @@ class FieldMemory:
         self._numbers = np.empty(0)
 
     def array(self, shape: tuple[int, ...]) -> np.ndarray:
-        """An array of this ``shape``, not initialised, in the memory of the last one if that is large enough."""
+        """Return an array of this ``shape``, not initialised, in the memory of the last one if that is large enough."""
         size = math.prod(shape)
         if size > self._numbers.size:
             self._numbers = np.empty(size)
@@ -385,7 +385,7 @@ class RunMemory:
         return self._memory.array(shape)
 
     def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
+        """Return array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         if self.comm.size > 1:
             return np.empty(shape)
         return self._fields[:, self._rows : self._rows + shape[1]]

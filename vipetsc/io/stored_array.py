@@ -20,12 +20,12 @@ class StoredArray(BackendArray):
         self._name = name
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
-        """The values at ``key``, an array or a number."""
+        """Return the values at ``key``, an array or a number."""
         # h5py takes an array of positions along one axis at most.
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER_1VECTOR, self._read)
 
     def _read(self, key: tuple[Any, ...]) -> Any:
-        """The values at ``key``: for each axis a number, a slice or, along one of them, an array of positions."""
+        """Return values at ``key``: for each axis a number, a slice or, along one of them, an array of positions."""
         positions = tuple(part.tolist() if isinstance(part, np.ndarray) else part for part in key)
         with self._files.acquire_context() as file:
             return file[self._name][positions]

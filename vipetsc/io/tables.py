@@ -244,7 +244,7 @@ def column_names(path: Path, most_rows: int = MOST_ROWS) -> list[str]:
 
 
 def _index_of(place: int | str, table: TextTable, key: str) -> int:
-    """The column, from 0, of a ``place`` in a ``table``; raises ColumnError where there is none."""
+    """Return the column, from 0, of a ``place`` in a ``table``; raises ColumnError where there is none."""
     if isinstance(place, int):
         if 1 <= place <= table.values.shape[1]:
             return place - 1
@@ -258,7 +258,7 @@ def _index_of(place: int | str, table: TextTable, key: str) -> int:
 
 
 def _hdf5_column(file: "h5py.File", key: str, place: int | str) -> np.ndarray:
-    """The numbers at a ``place``: a dataset of one dimension, or with "[3]" behind its name the third column of two."""
+    """Return the numbers at a ``place``: a dataset of one dimension, or, with "[3]" behind it, a column of two."""
     name = str(place)
     column: int | None = None
     match = re.fullmatch(r"(.+?)\[(\d+)\]", name)

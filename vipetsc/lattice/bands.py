@@ -135,14 +135,14 @@ def _resolve_touching(kappa: np.ndarray, squared: np.ndarray, vectors: np.ndarra
 
 
 def _eigenpairs(cell: UnitCell, kappa: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Squared frequencies (..., band), and vectors (..., dof, band) of displacements times the roots of the masses."""
+    """Return squared frequencies (..., band), and vectors (..., dof, band) of displacements times roots of masses."""
     root = 1 / np.sqrt(cell.masses)
     squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * (root[:, None] * root))
     return squared, vectors
 
 
 def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
-    """Derivative of the stiffness matrix (..., dof, dof) in N/m with respect to the wavenumbers ``kappa`` (...)."""
+    """Return the derivative of the stiffness matrix (..., dof, dof) in N/m by the wavenumbers ``kappa`` (...)."""
     slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
     for mass, offset, other, stiffness, *_ in cell.couplings():
         slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * kappa * offset)
@@ -159,7 +159,7 @@ class BandGrid(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _grid(cell: UnitCell) -> BandGrid:
-    """The bands of a cell where extremes and waves are searched."""
+    """Return the bands of a cell where extremes and waves are searched."""
     kappa = GRID
     if cell.dofs > MANY_MASSES:
         count = max(FEWEST, len(GRID) * MANY_MASSES // cell.dofs)
@@ -173,7 +173,7 @@ def _grid(cell: UnitCell) -> BandGrid:
 
 
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
-    """Frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
+    """Return the frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
     # Without the group velocities of ``bloch``, which cost as much again as the frequencies.
     if cell.dofs <= MANY_MASSES:
         squared = float(_eigenpairs(cell, kappa)[0][band - 1])
@@ -183,7 +183,7 @@ def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
 
 
 def _speed(cell: UnitCell, band: int, kappa: float) -> float:
-    """Magnitude of the group velocity in cells/s of ``band`` (from 1) at ``kappa``."""
+    """Return magnitude of the group velocity in cells/s of ``band`` (from 1) at ``kappa``."""
     # Where bands may touch, at 0 and at pi, the vector of one band is not enough.
     if cell.dofs <= MANY_MASSES or kappa < OFF_ZERO or kappa >= np.pi:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
@@ -195,7 +195,7 @@ def _speed(cell: UnitCell, band: int, kappa: float) -> float:
 
 
 def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:
-    """Squared frequency of ``band`` (from 1) at ``kappa``, and its mass-normalised vector.
+    """Return squared frequency of ``band`` (from 1) at ``kappa``, and its mass-normalised vector.
 
     One pair of a large matrix costs a quarter of all of them.
     """
@@ -206,7 +206,7 @@ def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarr
 
 
 def _maximum(function: Callable[[float], float], values: np.ndarray, kappa: np.ndarray) -> tuple[float, float]:
-    """Argument in [0, pi] and value of a function's maximum: the best of its ``values`` at ``kappa``, refined."""
+    """Return argument in [0, pi] and value of a function's maximum: the best of ``values`` at ``kappa``, refined."""
     best = int(np.argmax(values))
     last = len(kappa) - 1
     if last + 1 < len(GRID):
@@ -244,7 +244,7 @@ def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
 
 
 def wave_bands(cell: UnitCell) -> tuple[Band, ...]:
-    """Pass bands as of ``pass_bands``; () where contacts alone join the cells, so that no linear wave travels.
+    """Return pass bands as of ``pass_bands``; () where contacts alone join the cells, so that no linear wave travels.
 
     ``pass_bands`` then has the frequencies of a single cell's modes, each as a band with two equal edges.
     """
@@ -254,7 +254,7 @@ def wave_bands(cell: UnitCell) -> tuple[Band, ...]:
 
 
 def modes_of_a_cell(cell: UnitCell) -> np.ndarray:
-    """Frequencies (dof,) in rad/s of the modes of a ``cell`` that contacts alone join to others, lowest first.
+    """Return frequencies (dof,) in rad/s of the modes of a ``cell`` that contacts alone join to others, lowest first.
 
     A motion of the cell as a whole has the frequency 0.
     """
@@ -263,13 +263,13 @@ def modes_of_a_cell(cell: UnitCell) -> np.ndarray:
 
 
 def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
-    """Band gaps (low, high) in rad/s between consecutive pass bands; the region above is not one."""
+    """Return the band gaps (low, high) in rad/s between consecutive pass bands; the region above is not one."""
     return [(a.high, b.low) for a, b in itertools.pairwise(bands) if b.low > a.high]
 
 
 @lru_cache
 def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
-    """Wavenumber (rad per cell), frequency (rad/s) and |v_g| (cells/s) at which ``band`` (1-based) is fastest."""
+    """Return wavenumber (rad per cell), frequency (rad/s) and |v_g| (cells/s) where ``band`` (1-based) is fastest."""
     grid = _grid(cell)
     speeds = np.abs(grid.group_velocity[:, band - 1])
     fastest, largest = _maximum(partial(_speed, cell, band), speeds, grid.kappa)
@@ -278,7 +278,7 @@ def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
 
 @lru_cache
 def fastest_speed(cell: UnitCell) -> float:
-    """The largest group velocity of all bands in cells/s."""
+    """Return the largest group velocity of all bands in cells/s."""
     speeds = np.abs(_grid(cell).group_velocity).max(axis=0)
     (near,) = np.nonzero(speeds >= NEARLY_FASTEST * speeds.max())
     return max(max_group_velocity(cell, int(band) + 1)[2] for band in near)
@@ -286,7 +286,7 @@ def fastest_speed(cell: UnitCell) -> float:
 
 @lru_cache
 def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float], ...]:
-    """Propagating waves of ``frequency`` (rad/s): (band from 1, kappa in [0, pi], |v_g| in cells/s); () in a gap.
+    """Return the waves of ``frequency`` (rad/s): (band from 1, kappa in [0, pi], |v_g| in cells/s); () in a gap.
 
     There are none, either, where contacts alone join the cells.
     """

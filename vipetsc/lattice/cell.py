@@ -58,15 +58,15 @@ class Spring:
         return float(real[np.abs(real).argmin()])
 
     def nonlinear_force(self, z: np.ndarray) -> np.ndarray:
-        """The force's part beyond k z in N, at elongations ``z`` (...) in m."""
+        """Return the force's part beyond k z in N, at elongations ``z`` (...) in m."""
         return np.asarray(self.quadratic * z**2 + self.cubic * z**3)
 
     def nonlinear_slope(self, z: np.ndarray) -> np.ndarray:
-        """Derivative (...) of ``nonlinear_force`` by z in N/m, at elongations ``z`` (...) in m."""
+        """Return the derivative (...) of ``nonlinear_force`` by z in N/m, at elongations ``z`` (...) in m."""
         return np.asarray(2 * self.quadratic * z + 3 * self.cubic * z**2)
 
     def nonlinear_energy(self, z: np.ndarray) -> np.ndarray:
-        """Integral (...) of ``nonlinear_force`` from 0 to the elongations ``z`` (...) in m, in J."""
+        """Return the integral (...) of ``nonlinear_force`` from 0 to the elongations ``z`` (...) in m, in J."""
         return np.asarray(z * z * z * (self.quadratic / 3 + self.cubic / 4 * z))
 
 
@@ -141,7 +141,7 @@ class UnitCell:
         return all(spring.is_linear for spring in self.springs)
 
     def couplings(self) -> list[Coupling]:
-        """Every spring seen from both its ends; one to the ground has one.
+        """Return every spring seen from both its ends; one to the ground has one.
 
         Sorted by mass and otherwise in the order of ``springs``, which fixes the order of every sum.
         """
@@ -164,19 +164,19 @@ class UnitCell:
         return sorted(ends, key=lambda c: c.mass)
 
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
-        """Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
+        """Return Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
 
         It follows from the springs. The matrix that the paper prints, Eq. (S1), lacks the -1/2 in row 1, column 2.
         """
         return self._bloch(kappa, [c.stiffness for c in self.couplings()])
 
     def damping_matrix(self, kappa: ArrayLike) -> np.ndarray:
-        """Bloch damping (..., dofs, dofs) in N s/m of all dashpots, as ``stiffness_matrix``."""
+        """Return Bloch damping (..., dofs, dofs) in N s/m of all dashpots, as ``stiffness_matrix``."""
         grounding = np.diag(self.grounding or [0.0] * self.dofs)
         return self._bloch(kappa, [c.damping for c in self.couplings()]) + grounding
 
     def _bloch(self, kappa: ArrayLike, values: list[float]) -> np.ndarray:
-        """The Bloch matrix (..., dofs, dofs) of the couplings' ``values``, at wavenumbers ``kappa`` (...)."""
+        """Return the Bloch matrix (..., dofs, dofs) of the couplings' ``values``, at wavenumbers ``kappa`` (...)."""
         kappa = np.asarray(kappa, float)
         # Axes of the wavenumbers come last: at one wavenumber, as in a search, an entry is then a number, which takes
         # a fifth of the time of a view of one.
@@ -198,7 +198,7 @@ class UnitCell:
 def cell_problems(
     masses: tuple[float, ...], springs: tuple[Spring, ...], host: int, resonator: int, grounding: tuple[float, ...] = ()
 ) -> list[tuple[str, str]]:
-    """All problems of a cell as (key, message) pairs; empty for a valid cell.
+    """Return all problems of a cell as (key, message) pairs; empty for a valid cell.
 
     Messages count masses from 1, as case files do.
     """
@@ -222,7 +222,7 @@ def cell_problems(
 
 
 def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
-    """All problems of a ``spring`` in a cell of ``n`` masses, as ``cell_problems``."""
+    """Return all problems of a ``spring`` in a cell of ``n`` masses, as ``cell_problems``."""
     problems = []
     if not 0 < abs(spring.stiffness) < np.inf:
         problems.append((f"{key}.stiffness", f"stiffness {spring.stiffness!r} must not be zero (N/m)"))
@@ -242,7 +242,7 @@ def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
 
 
 def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, str]]:
-    """All problems of the dashpots to ground in a cell of ``n`` masses, as ``cell_problems``."""
+    """Return all problems of the dashpots to ground in a cell of ``n`` masses, as ``cell_problems``."""
     problems = []
     if len(grounding) not in (0, n):
         problems.append(("grounding", f"give one dashpot for each of the {n} masses, 0 for none"))
@@ -254,14 +254,14 @@ def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, s
 
 @lru_cache
 def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
-    """The group (from 0) of each of ``n`` nodes, in their order; ``pairs`` are the nodes (0-based) tied together."""
+    """Return group (from 0) of each of ``n`` nodes, in their order; ``pairs`` are the nodes (0-based) tied together."""
     # Asked once for each kind of cell: sweeps and searches have thousands of one kind.
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].tolist()
 
 
 def diatomic(reading: Reading = "printed") -> UnitCell:
-    """The paper's diatomic cell (Table I): a host with a resonator inside it.
+    """Return the paper's diatomic cell (Table I): a host with a resonator inside it.
 
     The calibrated reading divides both stiffnesses by ten, which brings the onset of contact to the
     amplitudes that the paper reports (0.58 N instead of 5.3 N).
@@ -273,7 +273,7 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
 
 
 def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) -> UnitCell:
-    """The paper's four-band cell, Eq. (7), in its Hermitian reading.
+    """Return the paper's four-band cell, Eq. (7), in its Hermitian reading.
 
     Springs, with masses counted from 1: k = 2e4 N/m from u4 to u1 of the next cell, k2 = 1e4 N/m from u1 to u2 and from
     u2 to u4, and from the host u2 to the resonator u3 one that ``lam`` sets: lam k = 2000 N/m in the printed reading,

@@ -110,7 +110,7 @@ class Chain:
         return [spring for spring in self.cell.springs if spring.offset and self.topology.neighbour(-1) == WALL]
 
     def linearised(self) -> "Chain":
-        """The lattice with the linear parts of its springs alone; itself if there is nothing else."""
+        """Return the lattice with the linear parts of its springs alone; itself if there is nothing else."""
         remaining = {name: array for name, array in self._varied.items() if name not in SpringTerms._fields}
         if self.cell.is_linear and len(remaining) == len(self._varied):
             return self
@@ -119,7 +119,7 @@ class Chain:
         return replace(self, cell=cell, variation=Variation(**remaining) if remaining else None)
 
     def without_dashpots(self) -> "Chain":
-        """The lattice with all dashpots left out; itself if it has none."""
+        """Return the lattice with all dashpots left out; itself if it has none."""
         if not self.is_damped:
             return self
         springs = tuple(replace(spring, damping=0.0) for spring in self.cell.springs)
@@ -160,7 +160,7 @@ class Chain:
         return any(pair.offset for pair in self.pairs)
 
     def reduced_masses(self, numbers: Sequence[int] | None = None) -> list[float]:
-        """Mass in kg of the relative motion of the sites with these ``numbers``, from 0, or of all."""
+        """Return the mass in kg of the relative motion of the sites with these ``numbers``, from 0, or of all."""
         if numbers is None:
             numbers = range(len(self.sites))
         # One row for all cells where they are equal, so that a long lattice costs no more than its sites.
@@ -174,7 +174,7 @@ class Chain:
         return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
-        """Whether no cell from ``start`` to ``stop`` differs from the reference cell.
+        """Return whether no cell from ``start`` to ``stop`` differs from the reference cell.
 
         On a ring the numbers go on beyond the last cell, and then stand for the first cells again.
         """
@@ -193,7 +193,7 @@ class Chain:
         return reference
 
     def coefficients(self, start: int, stop: int) -> Coefficients:
-        """Masses, springs and dashpots of the cells ``start`` to ``stop``.
+        """Return masses, springs and dashpots of the cells ``start`` to ``stop``.
 
         On a ring, numbers beyond the ends stand for the cells at the other end. In other lattices the cells beyond the
         ends are as the reference cell: the spring to a wall on the left belongs to cell -1.
@@ -201,11 +201,11 @@ class Chain:
         return Coefficients(*self._arrays(Coefficients._fields, start, stop))
 
     def spring_terms(self, start: int, stop: int) -> SpringTerms:
-        """Quadratic and cubic parts of springs of the cells ``start`` to ``stop``, as ``coefficients`` counts them."""
+        """Return quadratic and cubic parts of springs of cells ``start`` to ``stop``, as by ``coefficients``."""
         return SpringTerms(*self._arrays(SpringTerms._fields, start, stop))
 
     def _arrays(self, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:
-        """The arrays of these ``names`` of the cells ``start`` to ``stop``."""
+        """Return the arrays of these ``names`` of the cells ``start`` to ``stop``."""
         cells = self.topology.neighbour(np.arange(start, stop))
         exists = cells >= 0
         arrays = []
@@ -217,7 +217,7 @@ class Chain:
         return arrays
 
     def spring(self, cell: int, number: int) -> Spring:
-        """The spring of that ``number`` (from 0) that begins in a ``cell``, -1 in a wall on the left."""
+        """Return the spring of that ``number`` (from 0) that begins in a ``cell``, -1 in a wall on the left."""
         linear = self.coefficients(cell, cell + 1)
         terms = self.spring_terms(cell, cell + 1)
         return replace(
@@ -229,7 +229,7 @@ class Chain:
         )
 
     def mean_cell(self, start: int, stop: int) -> UnitCell:
-        """The reference cell with the mean masses, springs and dashpots of the cells ``start`` to ``stop``."""
+        """Return the reference cell with the mean masses, springs and dashpots of the cells ``start`` to ``stop``."""
         # Means of equal numbers are rounded: equal cells keep the reference cell, and what is cached for it.
         if self.linearised().is_uniform(start, stop):
             return self.cell
@@ -240,22 +240,22 @@ class Chain:
         return replace(self.cell, masses=tuple(mean.masses), springs=springs, grounding=tuple(mean.grounding))
 
     def stiffness_matrix(self) -> csc_matrix:
-        """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; memory grows as the cells."""
+        """Return sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; memory grows as the cells."""
         return self.stiffness_rows(0, self.cells).tocsc()
 
     def stiffness_rows(self, start: int, stop: int) -> csr_matrix:
-        """The rows ((stop - start) dofs, cells dofs) of the stiffness in N/m of cells ``start`` to ``stop``."""
+        """Return the rows ((stop - start) dofs, cells dofs) of the stiffness in N/m of cells ``start`` to ``stop``."""
         return self._rows(start, stop, self.coefficients(start - 1, stop).stiffness)
 
     def damping_rows(self, start: int, stop: int) -> csr_matrix:
-        """The rows ((stop - start) dofs, cells dofs) of the damping in N s/m of cells ``start`` to ``stop``."""
+        """Return the rows ((stop - start) dofs, cells dofs) of the damping in N s/m of cells ``start`` to ``stop``."""
         d = self.cell.dofs
         coefficients = self.coefficients(start - 1, stop)
         ground = diags([coefficients.grounding[1:].ravel()], [start * d], ((stop - start) * d, self.cells * d))
         return (self._rows(start, stop, coefficients.damping) + ground).tocsr()
 
     def _rows(self, start: int, stop: int, values: np.ndarray) -> csr_matrix:
-        """Rows of a matrix that couples masses by springs, from ``values`` (cell, spring) of cells ``start`` - 1 on.
+        """Return rows of a matrix of springs between masses, from ``values`` (cell, spring) of ``start`` - 1 on.
 
         A spring to the next cell belongs to the cell in which it begins, hence the cell before ``start``.
         """
@@ -287,11 +287,11 @@ class Chain:
         return coo_matrix((np.concatenate(entries), places), shape=shape).tocsr()
 
     def masses(self) -> np.ndarray:
-        """Masses (cells dofs,) in kg of all cells, in their order."""
+        """Return masses (cells dofs,) in kg of all cells, in their order."""
         return self.coefficients(0, self.cells).masses.ravel()
 
     def wave_scale(self, drive: Waveform, cell: int = 0, mass: int = 0) -> float:
-        """Displacement amplitude in m of the linear wave that ``drive`` makes on a ``mass`` of a ``cell`` (0-based).
+        """Return the amplitude in m of the linear wave that ``drive`` makes on a ``mass`` of a ``cell`` (0-based).
 
         With the drive's main frequency Om and its Nc cycles it is the largest steady response to the peak force at the
         complex frequency Om (1 - i/Nc), whose imaginary part stands for the finite burst; Om times that is the scale of
@@ -315,7 +315,7 @@ class Chain:
 # Kept, since most cases of a sweep or a fit differ in their contacts or in the drive's amplitude alone.
 @lru_cache(maxsize=64)
 def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega: complex) -> float:
-    """Largest displacement in m of a lattice of equal cells under 1 N at the complex frequency ``omega`` in rad/s.
+    """Return the largest displacement in m of equal cells under 1 N at the complex frequency ``omega`` in rad/s.
 
     The force acts on the mass of the number ``driven``, from 0, cell by cell.
     """
@@ -330,7 +330,7 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
 
 @lru_cache(maxsize=64)
 def unstable_key(cell: UnitCell, ends: Ends, cells: int) -> str | None:
-    """The key of the first negative spring or dashpot of a ``cell`` that others do not outweigh; None if they do.
+    """Return key of the first negative spring or dashpot of a ``cell`` that others do not outweigh; None if they do.
 
     With walls and on a ring the motions are sums of Bloch waves, whose energy, by K(kappa), and loss, by C(kappa), must
     not be negative. A free end has motions of its own, near it: a lattice of a few cells has them.

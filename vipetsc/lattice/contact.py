@@ -50,22 +50,22 @@ class LawParameter(NamedTuple):
 
 
 def parameter(law: str, unit: str, text: str, least: float, most: float) -> dict[str, LawParameter]:
-    """Metadata of a field of ``Contact`` that is a parameter of a shipped elastic law."""
+    """Return metadata of a field of ``Contact`` that is a parameter of a shipped elastic law."""
     return {"parameter": LawParameter(law=law, unit=unit, text=text, least=least, most=most)}
 
 
 def registered_law(name: str) -> LawPart | None:
-    """The law that a user's module registers by that ``name``; None for a shipped one."""
+    """Return the law that a user's module registers by that ``name``; None for a shipped one."""
     return cast(LawPart | None, PARTS[LAW].get(name))
 
 
 def registered_factor(name: str) -> DissipationPart | None:
-    """The dissipation factor that a user's module registers by that ``name``; None for a shipped one."""
+    """Return the dissipation factor that a user's module registers by that ``name``; None for a shipped one."""
     return cast(DissipationPart | None, PARTS[DISSIPATION].get(name))
 
 
 def least_restitution(factor: str) -> float:
-    """The smallest restitution that the dissipation ``factor`` of that name takes."""
+    """Return the smallest restitution that the dissipation ``factor`` of that name takes."""
     registered = registered_factor(factor)
     if registered:
         return registered.least_restitution
@@ -73,7 +73,7 @@ def least_restitution(factor: str) -> float:
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
-    """kc = 2 E sqrt(R) / (3 (1 - nu^2)) in N/m^(3/2) for the modulus E in Pa and the radius R in m.
+    """Return kc = 2 E sqrt(R) / (3 (1 - nu^2)) in N/m^(3/2) for the modulus E in Pa and the radius R in m.
 
     It is Hertz's stiffness 4/3 E' sqrt(R) of two bodies of one material, 1/E' = 2 (1 - nu^2)/E, with the relative
     curvature 1/R = 1/R1 + 1/R2: R is the radius of a sphere that meets a flat stop, and half the radius of two equal
@@ -83,7 +83,7 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
 
 
 def rebound(damping: float, restitution: float) -> float:
-    """c (1 + e) + log(1 - c e) - log(1 + c): zero where an impact with the damping c has the restitution e.
+    """Return c (1 + e) + log(1 - c e) - log(1 + c): zero where an impact with the damping c has the restitution e.
 
     For s = w'/w'_minus the motion m w'' = -f (1 + c s) gives s ds/(1 + c s) = -f dx/(m w'_minus^2). The indentation is
     0 at both ends of an impact, and with it the integral of f dx: that of s/(1 + c s) from s = -e to 1 must be 0. It is
@@ -155,14 +155,14 @@ class Contact:
         return self.law in LAWS and self.onset_exponent == 1 and not self.is_rigid
 
     def elastic_force(self, x: ArrayLike) -> np.ndarray:
-        """f (...) in N at indentations ``x`` (...) in m; zero for x <= 0."""
+        """Return f (...) in N at indentations ``x`` (...) in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)
         if self.law not in LAWS:
             return self._registered_values("force", x)
         return self.stiffness * x**self.onset_exponent
 
     def elastic_slope(self, x: ArrayLike) -> np.ndarray:
-        """df/dx (...) in N/m at indentations ``x`` (...) in m; for x <= 0 that of a contact that has just closed."""
+        """Return df/dx (...) in N/m at indentations ``x`` (...) in m; for x <= 0 that of a contact just closed."""
         x = np.maximum(x, 0.0)
         n = self.onset_exponent
         if self.law not in LAWS:
@@ -170,7 +170,7 @@ class Contact:
         return n * self.stiffness * x ** (n - 1)
 
     def elastic_energy(self, x: ArrayLike) -> np.ndarray:
-        """The integral of f (...) in J from 0 to indentations ``x`` (...) in m; zero for x <= 0."""
+        """Return the integral of f (...) in J from 0 to indentations ``x`` (...) in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)
         n = self.onset_exponent
         if self.law not in LAWS:
@@ -178,7 +178,7 @@ class Contact:
         return self.stiffness * x ** (n + 1) / (n + 1)
 
     def _registered_values(self, name: str, x: np.ndarray) -> np.ndarray:
-        """Force, slope or energy, by ``name``, of a law that a user's module registers."""
+        """Return force, slope or energy, by ``name``, of a law that a user's module registers."""
         # Imported here: who reads a case needs no compiler.
         from vipetsc.lattice.registered_law import compiled_law, evaluate
 
@@ -199,7 +199,7 @@ class Contact:
         return float(2 * integral)
 
     def impact_depth(self, speed: float, reduced_mass: float) -> float:
-        """Deepest indentation in m of two masses that meet at ``speed`` in m/s, without loss.
+        """Return the deepest indentation in m of two masses that meet at ``speed`` in m/s, without loss.
 
         ``reduced_mass`` in kg is m_host m_resonator / (m_host + m_resonator).
         """
@@ -221,7 +221,7 @@ class Contact:
         return x
 
     def impact_time(self, speed: float, reduced_mass: float) -> float:
-        """Duration in s of an impact without loss, as in ``impact_depth``: the integral of 2 dx/x'."""
+        """Return the duration in s of an impact without loss, as in ``impact_depth``: the integral of 2 dx/x'."""
         depth = self.impact_depth(speed, reduced_mass)
         # The impact of a rigid stop has no depth, and takes no time.
         if self.duration_factor:
@@ -274,7 +274,7 @@ class Contact:
         return float(scipy.optimize.brentq(lambda e: rebound(c, e), 0.0, most))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
-        """g = 1 + c w'/w'_minus of relative and approach velocities (...) in m/s, with the ``damping`` c.
+        """Return g = 1 + c w'/w'_minus of relative and approach velocities (...) in m/s, with the ``damping`` c.
 
         The paper prints a minus sign, which feeds energy in; Hunt and Crossley's law has a plus.
         """
@@ -286,13 +286,13 @@ class Contact:
     def force(
         self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf
     ) -> np.ndarray:
-        """Restoring force F (...) in N for relative displacements w (...) in m; g = 1 unless an approach is given."""
+        """Return the force F (...) in N for relative displacements w (...) in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
         elastic = self.elastic_force(w - clearance) - self.elastic_force(-w - clearance)
         return elastic * self.dissipation_factor(rate, approach)
 
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
-        """Elastic energy (...) in J stored at relative displacements w (...) in m."""
+        """Return the elastic energy (...) in J stored at relative displacements w (...) in m."""
         w = np.asarray(w, float)
         return self.elastic_energy(w - clearance) + self.elastic_energy(-w - clearance)
 

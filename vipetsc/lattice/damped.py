@@ -46,7 +46,7 @@ class DampedPoint(NamedTuple):
 
 
 def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
-    """The waves of ``cell`` at real wavenumbers ``kappa`` (...) in rad per cell, from the eigenvalues of the state."""
+    """Return waves of ``cell`` at real wavenumbers ``kappa`` (...) in rad per cell, from the state's eigenvalues."""
     kappa = np.asarray(kappa, float)
     d = cell.dofs
     inverse = 1 / np.asarray(cell.masses)[:, None]
@@ -73,7 +73,7 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
 
 @lru_cache
 def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Dashpots in N s/m to ground (dof,) and parallel to the springs (spring,) that bring bands near to a ``loss``.
+    """Return dashpots in N s/m to ground (dof,) and along springs (spring,) that bring bands near to a ``loss``.
 
     ``loss`` has pairs of a band (from 1) and the loss asked of it, twice the damping ratio. A wave phi of frequency
     omega, phi* M phi = 1, has the loss phi* C phi/omega if C is small, which is linear in the dashpots. They are not
@@ -115,7 +115,7 @@ class Waves(NamedTuple):
 
 @lru_cache
 def _three_matrices(cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
-    """Bloch stiffness and damping (wavenumber, dof, dof) at three wavenumbers.
+    """Return Bloch stiffness and damping (wavenumber, dof, dof) at three wavenumbers.
 
     D + B exp(i kappa) + B^T exp(-i kappa) has three parts, which three values determine.
     """
@@ -124,7 +124,7 @@ def _three_matrices(cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damped_waves(cell: UnitCell, omega: float) -> Waves:
-    """The waves of ``cell`` at the real frequency ``omega`` in rad/s: lambda, shapes and flux of each."""
+    """Return the waves of ``cell`` at the real frequency ``omega`` in rad/s: lambda, shapes and flux of each."""
     d = cell.dofs
     stiffness, damping = _three_matrices(cell)
     zero, quarter, half = stiffness + 1j * omega * damping
@@ -154,7 +154,7 @@ def damped_waves(cell: UnitCell, omega: float) -> Waves:
 
 
 def decay_length(cell: UnitCell, omega: float) -> float:
-    """Cells in which the wave of ``omega`` (rad/s) that goes farthest decays by 1/e; inf without damping."""
+    """Return cells in which the wave of ``omega`` (rad/s) that goes farthest decays by 1/e; inf without damping."""
     growth = np.abs(np.log(np.abs(damped_waves(cell, omega).factor)))
     slowest = growth.min()
     if slowest <= NEUTRAL:

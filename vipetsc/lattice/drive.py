@@ -98,14 +98,14 @@ class ToneBurst:
         return np.array([self.duration])
 
     def force(self, t: ArrayLike) -> np.ndarray:
-        """Force (...) in N at times ``t`` (...) in s."""
+        """Return the force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         phase = self.frequency * t
         burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
         return np.where((t > 0) & (t < self.duration), burst, 0.0)
 
     def rate(self, t: ArrayLike) -> np.ndarray:
-        """Derivative (...) of the force in N/s at times ``t`` (...) in s."""
+        """Return the derivative (...) of the force in N/s at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         phase = self.frequency * t
         slow = phase / self.cycles
@@ -113,7 +113,7 @@ class ToneBurst:
         return np.where((t > 0) & (t < self.duration), self.window_amplitude * self.frequency * rate, 0.0)
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
+        """Return Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
         w = np.asarray(frequency, float) * (1 + 1e-7j)  # off the poles, which the first factor cancels
         # [1 - cos(Om t/Nc)] sin(Om t) is the sum of three sines: their weights and frequencies. The one of frequency 0,
         # in a burst of one cycle, is 0 and must not be divided by w^2 = 0.
@@ -126,7 +126,7 @@ class ToneBurst:
         return self.window_amplitude * (1 - np.exp(-1j * w * self.duration)) * np.asarray(sines)
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
-        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), in closed form."""
+        """Return the integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), in closed form."""
         end = min(max(stop, 0.0), self.duration)
         begin = min(max(start, 0.0), end)
         middle = (begin + end) / 2
@@ -162,7 +162,7 @@ class Pieces:
 
     @classmethod
     def of(cls, amplitude: float, frequency: float, duration: float, table: np.ndarray) -> Self:
-        """The waveform of a ``table`` (piece,) of coefficients in which the amplitude is one."""
+        """Return the waveform of a ``table`` (piece,) of coefficients in which the amplitude is one."""
         table = table.copy()
         for name in COEFFICIENTS:
             table[name] *= amplitude
@@ -216,7 +216,7 @@ class Pieces:
         return float(np.abs(self.force(np.concatenate(times))).max())
 
     def force(self, t: ArrayLike) -> np.ndarray:
-        """Force (...) in N at times ``t`` (...) in s."""
+        """Return the force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
         x = t - piece["start"]
@@ -227,7 +227,7 @@ class Pieces:
         return np.where((t >= self.table["start"][0]) & (t < self.duration), value, 0.0)
 
     def rate(self, t: ArrayLike) -> np.ndarray:
-        """Derivative (...) of the force in N/s at times ``t`` (...) in s."""
+        """Return the derivative (...) of the force in N/s at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
         x = t - piece["start"]
@@ -241,14 +241,14 @@ class Pieces:
         return np.where((t >= self.table["start"][0]) & (t < self.duration), rate, 0.0)
 
     def phase(self, t: ArrayLike) -> np.ndarray:
-        """Phase (...) in rad of the sine at times ``t`` (...) in s."""
+        """Return phase (...) in rad of the sine at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
         x = t - piece["start"]
         return np.asarray(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
 
     def _piece(self, t: np.ndarray) -> np.ndarray:
-        """The piece at each time t in s; before the beginning the first one."""
+        """Return the piece at each time t in s; before the beginning the first one."""
         number = np.searchsorted(self.table["start"], t, side="right") - 1
         return self.table[np.maximum(number, 0)]
 
@@ -259,7 +259,7 @@ class Pieces:
         return not np.isfinite(self.duration) and bool(last["frequency"] or last["rate"])
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t).
+        """Return Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t).
 
         The integral is taken by quadrature; a value that is held for ever adds the transform of a step. Raises
         ValueError for a sine that does not end.
@@ -274,7 +274,7 @@ class Pieces:
         return np.asarray(values * np.exp(-1j * w * end))
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
-        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), by Gauss's quadrature."""
+        """Return integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), by Gauss's quadrature."""
         starts = self.table["start"]
         end = min(max(stop, 0.0), self.duration)
         begin = min(max(start, float(starts[0])), end)
@@ -333,7 +333,7 @@ class Drive:
         return abs(self.scale)
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
-        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s)/``scale`` ds, at each w (w,)."""
+        """Return the integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s)/``scale`` ds, at each w (w,)."""
         response = self.waveform.response(frequency, start, stop)
         if self.damping:
             # By parts, since only the waveform's own integral is at hand.
@@ -343,7 +343,7 @@ class Drive:
 
 
 def _table(starts: ArrayLike) -> np.ndarray:
-    """Pieces that begin at ``starts`` in s, all zero; their sine is 1 at all times, so that polynomials are left."""
+    """Return pieces that begin at ``starts`` in s, all zero, with a sine of 1, so that polynomials are left."""
     table = np.zeros(np.size(starts), PIECE)
     table["start"] = starts
     table["phase"] = np.pi / 2
@@ -364,7 +364,7 @@ def ramped(
     sweep: float | None = 0.0,
     phase: float = 0.0,
 ) -> Pieces:
-    """A sine of ``frequency`` in rad/s that rises over ``ramp`` s and falls likewise before ``duration``, if it ends.
+    """Return a sine of ``frequency`` in rad/s that rises over ``ramp`` s, and falls so before ``duration``, if any.
 
     Its ``phase`` in rad is that at the beginning. With a ``sweep`` its frequency goes linearly from half of that below
     to half of it above; without one (None) it is no sine, but a step. ``ramp`` is at most half the duration.
@@ -392,7 +392,7 @@ def ramped(
 
 
 def impulse(amplitude: float, duration: float) -> Pieces:
-    """Half a sine of ``duration`` s whose integral is ``amplitude``, in N s."""
+    """Return the half a sine of ``duration`` s whose integral is ``amplitude``, in N s."""
     table = _table([0.0])
     frequency = np.pi / duration
     table["phase"] = 0.0

@@ -39,7 +39,7 @@ class Side(NamedTuple):
 
     @classmethod
     def at(cls, end: End, waves: Waves) -> "Side":
-        """The side of an end at the frequency of ``waves``."""
+        """Return the side of an end at the frequency of ``waves``."""
         half = len(waves.factor) // 2
         to_higher = slice(0, half)
         to_lower = slice(half, None)
@@ -48,7 +48,7 @@ class Side(NamedTuple):
         return cls(towards=to_lower, back=to_higher, coupling=waves.coupling.T, step=1 / waves.factor)
 
     def decay(self) -> np.ndarray:
-        """|log| of the factors (wave,) of the waves towards the end."""
+        """Return |log| of the factors (wave,) of the waves towards the end."""
         return np.asarray(np.abs(np.log(np.abs(self.step[self.towards]))))
 
 
@@ -61,7 +61,7 @@ class EndSection(NamedTuple):
 
 
 def condensed(section: EndSection, omegas: np.ndarray) -> np.ndarray:
-    """Z (omega, dof, dof) in N/m of a ``section`` at ``omegas`` in rad/s, on its innermost cell."""
+    """Return Z (omega, dof, dof) in N/m of a ``section`` at ``omegas`` in rad/s, on its innermost cell."""
     chain, cells, end = section
     d = chain.cell.dofs
     # From the outermost cell inwards; ``outwards`` is the block of a row that couples it to the cell farther out.
@@ -89,7 +89,7 @@ def condensed(section: EndSection, omegas: np.ndarray) -> np.ndarray:
 
 
 def _blocks(rows: csr_matrix, first: int, d: int) -> np.ndarray:
-    """Blocks (3, cell, dof, dof) of a matrix's ``rows``, of cells from ``first``: cell before, the same, next one."""
+    """Return blocks (3, cell, dof, dof) of a matrix's ``rows``, of cells from ``first``: cell before, same, next."""
     blocks = rows.tobsr(blocksize=(d, d))
     cells = rows.shape[0] // d
     row = np.repeat(np.arange(cells), np.diff(blocks.indptr))
@@ -101,7 +101,7 @@ def _blocks(rows: csr_matrix, first: int, d: int) -> np.ndarray:
 
 
 def amplitudes_back(z: np.ndarray, waves: Waves, end: End) -> np.ndarray:
-    """Amplitudes (wave back, wave towards) of the waves that each wave of amplitude 1 towards an ``end`` sends back.
+    """Return amplitudes (wave back, wave towards) of the waves that unit waves towards an ``end`` send back.
 
     Both are at the last cell before the section, which is condensed to ``z`` (dof, dof).
     """
@@ -114,14 +114,14 @@ def amplitudes_back(z: np.ndarray, waves: Waves, end: End) -> np.ndarray:
 
 
 def reflections(z: np.ndarray, waves: Waves, end: End) -> np.ndarray:
-    """Fractions (wave towards,) of the waves' energies that come back from a section condensed to ``z``."""
+    """Return fractions (wave towards,) of the waves' energies that come back from a section condensed to ``z``."""
     side = Side.at(end, waves)
     flux = np.abs(waves.flux)
     return np.asarray(flux[side.back] @ np.abs(amplitudes_back(z, waves, end)) ** 2 / flux[side.towards])
 
 
 def reflection(chain: Chain, omega: float, cells: int, end: End = "right") -> float:
-    """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from the last ``cells`` at an ``end``.
+    """Return the largest share of a wave's energy at ``omega`` (rad/s) that returns from ``cells`` at an ``end``.
 
     The cells before them go on for ever, as the reference cell, and so must be the springs and dashpots that join the
     two parts. Incoming are waves that do not decay, in a damped cell the one that decays least. NaN in a gap.
@@ -141,7 +141,7 @@ def reflection(chain: Chain, omega: float, cells: int, end: End = "right") -> fl
 
 
 def absorber(cell: UnitCell, ends: Ends, cells: int, strength: float, before: int = 1) -> Chain:
-    """A right end of ``cells`` with dashpots to ground, ``strength`` (1/s) x^3 times each mass; cells ``before`` it.
+    """Return a right end of ``cells`` with dashpots to ground, ``strength`` (1/s) x^3 times masses; ``before`` it.
 
     x goes from 0 to 1 over the cells, taken in their middles.
     """
@@ -152,7 +152,7 @@ def absorber(cell: UnitCell, ends: Ends, cells: int, strength: float, before: in
 
 
 def absorbing_section(cell: UnitCell, ends: Ends, cells: int, strength: float, end: End) -> EndSection:
-    """The section of an ``absorber`` at an ``end``."""
+    """Return the section of an ``absorber`` at an ``end``."""
     right = absorber(cell, ends, cells, strength, before=0)
     if end == "right":
         return EndSection(right, cells, end)

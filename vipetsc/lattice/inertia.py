@@ -11,7 +11,7 @@ from vipetsc.compiled import kernel
 
 @kernel
 def count_below(band: np.ndarray, shift: float, smallest: float) -> int:
-    """Number of eigenvalues below ``shift``; ``band`` (n, width + 1) has A[j + k, j] at [j, k], and is overwritten.
+    """Return the number of eigenvalues below ``shift``; ``band`` (n, width + 1), A[j + k, j] at [j, k], is overwritten.
 
     A pivot smaller than ``smallest`` is taken for minus that.
     """

@@ -49,7 +49,7 @@ class Modes:
     cells: int
 
     def amplitudes(self, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Amplitudes z (t, mode) in sqrt(J) of fields (t, cell, dof) in m and m/s."""
+        """Return amplitudes z (t, mode) in sqrt(J) of fields (t, cell, dof) in m and m/s."""
         nt = len(velocity)
         if self.vectors.ndim == 2:
             root = np.sqrt(self.chain.masses()).reshape(self.chain.cells, -1)
@@ -71,11 +71,11 @@ class Modes:
         return np.concatenate([forward.reshape(nt, -1), back.reshape(nt, -1)], axis=1)
 
     def _backward(self, count: int) -> slice:
-        """Slice of ``count`` wavenumbers k >= 0 that leaves out 0 and pi, which are their own opposites."""
+        """Return slice of ``count`` wavenumbers k >= 0 that leaves out 0 and pi, which are their own opposites."""
         return slice(1, count - (self.cells % 2 == 0))
 
     def force(self, cell: int, mass: int) -> np.ndarray:
-        """Rate z' (mode) in 1/sqrt(kg) that a force of 1 N on a ``mass`` of a ``cell`` (0-based) adds."""
+        """Return the rate z' (mode) in 1/sqrt(kg) that a force of 1 N on a ``mass`` of a ``cell`` (0-based) adds."""
         root = np.sqrt(self.chain.coefficients(cell, cell + 1).masses[0, mass])
         if self.vectors.ndim == 2:
             return np.asarray(self.vectors[cell * self.chain.cell.dofs + mass] / root)
@@ -91,12 +91,12 @@ class Modes:
         return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
 
     def driven(self, drive: Drive, start: float, stop: float) -> np.ndarray:
-        """Change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for a ``force`` of 1."""
+        """Return change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for ``force`` 1."""
         return drive.response(self.frequency, start, stop)
 
 
 def linear_modes(chain: Chain) -> Modes:
-    """The modes of ``chain`` with linear springs alone, without its sites and dashpots, computed once.
+    """Return the modes of ``chain`` with linear springs alone, without its sites and dashpots, computed once.
 
     1200 DoFs take a quarter of a second, 4000 a quarter of a minute. Raises ValueError for a lattice of more than
     ``MOST_DOFS`` whose cells differ: its modes are no waves.
@@ -106,7 +106,7 @@ def linear_modes(chain: Chain) -> Modes:
 
 @lru_cache(maxsize=4)
 def _modes(chain: Chain) -> Modes:
-    """The modes of a chain without sites, as ``linear_modes``."""
+    """Return the modes of a chain without sites, as ``linear_modes``."""
     ring = chain.topology.is_ring
     many = chain.cells * chain.cell.dofs > MOST_DOFS
     if chain.is_uniform() and (ring or many):
@@ -134,7 +134,7 @@ def _modes(chain: Chain) -> Modes:
 
 
 def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
-    """The Bloch waves on a ring of ``cells``: k >= 0, to lower cells, then those of k < 0 that are not among them."""
+    """Return the Bloch waves on a ring of ``cells``: k >= 0, to lower cells, then k < 0 where these are others."""
     kappa = 2 * np.pi * np.arange(cells // 2 + 1) / cells
     waves = bloch(chain.cell, kappa)
     back = slice(1, len(kappa) - (cells % 2 == 0))
@@ -151,7 +151,7 @@ def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
 
 
 def number_near(chain: Chain, omega: float) -> int:
-    """The number (from 1, lowest first) of the mode whose frequency is nearest to ``omega`` in rad/s."""
+    """Return the number (from 1, lowest first) of the mode whose frequency is nearest to ``omega`` in rad/s."""
     if chain.topology.is_ring:
         frequency = np.sort(_ring(chain, chain.cells, exact=True).frequency)
         return int(np.argmin(np.abs(frequency - omega))) + 1
@@ -163,7 +163,7 @@ def number_near(chain: Chain, omega: float) -> int:
 
 @lru_cache(maxsize=4)
 def mode_frequency(chain: Chain, number: int) -> float:
-    """Frequency in rad/s of mode ``number`` (from 1, lowest first) of a chain of any length, with ends by bisection."""
+    """Return the frequency in rad/s of mode ``number`` (from 1, lowest first) of a chain with ends, by bisection."""
     if chain.topology.is_ring:
         frequencies = np.sort(_ring(chain, chain.cells, exact=True).frequency)
         squared = frequencies[number - 1] ** 2
@@ -188,7 +188,7 @@ def mode_frequency(chain: Chain, number: int) -> float:
 
 @lru_cache(maxsize=4)
 def mode_shape(chain: Chain, number: int) -> np.ndarray:
-    """Displacement (cell, dof) in m of mode ``number`` (from 1, lowest first), the largest 1 m.
+    """Return the displacement (cell, dof) in m of mode ``number`` (from 1, lowest first), the largest 1 m.
 
     Of the two modes of a wave on a ring, the one that is largest at cell 1 has the lower number.
     """
@@ -200,7 +200,7 @@ def mode_shape(chain: Chain, number: int) -> np.ndarray:
 
 
 def _ring_shape(chain: Chain, number: int) -> np.ndarray:
-    """Shape (cell, dof) of a mode of a ring: real or imaginary part of its Bloch wave."""
+    """Return the shape (cell, dof) of a mode of a ring: real or imaginary part of its Bloch wave."""
     ring = _ring(chain, chain.cells, exact=True)
     place = np.argsort(ring.frequency, kind="stable")[number - 1]
     kappa = ring.wavenumber[place]
@@ -213,7 +213,7 @@ def _ring_shape(chain: Chain, number: int) -> np.ndarray:
 
 
 def _standing_shape(chain: Chain, number: int) -> np.ndarray:
-    """Shape (cell, dof) of a mode of a lattice with ends, by inverse iteration."""
+    """Return the shape (cell, dof) of a mode of a lattice with ends, by inverse iteration."""
     band = _band(_scaled(chain))
     root = 1 / np.sqrt(chain.masses())
     # A hair above the eigenvalue, so that the shifted matrix can be inverted.
@@ -237,7 +237,7 @@ class _SpectrumCounter(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _spectrum_counter(chain: Chain) -> _SpectrumCounter:
-    """The counter of a chain with ends, by the inertia of its band matrix; the bound is of Gershgorin's circles."""
+    """Return counter of a chain with ends, by the inertia of its band matrix; the bound is of Gershgorin's circles."""
     from vipetsc.lattice.inertia import count_below  # numba, which takes long to import
 
     matrix = _scaled(chain)
@@ -249,13 +249,13 @@ def _spectrum_counter(chain: Chain) -> _SpectrumCounter:
 
 
 def _scaled(chain: Chain) -> csc_matrix:
-    """M^(-1/2) K M^(-1/2) in (rad/s)^2."""
+    """Return M^(-1/2) K M^(-1/2) in (rad/s)^2."""
     root = diags(1 / np.sqrt(chain.masses()))
     return csc_matrix(root @ chain.stiffness_matrix() @ root)
 
 
 def _band(matrix: csc_matrix) -> np.ndarray:
-    """The band of ``matrix`` (3 width + 1, n) in the layout of LAPACK's ``dgbtrf``, which fills the ``width`` above."""
+    """Return the band of ``matrix`` (3 width + 1, n) in the layout of LAPACK's ``dgbtrf``, which fills the top."""
     # One free mass has no spring: its matrix is 0, and has no entry.
     width = int(np.abs(np.subtract(*matrix.nonzero())).max(initial=0))
     band = np.zeros((3 * width + 1, matrix.shape[0]))
@@ -267,7 +267,7 @@ def _band(matrix: csc_matrix) -> np.ndarray:
 
 
 def _wavenumbers(vectors: np.ndarray, chain: Chain) -> np.ndarray:
-    """Wavenumbers (mode): of a standing wave two neighbours of a cell sum to 2 cos(kappa) times itself."""
+    """Return wavenumbers (mode): of a standing wave two neighbours of a cell sum to 2 cos(kappa) times itself."""
     shapes = vectors.reshape(chain.cells, -1, vectors.shape[1])
     sums = np.zeros_like(shapes)
     sums[1:] += shapes[:-1]

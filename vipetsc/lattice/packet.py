@@ -23,7 +23,7 @@ NEGLIGIBLE = 1e-18
 
 @lru_cache
 def packet_speeds(cell: UnitCell, burst: Waveform, mass: int) -> tuple[int, float, float]:
-    """Band (from 0) that takes most of the energy, and the speeds in cells/s of its slow and of its fast waves.
+    """Return band (from 0) that takes most of the energy, and the speeds in cells/s of its slow and of its fast waves.
 
     A force F on one ``mass`` (0-based) gives the Bloch wave of frequency w and mass-normalised vector u an energy in
     proportion to |F^(w)|^2 |u_mass|^2. All but the fraction ``BEYOND`` of the band's energy is faster than the slow
@@ -43,7 +43,7 @@ def packet_speeds(cell: UnitCell, burst: Waveform, mass: int) -> tuple[int, floa
 
 @lru_cache
 def narrow_fraction(cell: UnitCell, waveform: Waveform, mass: int, width: float) -> float:
-    """Fraction of the energy of waves by a force on one ``mass`` (0-based) that is in one band, and narrow.
+    """Return the fraction of the energy of waves by a force on one ``mass`` (0-based) that is in one band, and narrow.
 
     These are the waves of the band that takes most, at frequencies within the fraction ``width`` of the main one.
     """
@@ -67,7 +67,7 @@ class Packet(NamedTuple):
     energy: float
 
     def on(self, chain: Chain, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement and velocity (cell, dof) of cells ``start`` to ``stop``; what lies beyond an end is left out."""
+        """Return displacement and velocity (cell, dof) of cells ``start`` to ``stop``, none beyond an end."""
         first = self.centre - len(self.velocity) // 2
         cells = chain.topology.neighbour(first + np.arange(len(self.velocity)))
         inside = (cells >= start) & (cells < stop)
@@ -80,7 +80,7 @@ class Packet(NamedTuple):
 
 @lru_cache(maxsize=4)
 def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width: float, direction: int = 1) -> Packet:
-    """Waves of ``band`` (1-based) alone about ``kappa`` in (0, pi], in ``direction`` 1 to higher cells, -1 to lower.
+    """Return waves of ``band`` (1-based) alone about ``kappa`` in (0, pi], in ``direction`` 1 (to higher cells) or -1.
 
     u = Re sum a_k phi_k exp(i (k x - Om_k t)), a_k ~ exp(-(k - kappa)^2 width^2/2), x in cells from ``centre``: the
     envelope is a Gaussian of standard deviation ``width``. Vectors phi_k are turned so that they are in phase with that

@@ -82,7 +82,7 @@ class PlaneCell:
         return np.sqrt(np.repeat(self.masses, self.components))
 
     def _dynamical(self, k1: ArrayLike, k2: ArrayLike) -> np.ndarray:
-        """The dynamical matrix (..., dofs, dofs) in (rad/s)^2 at the phases ``k1`` and ``k2`` (...)."""
+        """Return the dynamical matrix (..., dofs, dofs) in (rad/s)^2 at the phases ``k1`` and ``k2`` (...)."""
         k1, k2 = np.broadcast_arrays(np.asarray(k1, float), np.asarray(k2, float))
         matrix = np.zeros((*k1.shape, self.dofs, self.dofs), complex)
         for spring in self.springs:
@@ -123,17 +123,17 @@ class PlaneCell:
                 yield number, row, self._wide(spring, row, row + across, rows, edges)
 
     def _projector(self, spring: PlaneSpring) -> np.ndarray:
-        """The matrix n n^T (components, components) of a spring; 1 out of the plane."""
+        """Return the matrix n n^T (components, components) of a spring; 1 out of the plane."""
         if not self.in_plane:
             return np.ones((1, 1))
         return np.outer(spring.direction, spring.direction)
 
     def _place(self, mass: int) -> slice:
-        """The degrees of freedom of a ``mass`` in the cell."""
+        """Return the degrees of freedom of a ``mass`` in the cell."""
         return slice(self.components * mass, self.components * (mass + 1))
 
     def _wide(self, spring: PlaneSpring, row: int, other: int, rows: int, edges: Edges) -> list[Spring]:
-        """The springs of the wide cell that a ``spring`` from ``row`` to the row ``other`` is; rows may lie outside."""
+        """Return the springs of the wide cell that a ``spring`` from ``row`` to ``other`` is; these may lie outside."""
         if edges == "periodic":
             # Each spring once, from the row in which it begins.
             if not 0 <= row < rows:
@@ -158,7 +158,7 @@ class PlaneCell:
 
     @staticmethod
     def _turned(spring: PlaneSpring) -> PlaneSpring:
-        """The numbers of a ``spring`` seen from its other end, from which its elongation has the other sign."""
+        """Return the numbers of a ``spring`` seen from its other end, from which its elongation has the other sign."""
         return PlaneSpring(
             start=spring.end,
             end=spring.start,
@@ -170,7 +170,7 @@ class PlaneCell:
         )
 
     def _between(self, spring: PlaneSpring, start: int, end: int, offset: int) -> list[Spring]:
-        """The scalar springs between two masses of the wide cell, or of it and the next one (``offset`` 1)."""
+        """Return the scalar springs between two masses of the wide cell, or of it and the next one (``offset`` 1)."""
         if start == end and not offset:
             return []  # a ring of one row joins a mass to itself
         if not self.in_plane:
@@ -185,7 +185,7 @@ class PlaneCell:
         return springs
 
     def _to_ground(self, spring: PlaneSpring, mass: int) -> list[Spring]:
-        """The scalar springs of a mass whose spring is held at the other end."""
+        """Return the scalar springs of a mass whose spring is held at the other end."""
         if not self.in_plane:
             return [self._scalar(spring, GROUND, mass, 1.0, 0)]
         block = self._projector(spring)
@@ -194,7 +194,7 @@ class PlaneCell:
 
     @staticmethod
     def _scalar(spring: PlaneSpring, start: int, end: int, factor: float, offset: int) -> Spring:
-        """A spring of the wide cell with ``factor`` times the stiffness and the dashpot of a ``spring``."""
+        """Return a spring of the wide cell with ``factor`` times the stiffness and the dashpot of a ``spring``."""
         return Spring(
             start=start,
             end=end,
@@ -207,7 +207,7 @@ class PlaneCell:
 
     @staticmethod
     def _merged(springs: list[Spring]) -> list[Spring]:
-        """The sums of ``springs`` between the same degrees of freedom, without those that cancel."""
+        """Return the sums of ``springs`` between the same degrees of freedom, without those that cancel."""
         sums: dict[tuple[int, int, int], list[Spring]] = {}
         for spring in springs:
             sums.setdefault((spring.start, spring.end, spring.offset), []).append(spring)

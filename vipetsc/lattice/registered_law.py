@@ -31,14 +31,14 @@ class CompiledLaw(NamedTuple):
 
 @cache
 def compiled_law(part: LawPart) -> CompiledLaw:
-    """The compiled functions of a law, which is named before; raises ValueError for one that numba cannot compile."""
+    """Return the compiled functions of a law, which is named before; raises ValueError if numba cannot compile it."""
     announce(f"compiling the law {part.name!r} of {part.file}")
     addresses = [_address(function, len(part.parameters)) for function in (part.force, part.slope, part.energy)]
     return CompiledLaw(*addresses)
 
 
 def _address(function: Callable[..., float], count: int) -> int:
-    """The address of a ``function`` of x, k and ``count`` parameters, as a C function of ``SIGNATURE``."""
+    """Return the address of a ``function`` of x, k and ``count`` parameters, as a C function of ``SIGNATURE``."""
     compiled = users_function(function)
 
     def call(x, k, a, b, c, d):  # type: ignore[no-untyped-def]
@@ -55,7 +55,7 @@ def _address(function: Callable[..., float], count: int) -> int:
 
 
 def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Values (...) of the function at an ``address`` at each indentation ``x`` (...) in m."""
+    """Return values (...) of the function at an ``address`` at each indentation ``x`` (...) in m."""
     # One signature for all laws: what a law does not take is zero and not read.
     numbers = np.zeros(1 + MOST_PARAMETERS)
     numbers[0] = stiffness
@@ -69,7 +69,7 @@ def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: n
 
 @intrinsic
 def _function_at(typing_context, address):  # type: ignore[no-untyped-def]
-    """The C function of ``SIGNATURE`` at an ``address``, for compiled code to call."""
+    """Return the C function of ``SIGNATURE`` at an ``address``, for compiled code to call."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.inttoptr(arguments[0], context.get_value_type(_FUNCTION))

@@ -61,7 +61,7 @@ class Source:
         self._sent: dict[tuple[float, End, bool], np.ndarray] = {}
 
     def energies(self, sections: Sequence[EndSection]) -> np.ndarray:
-        """Energies (2,) in J that arrive at the ``sections`` and that come back from them."""
+        """Return energies (2,) in J that arrive at the ``sections`` and that come back from them."""
         # With sections at both ends, no end is a wall that sends waves back to the other.
         absorbs = len(sections) == 2
 
@@ -71,7 +71,7 @@ class Source:
         return integrate(densities, self.edges())
 
     def edges(self) -> np.ndarray:
-        """Frequencies (edge,) in rad/s between which densities are smooth: edges of bands and the spectrum's lobes."""
+        """Return the frequencies (edge,) in rad/s between which densities are smooth: band edges and lobes."""
         bands = pass_bands(self.cell)
         edges = [0.0, *(band.low for band in bands), *(band.high for band in bands)]
         main = self.waveform.frequency
@@ -79,7 +79,7 @@ class Source:
         return np.unique([*edges, *(w for w in lobes if 0 < w < max(edges))])
 
     def sent(self, omegas: np.ndarray, end: End, absorbs: bool = False) -> np.ndarray:
-        """Energies (omega, wave) in J s/rad of the waves towards an ``end`` next to the driven cell.
+        """Return energies (omega, wave) in J s/rad of the waves towards an ``end`` next to the driven cell.
 
         The other end sends back what comes to it, unless it ``absorbs``, too.
         """
@@ -93,17 +93,17 @@ class Source:
         return np.array([self._sent[omega, end, absorbs] for omega in omegas.tolist()])
 
     def _cells_beyond(self, end: End) -> int:
-        """Number of cells between the driven one and an ``end``."""
+        """Return the number of cells between the driven one and an ``end``."""
         return {"left": self.place, "right": self.cells - 1 - self.place}[end]
 
     def _waves_at(self, omega: float) -> Waves:
-        """The waves at ``omega`` in rad/s, which all sections and both ends have in common."""
+        """Return the waves at ``omega`` in rad/s, which all sections and both ends have in common."""
         if omega not in self._waves:
             self._waves[omega] = damped_waves(self.cell, omega)
         return self._waves[omega]
 
     def _energy_of_a_unit(self, omega: float, end: End, wall: np.ndarray | None) -> np.ndarray:
-        """Energies (wave,) towards an ``end`` by a unit force, with the ``wall`` (dof, dof) of the other end."""
+        """Return energies (wave,) towards an ``end`` by a unit force, with the ``wall`` (dof, dof) of the other end."""
         waves = self._waves_at(omega)
         side = Side.at(end, waves)
         flux = np.abs(waves.flux[side.towards])
@@ -126,7 +126,7 @@ class Source:
         return np.asarray(flux * (np.abs(ahead) ** 2 + np.abs(image) ** 2))
 
     def _densities(self, omegas: np.ndarray, section: EndSection, absorbs: bool) -> np.ndarray:
-        """Energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
+        """Return energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
         end = section.end
         distance = max(self._cells_beyond(end) - section.cells, 0)
         sent = self.sent(omegas, end, absorbs)
@@ -142,7 +142,7 @@ class Source:
 
 
 def amplitudes_sent(waves: Waves, load: np.ndarray, end: End) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitudes at a cell of an infinite lattice that a ``load`` (dof,) in N on its masses sends out.
+    """Return amplitudes at a cell of an infinite lattice that a ``load`` (dof,) in N on its masses sends out.
 
     They are (wave,) of the waves towards an ``end`` and of the others, both in m, at the frequency of ``waves``.
     """
@@ -168,14 +168,14 @@ def amplitudes_sent(waves: Waves, load: np.ndarray, end: End) -> tuple[np.ndarra
 
 
 def integrate(densities: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:
-    """Integrals (n,) of ``densities`` (n, x) from the first to the last of the ``edges``, each to ``ACCURACY``.
+    """Return integrals (n,) of ``densities`` (n, x) from the first to the last of the ``edges``, each to ``ACCURACY``.
 
     Next to an edge they may be as the square root of the distance to it, or its inverse: x = a + (b - a) sin^2 angle.
     """
     points, weights = leggauss(NODES)
 
     def gauss(panels: np.ndarray) -> np.ndarray:
-        """Integrals (n, panel) over ``panels`` (panel, 4): two edges, and two angles between them."""
+        """Return integrals (n, panel) over ``panels`` (panel, 4): two edges, and two angles between them."""
         a, b, begin, end = panels.T[:, :, None]
         angle = begin + (end - begin) * (points + 1) / 2
         weight = weights * (end - begin) / 2 * (b - a) * np.sin(2 * angle)

@@ -53,7 +53,7 @@ class Variation:
             object.__setattr__(self, name, copy)
 
     def items(self) -> list[tuple[str, np.ndarray]]:
-        """Names and arrays (cell, ...) of what differs."""
+        """Return names and arrays (cell, ...) of what differs."""
         arrays = [(f.name, getattr(self, f.name)) for f in fields(self)]
         return [(name, array) for name, array in arrays if array is not None]
 

@@ -59,7 +59,7 @@ class Blocks(NamedTuple):
 
 @lru_cache
 def coupling_blocks(cell: UnitCell) -> Blocks:
-    """The blocks of an interior cell; r is the rank of the coupling to the next one."""
+    """Return the blocks of an interior cell; r is the rank of the coupling to the next one."""
     inside = np.zeros((cell.dofs, cell.dofs))
     coupling = np.zeros_like(inside)
     left = np.zeros_like(inside)
@@ -83,7 +83,7 @@ def coupling_blocks(cell: UnitCell) -> Blocks:
 
 
 def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
-    """The waves at ``omegas`` (frequency,) in rad/s with parts Re >= 0 and Im <= 0."""
+    """Return the waves at ``omegas`` (frequency,) in rad/s with parts Re >= 0 and Im <= 0."""
     blocks = coupling_blocks(cell)
     p = blocks.out
     q = blocks.into
@@ -146,7 +146,7 @@ def _make_static(cell: UnitCell, waves: BlochWaves, i: int) -> None:
 
 
 def cell_between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Displacement (dofs,) of a cell between two states (2r,), at the first frequency of ``waves``."""
+    """Return the displacement (dofs,) of a cell between two states (2r,), at the first frequency of ``waves``."""
     blocks = coupling_blocks(cell)
     r = blocks.out.shape[1]
     pull = blocks.out @ (after[:r] - waves.port * after[r:]) + blocks.into @ before[r:]
@@ -154,6 +154,6 @@ def cell_between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: n
 
 
 def energy_flux(omega: float, state: np.ndarray) -> float:
-    """Energy in W that a ``state`` (2r,) carries to higher cells at ``omega`` in rad/s."""
+    """Return the energy in W that a ``state`` (2r,) carries to higher cells at ``omega`` in rad/s."""
     r = len(state) // 2
     return float(omega / 2 * np.imag(state[r:].conj() @ state[:r]))

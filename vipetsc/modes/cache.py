@@ -19,7 +19,7 @@ class BoundedCache(Generic[Argument, Value]):
         self._values: dict[Argument, Value] = {}
 
     def get(self, argument: Argument, compute: Callable[[], Value]) -> Value:
-        """The value of an ``argument``, by ``compute`` if it is not kept; what ``compute`` raises is passed on."""
+        """Return value of an ``argument``, by ``compute`` if it is not kept; what ``compute`` raises is passed on."""
         if argument not in self._values:
             value = compute()
             if len(self._values) == self._count:

@@ -200,7 +200,7 @@ class DampedModes(RealUnknowns, OrbitProblem):
         return self.kinetic_energy(x, omega) + float(stored @ means) + float(self.series(x, omega).potential.sum())
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
-        """Estimated size of the harmonics left out, which inertia alone holds, over the sum of those kept."""
+        """Return estimated size of the harmonics left out, which inertia alone holds, over the sum of those kept."""
         forces = np.abs(self.elongations.T @ self.series(x, omega).forces)
         beyond = np.arange(self.order + 1, forces.shape[1])
         left_out = (forces[:, beyond] / (beyond * omega) ** 2).sum(axis=1) / self.system.masses

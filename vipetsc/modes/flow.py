@@ -83,7 +83,7 @@ class Change(NamedTuple):
 
 @kernel
 def first_rise(gap: np.ndarray, tolerance: float, room: np.ndarray) -> float:
-    """Position at which a gap that begins at zero or below first rises through it; ``NONE``, or ``UNDECIDED``.
+    """Return position at which a gap that begins at zero or below first rises through it; ``NONE``, or ``UNDECIDED``.
 
     ``gap`` (6,) are the coefficients of the interpolant in Bernstein's form, and the gap has the rounding error
     ``tolerance``; ``room`` (6,) is overwritten.
@@ -156,13 +156,13 @@ class FlowStep(NamedTuple):
 
 @inlined
 def clearance_on(contact: Any, side: int) -> float:
-    """Clearance in m of a ``CONTACT`` on one side, 1 or -1."""
+    """Return the clearance in m of a ``CONTACT`` on one side, 1 or -1."""
     return contact.plus if side > 0 else contact.minus
 
 
 @inlined
 def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: int) -> float:
-    """Row ``c`` of ``rows`` (rows, n) times n entries of column ``j`` of ``y``, from ``first`` on."""
+    """Return the row ``c`` of ``rows`` (rows, n) times n entries of column ``j`` of ``y``, from ``first`` on."""
     z = 0.0
     for k in range(n):
         z += rows[c, k] * y[first + k, j]
@@ -264,7 +264,7 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
 
 @kernel
 def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
-    """The record of a flow's steps, which begins at the state in column 0 of ``y`` (2n, 1 + m)."""
+    """Return the record of a flow's steps, which begins at the state in column 0 of ``y`` (2n, 1 + m)."""
     contacts = system.contacts.size
     side = np.empty(contacts, np.int64)
     step = FlowStep(system, side, np.empty((contacts, 3)), np.empty((contacts, 3)), np.empty((3, 6)))
@@ -274,7 +274,7 @@ def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
 
 @kernel
 def first_change(step: FlowStep, h: float, size: float) -> Change:
-    """The first change of a contact in a step of length ``h``; ``size`` in m is that of the motion."""
+    """Return the first change of a contact in a step of length ``h``; ``size`` in m is that of the motion."""
     change = Change(contact=-1, side=0, sign=0.0, offset=0.0, tolerance=0.0, position=NONE)
     motion = step.room[0]
     gap = step.room[1]
@@ -339,7 +339,7 @@ class ShootingMap:
         return self.start != self.end
 
     def end_unit(self, period: float) -> float:
-        """Unit of what vanishes at the end over that of the initial values, for an orbit of that ``period`` in s.
+        """Return the unit of what vanishes at the end over that of the initial values, for an orbit of ``period`` in s.
 
         From rest to rest, velocities over displacements, it is the frequency in rad/s, rounded to a power of two, by
         which numbers are multiplied without rounding.
@@ -423,7 +423,7 @@ class Flow(ABC):
 
     @contextmanager
     def limited(self, longest: int, stop: StopRequest | None) -> Iterator[None]:
-        """A block whose arcs raise FlowError beyond ``longest`` steps, and StoppedError where a ``stop`` is requested.
+        """Let arcs in the block raise FlowError beyond ``longest`` steps, StoppedError where a ``stop`` is asked.
 
         Outside of it no arc is too long, and none is stopped.
         """
@@ -446,11 +446,11 @@ class Flow(ABC):
         return min(int(steps) + self.between_looks, self._longest + 1)
 
     def omega_ref(self, period: float) -> float:
-        """Frequency in rad/s that makes velocities displacements: the larger of the fastest mode's and the orbit's."""
+        """Return the frequency in rad/s that makes velocities displacements: the larger of fastest mode and orbit."""
         return max(self.omega, 2 * np.pi / period)
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
-        """The orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.
+        """Return the orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.
 
         Raises FlowError if the time cannot be covered.
         """
@@ -479,7 +479,7 @@ class Flow(ABC):
         )
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
-        """The states (1 + count, 2n) of the orbit from ``start`` (2n,) on, every ``interval`` seconds.
+        """Return the states (1 + count, 2n) of the orbit from ``start`` (2n,) on, every ``interval`` seconds.
 
         ``period`` helps to choose steps. Raises FlowError if the time cannot be covered.
         """
@@ -544,7 +544,7 @@ def _combine(stepper: Stepper, weights: np.ndarray, h: float) -> None:
 
 @kernel
 def _scaled_error(stepper: Stepper, h: float) -> float:
-    """The largest error of a column over what is allowed; infinite if the step overflowed."""
+    """Return the largest error of a column over what is allowed; infinite if the step overflowed."""
     y = stepper.start
     end = stepper.end
     errors = stepper.errors
@@ -608,7 +608,7 @@ def tried(stepper: Stepper, h: float) -> float:
 
 @kernel
 def shortened(h: float, error: float) -> float:
-    """The length to try after a step of length ``h`` whose scaled ``error`` is not below 1."""
+    """Return the length to try after a step of length ``h`` whose scaled ``error`` is not below 1."""
     # A number that has overflowed says nothing of the next length.
     if not error < 1e300:
         return h * 0.1
@@ -617,7 +617,7 @@ def shortened(h: float, error: float) -> float:
 
 @kernel
 def grown(h: float, error: float, largest: float) -> float:
-    """The length of the next step, at most ``largest``, after one of length ``h`` whose scaled ``error`` is below 1."""
+    """Return the length of the next step, at most ``largest``, after one of ``h`` with a scaled ``error`` below 1."""
     return min(largest, h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125)))
 
 
@@ -636,7 +636,7 @@ many are allowed; in that interval the changes, the time in s, the next step's i
 
 @kernel
 def _size(stepper: Stepper) -> float:
-    """The size of the motion in m at the start of a step: the largest displacement, or velocity over a frequency."""
+    """Return size of the motion in m at the start of a step: the largest displacement, or velocity over a frequency."""
     n = stepper.step.system.inverse_mass.size
     size = 0.0
     for i in range(n):
@@ -807,7 +807,7 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray,
 
 
 def _padded(rows: int, columns: int) -> tuple[int, int]:
-    """The least numbers of rows and columns with a multiple of 8 entries: sums over them then have no remainder."""
+    """Return least numbers of rows and columns with a multiple of 8 entries: sums over them then have no remainder."""
     more_rows = -(-rows // 8) * 8, columns
     least = 8 // math.gcd(rows, 8)
     more_columns = rows, -(-columns // least) * least
@@ -852,7 +852,7 @@ class Dop853Flow(Flow):
         self._events = np.empty((MOST_CHANGES, 4))
 
     def _allocate(self, columns: int) -> Stepper:
-        """The arrays for steps of the orbit and its variations, in ``columns`` columns together."""
+        """Return the arrays for steps of the orbit and its variations, in ``columns`` columns together."""
         shape = _padded(2 * self.system.dofs, columns)
         block = np.zeros((STAGES + 5, *shape))
         flat = block.reshape(len(block), -1)
@@ -871,7 +871,7 @@ class Dop853Flow(Flow):
         return Advance(state=state, events=events, closed=float(progress["closed"]), steps=int(progress["steps"]))
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
-        """The states that ``Flow.states`` describes, computed without variations."""
+        """Return the states that ``Flow.states`` describes, computed without variations."""
         states = np.empty((1 + count, 2 * self.system.dofs))
         states[0] = start
         self._alone.start[: states.shape[1], 0] = start

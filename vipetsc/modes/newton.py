@@ -30,11 +30,11 @@ class CallbackErrors:
         self._first: BaseException | None = None
 
     def __bool__(self) -> bool:
-        """Whether a callback has failed in the present solve."""
+        """Return whether a callback has failed in the present solve."""
         return self._first is not None
 
     def keep(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """The function to give to PETSc in place of ``callback(solver, x, result, ...)``.
+        """Return the function to give to PETSc in place of ``callback(solver, x, result, ...)``.
 
         After the first failure the callback is not called again, since its arguments would follow from NaN; the results
         are NaN.
@@ -90,10 +90,10 @@ class DenseEquations(Protocol):
     """n equations in the n + 1 unknowns xi."""
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,), which vanishes at a solution."""
+        """Return the residual (n,), which vanishes at a solution."""
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
+        """Return the derivative (n, n + 1) of the residual."""
 
 
 class DenseNewton:
@@ -142,7 +142,7 @@ class DenseNewton:
         tolerance: float,
         rounding: float = 0.0,
     ) -> Attempt:
-        """Newton's method from ``guess`` (size,) to a residual of ``tolerance`` on the plane row . xi = value.
+        """Solve by Newton's method from ``guess`` (size,), to ``tolerance``, on the plane row . xi = value.
 
         ``rounding`` is the largest norm that rounding may leave of the residual at a solution.
         """

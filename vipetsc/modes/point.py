@@ -80,7 +80,7 @@ class Point(Solution):
         return 1 / self.period
 
     def describe(self) -> str:
-        """The point's number and energy, for messages."""
+        """Return the point's number and energy, for messages."""
         return f"point {self.index} (E = {self.energy:.9g} J)"
 
 
@@ -88,14 +88,14 @@ class OrbitProblem(PeriodicProblem[Point]):
     """Equations whose solutions are orbits with contacts."""
 
     def grazing(self, point: Point) -> list[int]:
-        """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.
+        """Return the numbers, from 1, of contacts that graze in an orbit, where they are looked for.
 
         Raises FlowError if the arc cannot be integrated.
         """
         return []
 
     def acceleration(self, point: Point) -> float:
-        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+        """Return largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
 
         It is 0 at an equilibrium, and infinite where no rest of the orbit is known.
         """

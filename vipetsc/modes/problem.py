@@ -48,7 +48,7 @@ class Solution:
     kind: str
 
     def describe(self) -> str:
-        """The point's number, for messages."""
+        """Return the point's number, for messages."""
         return f"point {self.index}"
 
 
@@ -96,19 +96,19 @@ class Frame(Protocol[S]):
     tangent: np.ndarray
 
     def encode(self, point: S) -> np.ndarray:
-        """The unknowns (n + 1,) of another point of the branch."""
+        """Return the unknowns (n + 1,) of another point of the branch."""
 
     def direction(self, point: S) -> np.ndarray:
-        """The branch's direction (n + 1,) at another point, of any length, in these unknowns."""
+        """Return the branch's direction (n + 1,) at another point, of any length, in these unknowns."""
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the solution at an ``arclength`` along the tangent."""
+        """Solve for the solution at an ``arclength`` along the tangent, from ``guess`` (n + 1,)."""
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+        """Return the unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> S:
-        """The point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
+        """Return the point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
 
 
 class PeriodicProblem(ABC, Generic[S]):
@@ -125,7 +125,7 @@ class PeriodicProblem(ABC, Generic[S]):
 
     @contextmanager
     def stopped_by(self, stop: StopRequest) -> Iterator[None]:
-        """A block in which the search for a point can be stopped."""
+        """Return a block in which the search for a point can be stopped."""
         self.stop = stop
         try:
             yield
@@ -134,26 +134,26 @@ class PeriodicProblem(ABC, Generic[S]):
 
     @abstractmethod
     def frame(self, point: S, chart: str = "auto") -> Frame[S]:
-        """The frame at ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
+        """Return the frame at ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
 
     @abstractmethod
     def first_tangent(self, start: S, direction: int) -> np.ndarray:
-        """Tangent at the first point, along which the energy (or parameter) grows (``direction`` 1) or falls (-1).
+        """Return tangent at the first point, along which energy (or parameter) grows (``direction`` 1) or falls (-1).
 
         Raises ContinuationError where the tangent is not unique.
         """
 
     def turn(self, before: S, after: S) -> float:
-        """Angle in rad between the tangents of two points in relative units; 0 where there is one chart."""
+        """Return the angle in rad between the tangents of two points in relative units; 0 where there is one chart."""
         return 0.0
 
     @abstractmethod
     def special_kinds(self, left: S, right: S) -> Iterator[SpecialKind[S]]:
-        """Kinds of special points that may lie between two neighbouring points of a branch."""
+        """Return kinds of special points that may lie between two neighbouring points of a branch."""
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """The vector (n,) divided by its length."""
+    """Return the vector (n,) divided by its length."""
     return vector / np.linalg.norm(vector)
 
 

@@ -32,7 +32,7 @@ class Companion(NamedTuple):
 
 
 def companions(system: System, mode: int) -> list[Companion]:
-    """The other modes of ``system`` whose motion is periodic with the period of ``mode`` (from 0).
+    """Return the other modes of ``system`` whose motion is periodic with the period of ``mode`` (from 0).
 
     Branches of an odd system are sought among motions with u(t + T/2) = -u(t), in which modes of even multiples take no
     part.
@@ -54,7 +54,7 @@ def companions(system: System, mode: int) -> list[Companion]:
 
 
 def why_not_alone(system: System, mode: int) -> str:
-    """Why no branch begins with ``mode`` (from 0) alone, and the remedy; empty where one does.
+    """Return why no branch begins with ``mode`` (from 0) alone, and the remedy; empty where one does.
 
     It is empty, too, for systems that are not linear about rest (smooth springs, pressed contacts of Hertz's law):
     their small motions depend on the nonlinearity, and Newton's method finds a branch or fails.

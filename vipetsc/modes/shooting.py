@@ -50,7 +50,7 @@ TOUCH = 1e-5
 
 
 def grazing_contacts(system: System, u: np.ndarray) -> list[int]:
-    """The numbers, from 1, of contacts that graze along displacements ``u`` (samples, n) in m at equal times.
+    """Return the numbers, from 1, of contacts that graze along displacements ``u`` (samples, n) in m at equal times.
 
     At each local maximum among the samples a parabola through it and its two neighbours gives the largest value.
     """
@@ -92,22 +92,22 @@ class Chart(ABC):
 
     @abstractmethod
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+        """Return the unknowns (n + 1,) of initial values ``x`` (n,) and period."""
 
     @abstractmethod
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+        """Return initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
 
     @abstractmethod
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """The matrix d(x, period)/d xi (n + 1, n + 1) at the unknowns ``xi`` (n + 1,)."""
+        """Return the matrix d(x, period)/d xi (n + 1, n + 1) at the unknowns ``xi`` (n + 1,)."""
 
     def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+        """Return changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
         return self.derivative(xi) @ changes
 
     def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+        """Return changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
         return np.linalg.solve(self.derivative(xi), changes)
 
 
@@ -139,15 +139,15 @@ class Relative(Chart):
         self._derivative[n, n] = period
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+        """Return the unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         return np.append(self.weights @ x, period / self.period)
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+        """Return initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         return self.inverse @ xi[:-1], float(xi[-1] * self.period)
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
+        """Return d(x, period)/d xi."""
         return self._derivative
 
 
@@ -174,14 +174,14 @@ class Grazing(Chart):
             self.clearance = system.contacts[nearest].stops.clearance
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
+        """Return the unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         xi = np.append(x / self.size, period / self.period)
         gap = self.sign * (self.row @ x) / self.clearance - 1
         xi[self.index] = np.sign(gap) * np.sqrt(np.abs(gap))
         return xi
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
+        """Return initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         x = xi[:-1] * self.size
         y = xi[self.index]
         x[self.index] = 0.0
@@ -189,7 +189,7 @@ class Grazing(Chart):
         return x, float(xi[-1] * self.period)
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
+        """Return d(x, period)/d xi."""
         d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
         d[self.index, :-1] = -self.row * self.size
         d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), SMALLEST_ROOT)
@@ -200,7 +200,7 @@ CHARTS: dict[str, type[Relative | Grazing]] = {"relative": Relative, "grazing": 
 
 
 def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
-    """Numbers of the ``contacts`` whose elongations may be unknowns in the places of their resonators, all at once.
+    """Yield sets of ``contacts`` whose elongations may be unknowns in the places of their resonators.
 
     Left out are contacts that close a ring, each from a host to a resonator that is the host of the next.
     """
@@ -216,7 +216,7 @@ def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
 
 
 def near_grazing(system: System, x: np.ndarray) -> bool:
-    """Whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
+    """Return whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
     w = system.contact_rows @ x
     distance = np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1)
     return bool(distance.min(initial=np.inf) < NEAR_GRAZING)
@@ -257,15 +257,15 @@ class ShootingFrame:
             self.tangent = unit(chart.to_unknowns(self.xi, tangent))
 
     def encode(self, point: Point) -> np.ndarray:
-        """The unknowns (n + 1,) of another orbit."""
+        """Return the unknowns (n + 1,) of another orbit."""
         return self.chart.encode(point.x, point.period)
 
     def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction (n + 1,) at another orbit, of any length."""
+        """Return the branch's direction (n + 1,) at another orbit, of any length."""
         return self.chart.to_unknowns(self.encode(point), point.tangent)
 
     def arc(self, xi: np.ndarray) -> Arc:
-        """The arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
+        """Return the arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
         if np.all(np.isfinite(xi)):
             x, period = self.chart.decode(xi)
             if period > 0:
@@ -273,15 +273,15 @@ class ShootingFrame:
         raise FlowError("Newton's method left the domain: the period is not positive")
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
+        """Return the residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
         return self.problem.residual(self.arc(xi)) / self.unit
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit at an ``arclength`` along the tangent."""
+        """Solve for the orbit at an ``arclength`` along the tangent, from ``guess`` (n + 1,)."""
         return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value.
+        """Solve for the orbit with row . xi = value, from ``guess`` (n + 1,).
 
         It fails where it comes to an arc of ``MOST_LONGER`` times the steps of that at the guess. Raises StoppedError
         where ``Shooting.stop`` is requested.
@@ -297,19 +297,19 @@ class ShootingFrame:
             return problem.newton.solve(self, guess, row, value, problem.tolerance, rounding)
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
+        """Return the derivative (n, n + 1) of the residual."""
         return self.jacobian_of(self.arc(xi), xi)
 
     def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
+        """Return the derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
         return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
+        """Return the unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
         return self.tangent_towards(xi, self.tangent)
 
     def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
+        """Return the unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
         # The null vector, of either sign.
         direction = np.linalg.svd(self.jacobian(xi))[2][-1]
         if direction @ reference < 0:
@@ -317,7 +317,7 @@ class ShootingFrame:
         return direction
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The orbit that an attempt has converged to; ``direction`` (n + 1,) is the branch's unit tangent or None."""
+        """Return the orbit of a converged attempt; ``direction`` (n + 1,) is the branch's unit tangent or None."""
         problem = self.problem
         chart = self.chart
         x, period = chart.decode(attempt.xi)
@@ -399,19 +399,19 @@ class Shooting(OrbitProblem):
         self._frames: BoundedCache[tuple[Point, str], ShootingFrame] = BoundedCache(1)
 
     def start(self, x: np.ndarray) -> np.ndarray:
-        """The state (2n,) at the start of the arc from initial values ``x``."""
+        """Return the state (2n,) at the start of the arc from initial values ``x``."""
         state = np.zeros(2 * self.system.dofs)
         state[self.free] = x
         return state
 
     def arc(self, x: np.ndarray, period: float) -> Arc:
-        """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
+        """Return arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
         # Bytes are compared faster than arrays of a few numbers.
         duration = self.map.fraction * period
         return self._arcs.get((x.tobytes(), period), lambda: self.flow.arc(self.start(x), duration, period))
 
     def rounding(self, period: float) -> float:
-        """The largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
+        """Return the largest scaled residual that rounding may leave of an orbit of that ``period`` in s.
 
         Let the fastest mode be r times as fast as the orbit. A step of the flow is a radian of that mode or less, and
         rounds its velocity, which may be r times that of the orbit, to eps r. The mode sums the errors of some r steps
@@ -421,13 +421,13 @@ class Shooting(OrbitProblem):
         return float(ROUNDING * np.finfo(float).eps * ratio**1.5)
 
     def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
-        """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
+        """Return half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
         traces = half_traces(self.system, self.map, arc)
         # A single mass has the trivial pair alone, whose multiplier is 1.
         return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
 
     def residual(self, arc: Arc) -> np.ndarray:
-        """What vanishes at the arc's end for an orbit (n,): displacements in m or velocities in m/s.
+        """Return what vanishes at the arc's end for an orbit (n,): displacements in m or velocities in m/s.
 
         In a system that nothing holds, the displacement of the centre of mass times a frequency is added.
         """
@@ -437,14 +437,14 @@ class Shooting(OrbitProblem):
         return end + self.flow.omega * (self._kept @ arc.start[self.free])
 
     def jacobian(self, arc: Arc) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+        """Return the derivative (n, n + 1) of the residual with respect to initial values and period."""
         sensitivity = arc.sensitivity[self.zero, self.free]
         if self._kept is not None:
             sensitivity = sensitivity + self.flow.omega * self._kept
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
 
     def end_rate(self, arc: Arc) -> np.ndarray:
-        """Time derivative (n,) of what should vanish at the arc's end."""
+        """Return time derivative (n,) of what should vanish at the arc's end."""
         n = self.system.dofs
         end = arc.end
         # At rest velocities should vanish, whose rates are accelerations; at the centre displacements.
@@ -453,20 +453,20 @@ class Shooting(OrbitProblem):
         return end[n:]
 
     def energy(self, x: np.ndarray) -> float:
-        """Energy in J of the orbit with initial values ``x`` (n,)."""
+        """Return the energy in J of the orbit with initial values ``x`` (n,)."""
         zero = np.zeros_like(x)
         if self.map.starts_at_rest:
             return self.system.energy(u=x, v=zero)
         return self.system.energy(u=zero, v=x)
 
     def energy_gradient(self, x: np.ndarray) -> np.ndarray:
-        """dE/dx (n,) in J over the unit of ``x``."""
+        """Return dE/dx (n,) in J over the unit of ``x``."""
         if self.map.starts_at_rest:
             return self.system.forces(x)
         return self.system.masses * x
 
     def frame(self, point: Point, chart: str = "auto") -> ShootingFrame:
-        """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
+        """Return frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
 
         def make() -> ShootingFrame:
             name = chart
@@ -480,24 +480,24 @@ class Shooting(OrbitProblem):
         return self._frames.get((point, chart), make)
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> ShootingFrame:
-        """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
+        """Return the frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
         if tangent is None:
             tangent = np.empty(0)
         return ShootingFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
 
     def relative_frame(self, x: np.ndarray, period: float) -> ShootingFrame:
-        """The unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
+        """Return the unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
         return ShootingFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
 
     def relative_chart(self, x: np.ndarray, period: float) -> Relative:
-        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+        """Return the chart ``relative`` near the initial values ``x`` (n,) and the period in s.
 
         It has the gaps of contacts only where the map starts at rest.
         """
         return Relative(self.system, x, period, rest=self.map.starts_at_rest)
 
     def null_vector(self, start: Point) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+        """Return the tangent d(x, period) at an orbit, of either sign; raises ContinuationError if it is not unique."""
         chart = CHARTS["relative"](self.system, start.x, start.period)
         xi = chart.encode(start.x, start.period)
         matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
@@ -510,7 +510,7 @@ class Shooting(OrbitProblem):
         return chart.derivative(xi) @ directions[-1]
 
     def first_tangent(self, start: Point, direction: int) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
+        """Return the tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
 
         Raises ContinuationError at a branch point, where the tangent is not unique.
         """
@@ -521,7 +521,7 @@ class Shooting(OrbitProblem):
         return tangent * (sign * direction)
 
     def turn(self, before: Point, after: Point) -> float:
-        """Angle in rad between the tangents of two orbits in relative units at the first; 0 without a tangent."""
+        """Return the angle in rad between the tangents of two orbits in units of the first; 0 without a tangent."""
         if not (before.tangent.size and after.tangent.size):
             return 0.0
         chart = self.relative_chart(before.x, before.period)
@@ -531,14 +531,14 @@ class Shooting(OrbitProblem):
         return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
 
     def grazing(self, point: Point) -> list[int]:
-        """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
+        """Return numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
         start = self.arc(point.x, point.period).start
         interval = self.map.fraction * point.period / SAMPLES
         u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
         return grazing_contacts(self.system, u)
 
     def acceleration(self, point: Point) -> float:
-        """The largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
+        """Return largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
 
         It is 0 at an equilibrium, and infinite for maps from centre to centre. Of two rests the smaller value counts.
         """
@@ -553,7 +553,7 @@ class Shooting(OrbitProblem):
         return float(min(accelerations, default=np.inf) / size * (point.period / (2 * np.pi)) ** 2)
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds, what the half-traces tell, and a contact that just touches.
+        """Yield folds, what the half-traces tell, and a contact that just touches.
 
         A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
         doubles the period (the others); 0 doubles the period of quarter-period orbits.
@@ -583,7 +583,7 @@ class Shooting(OrbitProblem):
             yield touch_of(count)
 
     def _with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
-        """A fold of the energy with the resonance whose tongue it begins or ends."""
+        """Return a fold of the energy with the resonance whose tongue it begins or ends."""
         return replace(fold, resonance=resonance(self, fold))
 
 
@@ -597,7 +597,7 @@ PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
 
 
 def sample_orbit(problem: Shooting, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
+    """Return displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
 
     Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
     """
@@ -608,7 +608,7 @@ def sample_orbit(problem: Shooting, point: Point, samples: int = 400) -> tuple[n
 
 
 def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, parity: int) -> np.ndarray:
-    """Values (samples, ...) at uniform times of a period, from those of an arc, its start and its end included.
+    """Return values (samples, ...) at uniform times of a period, from those of an arc, its start and its end included.
 
     ``parity`` is 1 of displacements, which are even about a rest and odd about the centre, and -1 of velocities.
     """
@@ -624,7 +624,7 @@ def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, pari
 
 
 def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
-    """The number k of the k:1 internal resonance to whose tongue an orbit belongs; 1 without a resonance.
+    """Return the number k of the k:1 internal resonance to whose tongue an orbit belongs; 1 without a resonance.
 
     It is the number of zeros in half a period of the contacts' relative motion, or, without contacts, of displacements:
     the largest over all of them. On the tongue the higher mode oscillates k times in a period of the lower one.
@@ -642,7 +642,7 @@ def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
 
 
 def repetitions(problem: Shooting, point: Point) -> int:
-    """How often an orbit passes the same motion in its period: the smallest such number among ``PRIMES``, else 1.
+    """Return how often an orbit passes one motion in its period: the smallest such number in ``PRIMES``, else 1.
 
     Along a branch from a linear mode it is 1, except where a tongue of a k:1 internal resonance crosses the branch of
     another mode: there the orbit is that mode's, passed k times.
@@ -663,7 +663,7 @@ def repetitions(problem: Shooting, point: Point) -> int:
 
 
 def touch_of(count: int) -> SpecialKind[Point]:
-    """Points at which the number of contact episodes becomes ``count``, or falls below it.
+    """Return points at which the number of contact episodes becomes ``count``, or falls below it.
 
     A mere touch is no episode: such a point has one fewer.
     """
@@ -675,7 +675,7 @@ def touch_of(count: int) -> SpecialKind[Point]:
 
 
 def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
-    """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
+    """Return the periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
     Raises StartError if the mode has no stiffness, if other modes share its frequency, or if Newton's method does not
     converge from the linear mode at that energy.

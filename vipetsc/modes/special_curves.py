@@ -156,7 +156,7 @@ class SpecialCurve(UserProblem):
         return states.jacobian(inner, self._shift)[:, :-1]
 
     def _bordered(self, y: np.ndarray, p: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """g, v and w of the docstring of the module."""
+        """Return g, v and w of the docstring of the module."""
         matrix = np.block([[self._jacobian(y, p), self._b[:, None]], [self._c[None], np.zeros((1, 1))]])
         right = np.eye(len(matrix))[-1]
         v = np.linalg.solve(matrix, right)

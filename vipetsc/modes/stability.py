@@ -103,7 +103,7 @@ UNSTABLE_BEYOND = float(np.exp(2 * np.pi * LEAST_GROWTH))
 
 
 def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarray:
-    """Half-traces c (n - 1,) of the basic map of an ``arc``, without that of its trivial pair, by their real parts.
+    """Return half-traces c (n - 1,) of the basic map of an ``arc``, without the trivial pair, by their real parts.
 
     They are real, or complex if one of them is not.
     """
@@ -145,7 +145,7 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
 
 
 def _start_rate(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarray:
-    """The time derivative (n,) of what is zero at the arc's start: acceleration at rest, velocity at the centre."""
+    """Return time derivative (n,) of what is zero at the arc's start: acceleration at rest, velocity at the centre."""
     n = system.dofs
     if not shooting_map.starts_at_rest:
         return arc.start[n:]
@@ -153,7 +153,7 @@ def _start_rate(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
 
 
 def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
-    """Floquet multipliers (2n - 2,) over the whole period from half-traces (n - 1,), those of a ``quarter`` map or not.
+    """Return multipliers (2n - 2,) over the period from half-traces (n - 1,), those of a ``quarter`` map or not.
 
     The first half has |mu| >= 1, the second half their inverses.
     """
@@ -169,7 +169,7 @@ def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
 
 
 def real_half_traces(left: Point, right: Point) -> list[int]:
-    """Numbers (from 0) of the half-traces that are real at one of two points or at both.
+    """Return numbers (from 0) of the half-traces that are real at one of two points or at both.
 
     A complex one belongs to multipliers off the real axis, which do not come to 1 or -1, whatever its real part does.
     """
@@ -185,23 +185,23 @@ class HalfTraceAbove:
         self.level = level
 
     def __call__(self, point: Point) -> float:
-        """The difference at a point."""
+        """Return the difference at a point."""
         return float(np.real(point.half_traces[self.number])) - self.level
 
     def is_real(self, point: Point) -> bool:
-        """Whether the half-trace is real at a point; numbers change where two of them become a complex pair."""
+        """Return whether the half-trace is real at a point; numbers change where two of them become a complex pair."""
         return bool(np.imag(point.half_traces[self.number]) == 0)
 
 
 def of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """G (..., order, pair, pair) between some of the ``pairs``."""
+    """Return G (..., order, pair, pair) between some of the ``pairs``."""
     if len(pairs) == g.shape[-1]:
         return g
     return g[..., pairs[:, None], pairs]
 
 
 def flat(jacobian: np.ndarray) -> np.ndarray:
-    """J (..., pair, order, order) as a matrix (..., order pair, order pair)."""
+    """Return J (..., pair, order, order) as a matrix (..., order pair, order pair)."""
     *several, pairs, rows, columns = jacobian.shape
     if pairs == 1:
         return jacobian[..., 0, :, :]
@@ -212,7 +212,7 @@ def flat(jacobian: np.ndarray) -> np.ndarray:
 
 
 def plus_one(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """1 + G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, order pair)."""
+    """Return 1 + G J of a G (..., order, pair, pair) diagonal in orders, and J (..., order pair, order pair)."""
     out = product_of(g, matrix)
     diagonal = np.arange(out.shape[-1])
     out[..., diagonal, diagonal] += 1.0
@@ -220,7 +220,7 @@ def plus_one(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def product_of(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, columns)."""
+    """Return G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, columns)."""
     count, pairs = g.shape[-3:-1]
     rows = matrix.reshape(*matrix.shape[:-2], count, pairs, -1)
     # Of one pair each order has one number, for which a product of matrices would take twice as long.
@@ -279,7 +279,7 @@ def kept_orders(
 
 
 def highest_in_contact(compliance: Compliance, omega: float, series: ForceSeries, acting: np.ndarray) -> float:
-    """omega_h in rad/s of a motion at ``omega`` (rad/s) with the forces ``series`` on the pairs ``acting``."""
+    """Return omega_h in rad/s of a motion at ``omega`` (rad/s) with the forces ``series`` on the pairs ``acting``."""
     samples = 2 * series.slopes.shape[1]
     slopes = np.fft.irfft(series.slopes[acting], samples) * samples
     root = np.sqrt(np.maximum(slopes.max(axis=1), 0.0))
@@ -341,7 +341,7 @@ class ContourLine(NamedTuple):
     ends: tuple[float, float]
 
     def zeros_beyond(self) -> int:
-        """The number of zeros to the right of the line; -1 if it is undecided."""
+        """Return the number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
         # With all orders D is real at both ends, and it has turned by a whole number of half circles. A number that is
         # far from whole, or below 0, says that orders are left out that matter, and NaN that D is not finite or 0 at a
@@ -378,13 +378,13 @@ class Stability(NamedTuple):
 
 
 def _turns(values: np.ndarray) -> np.ndarray:
-    """The angles by which D turns between neighbouring ``values``; NaN where it is 0 or not finite."""
+    """Return the angles by which D turns between neighbouring ``values``; NaN where it is 0 or not finite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.angle(values[1:] / values[:-1])
 
 
 def least_growth(finite: bool, decay: float = 0.0) -> float:
-    """Re lambda/Om up to which a motion counts as stable, of a ``finite`` system whose modes decay at least so fast."""
+    """Return Re lambda/Om up to which a motion of a ``finite`` system is stable, whose modes decay at least so fast."""
     if not finite:
         return LEAST
     return max(LEAST_OF_FINITE - decay, LEAST)
@@ -416,11 +416,11 @@ class Hill:
         self._least_line: tuple[ForceSeries, ContourLine] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
-        """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases. NaN with too few orders."""
+        """Return D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases. NaN with too few orders."""
         return self._evaluate(series, exponents).values
 
     def _evaluate(self, series: ForceSeries, exponents: np.ndarray, units: np.ndarray | float = 0.0) -> _Determinants:
-        """D at lambda/Om = ``exponents``, its values over the exponentials of the ``units`` (block,)."""
+        """Return D at lambda/Om = ``exponents``, its values over the exponentials of the ``units`` (block,)."""
         out = np.ones(len(exponents), complex)
         sizes = np.zeros((len(self._blocks), len(exponents)))
         units = np.broadcast_to(units, len(self._blocks))
@@ -452,14 +452,14 @@ class Hill:
         return _Determinants(out, sizes)
 
     def _reduce(self, series: ForceSeries, acting: np.ndarray) -> list[KeptOrders]:
-        """The orders kept of each block and their J; none at all if perturbations may have higher orders."""
+        """Return the orders kept of each block and their J; none at all if perturbations may have higher orders."""
         highest = highest_in_contact(self.compliance, self.omega, series, acting)
         if highest > series.order * self.omega:
             return []
         return [kept_orders(self.compliance, self.omega, series, orders, acting, highest) for orders in self._blocks]
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
-        """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
+        """Return compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
         # The number of orders is a part of the key: a state without dissipation needs its low orders alone, one with
         # dissipation all of them.
         keys = [(block, len(orders), mu) for mu in exponents]
@@ -481,7 +481,7 @@ class Hill:
         return values
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
-        """D on Re lambda = ``growth`` Om; of the latest motion the line of ``least`` is kept."""
+        """Return D on Re lambda = ``growth`` Om; of the latest motion the line of ``least`` is kept."""
         if growth != self.least:
             return self._follow_line(series, growth)
         if self._least_line is None or self._least_line[0] is not series:
@@ -489,7 +489,7 @@ class Hill:
         return self._least_line[1]
 
     def _follow_line(self, series: ForceSeries, growth: float) -> ContourLine:
-        """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.
+        """Return D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most between positions.
 
         Nor does log|D| change by more than ``STEEP`` there. Where a zero is so near to the line that the finest
         interval does not resolve it, it is counted on either side.
@@ -523,12 +523,12 @@ class Hill:
         )
 
     def stability(self, series: ForceSeries) -> Stability:
-        """The number of perturbations that grow faster than ``least`` Om, two for a pair; the fastest is not sought."""
+        """Return how many perturbations grow faster than ``least`` Om, two for a pair; the fastest is not sought."""
         line = self._line(series, self.least)
         return Stability(line.zeros_beyond(), *line.ends)
 
     def pairs(self, series: ForceSeries) -> list[complex]:
-        """lambda/Om, Im lambda > 0, of the complex pairs that grow faster than ``least`` Om, the slowest first.
+        """Return lambda/Om, Im lambda > 0, of the complex pairs that grow faster than ``least`` Om, the slowest first.
 
         Empty also where not all of what grows is found.
         """
@@ -536,7 +536,7 @@ class Hill:
         return sorted((zero for zero in zeros if REAL < zero.imag < 0.5 - REAL), key=lambda zero: zero.real)
 
     def near(self, series: ForceSeries, guess: complex) -> complex:
-        """lambda/Om of the complex pair to which the secant method goes from a ``guess``, that of a motion near by.
+        """Return lambda/Om of the complex pair that the secant method finds from a ``guess`` of a motion near by.
 
         Raises NoMotionError if it goes to none within 1 of the guess.
         """
@@ -546,7 +546,7 @@ class Hill:
         return zero
 
     def fastest(self, series: ForceSeries) -> complex | None:
-        """lambda/Om, Im lambda >= 0, of what grows fastest; 0 if nothing does, None if it is not found."""
+        """Return lambda/Om, Im lambda >= 0, of what grows fastest; 0 if nothing does, None if it is not found."""
         for growth in (*(line for line in LINES if line > self.least), self.least):
             zeros = self._beyond(series, growth)
             if zeros:
@@ -557,7 +557,7 @@ class Hill:
         return 0j
 
     def _beyond(self, series: ForceSeries, growth: float) -> list[complex] | None:
-        """lambda/Om of all that grow faster than ``growth`` Om; None if undecided or if not all are found."""
+        """Return lambda/Om of all that grow faster than ``growth`` Om; None if undecided or if not all are found."""
         line = self._line(series, growth)
         count = line.zeros_beyond()
         if count < 0:
@@ -588,7 +588,7 @@ class Hill:
         return zeros
 
     def _zero(self, series: ForceSeries, guess: complex, others: list[complex]) -> complex | None:
-        """A zero of D that is none of the ``others``, Im in [0, 1/2], by the secant method."""
+        """Return a zero of D that is none of the ``others``, Im in [0, 1/2], by the secant method."""
         before = guess + STEP * (1 + 1j)
         # A large D in units of its size here: with a phase alone the method would go nowhere.
         units = np.maximum(self._evaluate(series, np.array([before])).logs[:, 0] - LARGEST_LOG, 0.0)

@@ -52,7 +52,7 @@ class SmoothSpring(NamedTuple):
 
     @classmethod
     def between(cls, start: int | None, end: int, quadratic: float = 0.0, cubic: float = 0.0) -> Self:
-        """A spring with the force ``quadratic`` z^2 + ``cubic`` z^3 in N/m^2 and N/m^3."""
+        """Return a spring with the force ``quadratic`` z^2 + ``cubic`` z^3 in N/m^2 and N/m^3."""
         return cls(start, end, Spring(0, 1, stiffness=0.0, quadratic=quadratic, cubic=cubic))
 
 
@@ -102,7 +102,7 @@ class System:
         contacts: Iterable[ContactPair] = (),
         smooth: Iterable[SmoothSpring] = (),
     ) -> Self:
-        """A system from linear springs (start, end, stiffness in N/m); start None is the ground."""
+        """Return a system from linear springs (start, end, stiffness in N/m); start None is the ground."""
         masses = np.asarray(list(masses), float)
         stiffness = np.zeros((len(masses), len(masses)))
         for start, end, k in springs:
@@ -112,7 +112,7 @@ class System:
 
     @classmethod
     def from_case(cls, case: NnmCase) -> Self:
-        """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
+        """Return the system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
         stops = elastic_stops(case)
         table = case.nnm.custom
         if case.nnm.system == "chain":
@@ -132,7 +132,7 @@ class System:
 
     @classmethod
     def from_chain(cls, chain: Chain, stops: Sequence[Stops]) -> Self:
-        """The finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots."""
+        """Return the finite lattice ``chain`` with the ``stops`` of its sites as one system, without its dashpots."""
         pairs = []
         for (host, resonator), of_site in zip(contacts(chain).mass_pairs(), stops, strict=True):
             pairs.append(contact_pair(None if host < 0 else host, resonator, of_site))
@@ -146,7 +146,7 @@ class System:
 
     @classmethod
     def reduced(cls, cell: UnitCell, stops: Stops) -> Self:
-        """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
+        """Return the paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
 
         A spring from the host to another mass of the lattice is divided between the two: fixed at its middle, the
         host's half has twice the stiffness. The paper takes half of the total of these, so that the host is tied to the
@@ -194,7 +194,7 @@ class System:
         return not self.springs and all(pair.stops.is_linear_at_rest for pair in self.contacts)
 
     def sides_at(self, w: np.ndarray) -> np.ndarray:
-        """The sides (..., contacts), 1 or -1, whose stops are the nearest ones at relative displacements ``w``.
+        """Return the sides (..., contacts), 1 or -1, whose stops are the nearest ones at relative displacements ``w``.
 
         A contact that is pressed at rest has one side, on which it opens.
         """
@@ -202,7 +202,7 @@ class System:
         return np.where(self.is_pressed, np.where(plus < minus, 1, -1), np.where(w < 0, -1, 1))
 
     def clearances_at(self, w: np.ndarray) -> np.ndarray:
-        """Clearances (..., contacts) in m on the sides of the relative displacements ``w`` (..., contacts)."""
+        """Return clearances (..., contacts) in m on the sides of the relative displacements ``w`` (..., contacts)."""
         plus, minus = self.clearances.T
         return np.where(self.sides_at(w) < 0, minus, plus)
 
@@ -234,7 +234,7 @@ class System:
         return np.asarray(np.outer(moved, self.masses) / np.sum(self.masses))
 
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) of small motions about rest."""
+        """Return frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) about rest."""
         return self._small_motions
 
     @cached_property
@@ -246,7 +246,7 @@ class System:
         return np.sqrt(np.maximum(squared, 0)), shapes * signs
 
     def moves(self, mode: int) -> np.ndarray:
-        """The elongations (contacts + springs,) of contacts and smooth springs in a mass-normalised mode.
+        """Return the elongations (contacts + springs,) of contacts and smooth springs in a mass-normalised mode.
 
         They are 0 where a node of the mode leaves rounding alone.
         """
@@ -264,12 +264,12 @@ class System:
         return "out-of-phase"
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
-        """How far every contact is beyond its stop in m at displacements ``u`` (..., n), shape (..., contacts)."""
+        """Return how far contacts are beyond their stops in m at displacements ``u`` (..., n): (..., contacts)."""
         w = u @ self.contact_rows.T
         return self.sides_at(w) * w - self.clearances_at(w)
 
     def forces(self, u: np.ndarray) -> np.ndarray:
-        """Restoring forces (n,) in N at displacements ``u`` (n,) in m."""
+        """Return restoring forces (n,) in N at displacements ``u`` (n,) in m."""
         force = self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             force = force + row * pair.stops.force(row @ u)
@@ -278,7 +278,7 @@ class System:
         return force
 
     def energy(self, u: np.ndarray, v: np.ndarray) -> float:
-        """Kinetic and potential energy in J at displacements ``u`` and velocities ``v`` (n,)."""
+        """Return the kinetic and potential energy in J at displacements ``u`` and velocities ``v`` (n,)."""
         total = 0.5 * (self.masses * v) @ v + 0.5 * u @ self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             total += pair.stops.energy(row @ u)
@@ -287,7 +287,7 @@ class System:
         return float(total)
 
     def grazing_energy(self, mode: int) -> float:
-        """Energy in J at which linear mode ``mode`` (0-based) first closes or opens a contact; inf if it never does."""
+        """Return the energy in J at which linear mode ``mode`` (0-based) first closes or opens a contact, or inf."""
         omega, _ = self.linear_modes()
         reach = np.abs(self.moves(mode)[: len(self.contacts)])
         moves = reach > 0
@@ -298,7 +298,7 @@ class System:
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def nonlinear_energy(self, mode: int, fraction: float) -> float:
-        """Energy in J at which smooth springs exert a ``fraction`` of the linear force in a mode; inf if they never do.
+        """Return the energy in J at which smooth springs exert a ``fraction`` of the linear force in a mode, or inf.
 
         At the amplitude a of the mass-normalised shape the linear force is omega^2 a, and the springs exert
         sum_j |r_j| (|q_j| (r_j a)^2 + |c_j| |r_j a|^3), where r_j is the elongation of the spring in the shape.
@@ -315,7 +315,7 @@ class System:
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def closed_frequencies(self) -> np.ndarray:
-        """Frequencies (n,) in rad/s to which those of large motions tend if all contacts have the bilinear law.
+        """Return frequencies (n,) in rad/s to which those of large motions tend if all contacts have the bilinear law.
 
         Each contact must have stops on both sides.
         """
@@ -327,17 +327,17 @@ class System:
 
 
 def elastic_stops(case: NnmCase) -> list[Stops]:
-    """The stops of each contact of a case, and its law without dissipation."""
+    """Return the stops of each contact of a case, and its law without dissipation."""
     return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.elastic_laws(), case.gaps(), strict=True)]
 
 
 def contact_pair(host: int | None, resonator: int, stops: Stops) -> ContactPair:
-    """The contact of two masses (from 0; ``host`` None is the ground) with these ``stops``."""
+    """Return the contact of two masses (from 0; ``host`` None is the ground) with these ``stops``."""
     return ContactPair(host, resonator, stops.plus, stops.law, stops.minus)
 
 
 def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray:
-    """Rows (pairs, n) that turn displacements into the elongations u_end - u_start of pairs (start, end)."""
+    """Return rows (pairs, n) that turn displacements into the elongations u_end - u_start of pairs (start, end)."""
     rows = np.zeros((len(ends), dofs))
     for row, (start, end) in zip(rows, ends, strict=True):
         row[end] = 1.0
@@ -347,7 +347,7 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
 
 
 def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
-    """The springs of a lattice that have more than a linear part, those to its walls among them."""
+    """Yield the springs of a lattice that have more than a linear part, those to its walls among them."""
     for (start, end), law in zip(nonlinear_springs(chain).mass_pairs(), spring_laws(chain), strict=True):
         if end >= 0:
             yield SmoothSpring(None if start < 0 else start, end, law)

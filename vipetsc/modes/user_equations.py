@@ -71,7 +71,7 @@ class UserFrame:
         return point.tangent
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the point at an ``arclength`` along the tangent."""
+        """Solve for the point at an ``arclength`` along the tangent, from ``guess`` (n + 1,)."""
         return self.problem.solve(guess, self.tangent, self.tangent @ (self.xi + arclength * self.tangent))
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
@@ -110,7 +110,7 @@ class UserProblem(RangeProblem):
         self.unit = float(np.linalg.norm(self.jacobian(xi), np.inf)) or 1.0
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """F (n,) over its unit at the unknowns ``xi`` (n + 1,); raises ValueError if it has another shape."""
+        """Return F (n,) over its unit at the unknowns ``xi`` (n + 1,); raises ValueError if it has another shape."""
         values = np.asarray(self.function(xi[:-1] * self.scales[:-1], float(xi[-1] * self.scales[-1])), float)
         if values.shape != (len(xi) - 1,):
             raise ValueError(
@@ -131,7 +131,7 @@ class UserProblem(RangeProblem):
         return (self.residual(xi + step) - self.residual(xi - step)) / (2 * DIFFERENCE)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` for the solution with row . xi = value, (n + 1,)."""
+        """Solve for the point (n + 1,) with row . xi = value, from ``guess``."""
         return self.newton.solve(self, guess, row, value, self.tolerance)
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
@@ -143,7 +143,7 @@ class UserProblem(RangeProblem):
         return attempt.xi
 
     def null_vectors(self, xi: np.ndarray) -> np.ndarray:
-        """Orthonormal null vectors of the derivative: (1, n + 1) at a regular point, (2, n + 1) at a branch point."""
+        """Return orthonormal null vectors of the derivative: (1, n + 1), or (2, n + 1) at a branch point."""
         jacobian = self.jacobian(xi)
         if not np.isfinite(jacobian).all():
             raise FlowError("the derivative of F is not finite")
@@ -152,7 +152,7 @@ class UserProblem(RangeProblem):
         return directions[max(regular, len(xi) - 2) :]
 
     def unstable(self, xi: np.ndarray) -> int:
-        """Number of eigenvalues of dF/dx with a positive real part, beyond rounding."""
+        """Return the number of eigenvalues of dF/dx with a positive real part, beyond rounding."""
         eigenvalues = np.linalg.eigvals(self.jacobian(xi)[:, :-1] / self.scales[:-1])
         return int(np.sum(eigenvalues.real > 1e-9 * np.abs(eigenvalues).max()))
 
@@ -176,7 +176,7 @@ class UserProblem(RangeProblem):
         yield SpecialKind("branch-point", bordered)
 
     def _determinant(self, point: Response) -> tuple[float, float]:
-        """Sign and logarithm of the determinant of the derivative bordered by the tangent."""
+        """Return sign and logarithm of the determinant of the derivative bordered by the tangent."""
         sign, logarithm = np.linalg.slogdet(np.vstack([self.jacobian(point.xi), point.tangent]))
         return float(sign), float(logarithm)
 

@@ -22,7 +22,7 @@ stems of its "pictures". "cpu" is CPU time in s of all ranks: of the "steps" by 
 
 
 def read_record(root: Path) -> BuildRecord:
-    """Content of ``made.json`` in ``root``; without it an empty record, by which all but the steps is made again."""
+    """Return the content of ``made.json`` in ``root``; without it an empty record, which makes all but steps anew."""
     empty = {"figures": {}, "cpu": {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}}
     return empty | (read_json(root / RECORD) or {})
 
@@ -34,7 +34,7 @@ def write_record(root: Path, record: BuildRecord) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether the picture or page ``path`` is there and was not cut off."""
+    """Return whether the picture or page ``path`` is there and was not cut off."""
     if not path.exists():
         return False
     with path.open("rb") as file:
@@ -44,5 +44,5 @@ def is_whole(path: Path) -> bool:
 
 
 def is_drawn(root: Path, stem: str) -> bool:
-    """Whether the picture ``stem`` is there, whole, in each of ``FORMATS``."""
+    """Return whether the picture ``stem`` is there, whole, in each of ``FORMATS``."""
     return all(is_whole(root / "figures" / f"{stem}.{kind}") for kind in FORMATS)

@@ -44,7 +44,7 @@ class CellSearch:
         return (self.signed_deflection >= 0).all(axis=-1) & (self.signed_deflection > 0).any(axis=-1)
 
     def cost(self, name: str) -> np.ndarray:
-        """Cost ``name``, one of ``COSTS``, over (lambda, eta); the larger the better.
+        """Return the cost ``name``, one of ``COSTS``, over (lambda, eta); the larger the better.
 
         ``deflection``, without unit, is the largest signed deflection over kappa. ``group_velocity`` in cells/s is the
         sum over bands 2 to 4 of the largest |v_g|. ``weighted`` in cells/s is their product, Eq. (8) of the paper.
@@ -55,7 +55,7 @@ class CellSearch:
         return costs[name]
 
     def optimum(self, name: str) -> tuple[int, int] | None:
-        """Indices (lambda, eta) of the best cost ``name`` among the cells out of phase; None if there is none."""
+        """Return the indices (lambda, eta) of the best cost ``name`` among cells out of phase; None for none."""
         if not self.out_of_phase.any():
             return None
 
@@ -97,7 +97,7 @@ def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: A
 
 
 def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
-    """Deflection |u3 - u2| sign(-u2 u3) (..., band) of the contact pair, positive where its masses move out of phase.
+    """Return the deflection |u3 - u2| sign(-u2 u3) (..., band) of the contact pair, positive out of phase.
 
     u2 is the host's displacement and u3 the resonator's in the waves ``point`` of a ``cell``. The paper leaves the
     length of the Bloch vectors open. They have unit norm here, which puts the optimum near the paper's eta = 0.5 in
@@ -112,5 +112,5 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
 
 
 def unit_vectors(point: BlochPoint) -> np.ndarray:
-    """The Bloch vectors (..., dof, band) of ``point``, scaled such that the sum of |u|^2 over the masses is 1."""
+    """Return Bloch vectors (..., dof, band) of ``point``, scaled such that the sum of |u|^2 over the masses is 1."""
     return point.vectors / np.linalg.norm(point.vectors, axis=-2, keepdims=True)

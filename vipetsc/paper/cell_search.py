@@ -64,7 +64,7 @@ def search_design(
 
 
 def read_design(folder: str | Path) -> xr.Dataset:
-    """The content of ``design.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    """Return the content of ``design.h5`` in ``folder``; raises OSError or ValueError if it is none."""
     with open_netcdf(Path(folder) / "design.h5", "search", (*BEST, "summary")) as data:
         return data.load()
 
@@ -109,13 +109,13 @@ def _search(case: DesignCase) -> xr.Dataset:
 
 
 def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:
-    """The costs of the cell that the paper takes, in the order of ``COSTS``."""
+    """Return the costs of the cell that the paper takes, in the order of ``COSTS``."""
     cell = search_cells(reading, *PAPER_CELL, wavenumber)
     return [cell.cost(name).item() for name in COSTS]
 
 
 def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The best cell by each cost, and the Bloch vectors there: the variables ``optimum_*`` of ``LAYOUT``.
+    """Return the best cell by each cost, and the Bloch vectors there: the variables ``optimum_*`` of ``LAYOUT``.
 
     They are NaN in a reading in which no cell is out of phase. Sizes of dimensions are those of the coordinates in
     ``values``.
@@ -143,7 +143,7 @@ def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> d
 
 
 def _table(data: xr.Dataset) -> str:
-    """The optima as text, with one line for each reading and cost."""
+    """Return the optima as text, with one line for each reading and cost."""
     sizes = data.sizes
     lines = [
         f"four-band cell, {sizes['lambda']} x {sizes['eta']} cells, {sizes['wavenumber']} wavenumbers;"

@@ -78,7 +78,7 @@ def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: 
 
 
 def _is_complete(key: str, record: BuildRecord, root: Path) -> bool:
-    """Whether all pictures of the figure ``key`` are there."""
+    """Return whether all pictures of the figure ``key`` are there."""
     stems = record["figures"][key]["pictures"]
     return bool(stems) and all(is_drawn(root, stem) for stem in stems)
 

@@ -25,7 +25,7 @@ The other two, whose numbers differ since their motion is chaotic, differ by 2e-
 
 
 def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
-    """``count`` members of ``sweep`` for the engine ``ts``, on as many of its curves over the amplitude.
+    """Return ``count`` members of ``sweep`` for the engine ``ts``, on as many of its curves over the amplitude.
 
     Curves are drawn from ``seed``, and of the amplitudes, cut into ``count`` equal parts, one in each: few members go
     from no contact to hard contact. They lie on one axis. Raises ValueError if the amplitude does not vary.
@@ -50,7 +50,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
 
 
 def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
-    """Differences of the members of the ``sample`` from those of the ``sweep`` (folders), the largest amplitude last.
+    """Return differences of the members of ``sample`` from those of ``sweep`` (folders), the largest amplitude last.
 
     A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
     ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.
@@ -69,7 +69,7 @@ def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
 
 
 def _compared(first: xr.Dataset, second: xr.Dataset) -> dict[str, Any]:
-    """A row of ``agreement``: one member by both engines."""
+    """Return a row of ``agreement``: one member by both engines."""
     # A member that failed has -1, which is no number of contacts.
     episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in (first, second)]
     differences: dict[str, float] = {}

@@ -104,7 +104,7 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
         _ = step.text
 
     def difference(text: str) -> str | None:
-        """Reason why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
+        """Return the reason why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
         try:
             grid = json.loads(text)["grid"]
         except (ValueError, KeyError):
@@ -165,7 +165,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: st
 
 
 def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFigure, list[Path]]]:
-    """The figures of the ``plan``, each with those of its pictures (PNG) that are there."""
+    """Return the figures of the ``plan``, each with those of its pictures (PNG) that are there."""
     pictures = []
     for figure in plan.figures:
         stems = record["figures"].get(figure.id, {}).get("pictures", ())
@@ -175,7 +175,7 @@ def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFi
 
 
 def plan_table(plan: Plan, root: Path, ranks: int) -> str:
-    """Table of the steps and figures of ``plan``, with their state in ``root`` and the time left on ``ranks``."""
+    """Return a table of the steps and figures of ``plan``, with their state in ``root`` and time left on ``ranks``."""
     lines = [f"{'step':<26}{'state':<10}{'left':>9}  claims"]
     total = 0.0
     for step in plan.steps:
@@ -197,7 +197,7 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
 
 
 def _figure_state(root: Path, figure: PaperFigure, entry: BuildRecord | None, inputs: str) -> tuple[int, str]:
-    """Number of existing pictures of a ``figure``, and whether they are those of its ``inputs``.
+    """Return the number of existing pictures of a ``figure``, and whether they are those of its ``inputs``.
 
     ``entry`` is what is recorded of it, None if nothing is.
     """

@@ -74,7 +74,7 @@ class PaperFigure:
         return tuple(dict.fromkeys(step for part in self.parts for step in part.steps))
 
     def offers(self, folders: Mapping[str, Path], files: Files) -> Iterator[Picture]:
-        """The pictures that can be drawn from the ``folders`` of finished steps, by name, while ``files`` are open."""
+        """Yield the pictures that ``folders`` of finished steps allow, by name, while ``files`` are open."""
         for part in self.parts:
             if part.schematic:
                 for reading in READINGS:
@@ -103,12 +103,12 @@ def _drawings(name: str, folders: Sequence[Path], files: Files) -> Iterator[Draw
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:
-    """The cell, the bands and the lattice of a preset with each of these numbers of contact sites."""
+    """Return the cell, the bands and the lattice of a preset with each of these numbers of contact sites."""
     return lattice_page(_case(preset, reading), tuple(sites))
 
 
 def two_masses(reading: str) -> Figure:
-    """The reduced model of the four-band cell, of host and resonator, as `modes.system.System.reduced` has it."""
+    """Return reduced model of the four-band cell, of host and resonator, as `modes.system.System.reduced` has it."""
     cell = _case("four-band", reading).lattice.unit_cell()
     pair = {cell.host, cell.resonator}
     masses = (cell.masses[cell.host], cell.masses[cell.resonator])
@@ -148,5 +148,5 @@ NAMES = (
 
 
 def describe(stem: str) -> str:
-    """The name ``stem`` of a picture's file in words, as in "calibrated reading, 5π/9, energy-weighted average"."""
+    """Return name ``stem`` of a picture's file in words, as in "calibrated reading, 5π/9, energy-weighted average"."""
     return ", ".join(match.expand(text) for pattern, text in NAMES for match in re.finditer(pattern, stem))

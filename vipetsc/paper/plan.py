@@ -88,7 +88,7 @@ class PaperStep:
     sample: int = 0
 
     def folder(self, root: Path) -> Path:
-        """The folder of the step's files in the folder ``root`` of the paper."""
+        """Return the folder of the step's files in the folder ``root`` of the paper."""
         return root / self.name
 
     @cached_property
@@ -105,7 +105,7 @@ class PaperStep:
         return self.case.to_toml()
 
     def results(self, root: Path) -> list[Path]:
-        """The files of results, from which pictures are drawn and claims are measured; they need not be there yet."""
+        """Return the files of results of which pictures and claims are made; they need not be there yet."""
         if isinstance(self.case, NnmCase):
             system = System.from_case(self.case)
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
@@ -161,7 +161,7 @@ class PaperStep:
         return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
     def state(self, root: Path) -> str:
-        """State of the step: DONE, BEGUN, MISSING, or STALE if the folder holds results of another case or version."""
+        """Return the state of the step: DONE, BEGUN, MISSING, or STALE for results of another case or version."""
         folder = self.folder(root)
         if not (folder / "case.toml").exists():
             return MISSING
@@ -172,12 +172,12 @@ class PaperStep:
         return BEGUN
 
     def _is_case_of(self, folder: Path) -> bool:
-        """Whether a ``folder`` is marked as one for results of this case."""
+        """Return whether a ``folder`` is marked as one for results of this case."""
         marker = folder / "case.toml"
         return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8", errors="replace"))
 
     def _is_complete(self, path: Path) -> bool:
-        """Whether the file ``path`` is a finished result of this step, and of its case.
+        """Return whether the file ``path`` is a finished result of this step, and of its case.
 
         A branch is finished when it has ended, also in a failure that it names; a sweep when its
         ensemble has all records.
@@ -197,20 +197,20 @@ class PaperStep:
         return False
 
     def _is_same_case(self, text: str) -> bool:
-        """Whether the case ``text`` in TOML is this step's, in whatever order its keys stand."""
+        """Return whether the case ``text`` in TOML is this step's, in whatever order its keys stand."""
         # A text that cannot be read is no case of this step, which will say so when it claims its folder.
         with suppress(tomllib.TOMLDecodeError, RecursionError):
             return tomllib.loads(text) == tomllib.loads(self.text)
         return False
 
     def identity(self, root: Path) -> str:
-        """Hash of the case and of the contents of its results."""
+        """Return the hash of the case and of the contents of its results."""
         # With the relation to branches, which is drawn from the folder of the sweep.
         paths = [*self.results(root), self.folder(root) / RELATION]
         return fingerprint(self.text, *(path.read_bytes() for path in paths if path.exists()))
 
     def left(self, root: Path) -> float:
-        """CPU time in s that the step still needs.
+        """Return CPU time in s that the step still needs.
 
         A sweep needs it for its missing members, each at the mean time of the finished ones, but at least at ``cost``.
         """
@@ -230,7 +230,7 @@ class PaperStep:
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def failures(self, root: Path) -> int:
-        """Number of members or branches that failed, of a step whose state is DONE."""
+        """Return the number of members or branches that failed, of a step whose state is DONE."""
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
         if isinstance(self.case, Sweep):
@@ -240,7 +240,7 @@ class PaperStep:
         return 0
 
     def statistics(self, root: Path) -> dict[str, Any]:
-        """Numbers about the results for a report, once they are there; empty where there are none."""
+        """Return numbers about the results for a report, once they are there; empty where there are none."""
         if isinstance(self.case, NnmCase):
             return _branch_statistics(self.results(root))
 
@@ -267,7 +267,7 @@ class Plan:
     measure: Callable[[Path, Mapping[str, str]], Sequence[Mapping[str, Any]]] = measure_claims
 
     def only(self, ids: Sequence[str]) -> Self:
-        """The part of the plan that the figures and claims ``ids`` need; the whole plan without any.
+        """Return the part of the plan that the figures and claims ``ids`` need; the whole plan without any.
 
         Raises FolderError for an id that the plan does not have.
         """
@@ -289,27 +289,27 @@ class Plan:
         return replace(self, steps=tuple(s for s in self.steps if s.name in needed), figures=figures)
 
     def left(self, root: Path) -> dict[str, float]:
-        """The steps that are not done or had failures, by name, with the CPU time in s that they still need."""
+        """Return the steps that are not done or had failures, by name, with the CPU time in s that they still need."""
         return {s.name: s.left(root) for s in self.steps if s.state(root) != DONE or s.failures(root)}
 
     def folders(self, root: Path) -> Mapping[str, Path]:
-        """The folders of the steps that are done, by name."""
+        """Return the folders of the steps that are done, by name."""
         return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}
 
     def unusable(self, root: Path) -> Mapping[str, str]:
-        """The reason why a step has results that no claim is measured from, by its name: they are stale, or a part."""
+        """Return why a step has results that no claim is measured from, by its name: they are stale, or a part."""
         reasons = {STALE: "has results of another case or version: compute it again", BEGUN: "is not finished"}
         states = {step.name: step.state(root) for step in self.steps}
         return {name: reasons[state] for name, state in states.items() if state in reasons}
 
     def claims_of(self, step: PaperStep) -> list[str]:
-        """The ids of the claims that are measured from a step, or whose figures show it."""
+        """Return the ids of the claims that are measured from a step, or whose figures show it."""
         claims = {claim for figure in self.figures if step.name in figure.steps for claim in figure.claims}
         claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
         return [claim for claim in CLAIMS if claim in claims]
 
     def inputs(self, root: Path) -> dict[str, str]:
-        """Hash of what each figure is drawn from, by id; under "claims" that of all finished steps."""
+        """Return the hash of what each figure is drawn from, by id; under "claims" that of all finished steps."""
         steps = {step.name: step.name + step.identity(root) for step in self.steps if step.state(root) == DONE}
         # The note is printed on every picture. Another version of the package may draw or measure otherwise.
         version = (vipetsc.__version__, self.note)
@@ -321,7 +321,7 @@ class Plan:
 
 
 def paper_plan(grid: str = FULL) -> Plan:
-    """The whole paper, from ``plan.toml`` and the case files of the package.
+    """Return the whole paper, from ``plan.toml`` and the case files of the package.
 
     The quick grid has fewer amplitudes, wavenumbers and sites and leaves out the in-phase branches; both laws and both
     readings stay.
@@ -352,7 +352,7 @@ def paper_plan(grid: str = FULL) -> Plan:
 
 
 def _sweep_statistics(folder: Path) -> dict[str, Any]:
-    """Numbers of the sweep in ``folder`` for the report: members by ending, contacts, ledger error, CPU time in s."""
+    """Return numbers of the sweep in ``folder`` for the report: members by ending, contacts, ledger, CPU time in s."""
     ensemble = open_ensemble(folder)
     status = ensemble["status"].values
     return {
@@ -367,7 +367,7 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
 
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
-    """Numbers of the branches in the files ``paths`` for the report.
+    """Return numbers of the branches in the files ``paths`` for the report.
 
     ``points`` and their largest ``residual``, the ``endings`` with tongues and warnings, and how many ``failed``.
     """
@@ -390,7 +390,7 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file; None if it is not there or was cut off."""
+    """Return the content of a JSON file; None if it is not there or was cut off."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -400,7 +400,7 @@ def read_json(path: Path) -> Any:
 
 
 def fingerprint(*parts: str | bytes) -> str:
-    """Hash of all ``parts`` together, in this order."""
+    """Return the hash of all ``parts`` together, in this order."""
     # Digests have one length: a text that moves from the end of one part to the beginning of the next changes the hash.
     digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
     return hashlib.sha256(" ".join(digests).encode()).hexdigest()

@@ -108,7 +108,7 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str]
 
 
 def small(image: Image.Image) -> bytes:
-    """The picture as WebP: with all pixels in few colours, or, if that is larger, narrower and with losses."""
+    """Return the picture as WebP: with all pixels in few colours, or, if that is larger, narrower and with losses."""
     few = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     lines = _webp(few.convert("RGB"), lossless=True, quality=60, method=2)
 
@@ -123,25 +123,25 @@ def small(image: Image.Image) -> bytes:
 
 
 def _webp(image: Image.Image, **options: Any) -> bytes:
-    """The ``image`` as WebP, with Pillow's ``options``."""
+    """Return the ``image`` as WebP, with Pillow's ``options``."""
     encoded = io.BytesIO()
     image.save(encoded, "webp", **options)
     return encoded.getvalue()
 
 
 def numbers(named: Mapping[str, float | None]) -> list[str]:
-    """The ``named`` numbers as short texts with their names; those that could not be measured are left out."""
+    """Return the ``named`` numbers as short texts with their names; those that could not be measured are left out."""
     return [f"{name} = {value:.4g}" for name, value in named.items() if value is not None]
 
 
 def sources(files: Sequence[str]) -> str:
-    """The steps to whose folders ``files`` belong, as text, with the number of files if there are several."""
+    """Return the steps to whose folders ``files`` belong, as text, with the number of files if there are several."""
     counts = Counter(name.partition("/")[0] for name in files)
     return ", ".join(step if n == 1 else f"{step} ({n} files)" for step, n in counts.items())
 
 
 def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
-    """The verdicts as a table of text: claims in rows, readings in columns."""
+    """Return the verdicts as a table of text: claims in rows, readings in columns."""
     readings = list(dict.fromkeys(claim["reading"] for claim in claims))
     lines = [f"{'':<5}" + "".join(f"{reading:<18}" for reading in readings) + "claim"]
     for key, row in by_reading(claims).items():
@@ -152,6 +152,6 @@ def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
 
 
 def by_reading(claims: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """The rows of ``claims.json`` by id and reading."""
+    """Return the rows of ``claims.json`` by id and reading."""
     # ``groupby`` joins neighbours only: the rows of one claim follow each other in ``claims.json``.
     return {key: {row["reading"]: row for row in rows} for key, rows in groupby(claims, itemgetter("id"))}

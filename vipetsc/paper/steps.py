@@ -157,7 +157,7 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: Col
 
 
 def rough_time(seconds: float) -> str:
-    """An estimated time as text, in whole seconds or from two minutes on in whole minutes; a dash if it is not above 0.
+    """Return an estimated time as text, in whole seconds, from two minutes on in minutes; a dash if it is not above 0.
 
     Further digits would claim an accuracy that an estimate does not have.
     """

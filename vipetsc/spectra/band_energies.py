@@ -39,7 +39,7 @@ class Parts:
 
     @classmethod
     def of(cls, bands: Sequence[Band]) -> Self:
-        """The partition that ``bands``, lowest first, make of the frequency axis."""
+        """Return the partition that ``bands``, lowest first, make of the frequency axis."""
         edges: list[float] = [0.0]
         inside: list[tuple[int, ...]] = []  # the bands of each part
         # The first band of a free lattice begins at zero, as the root of an eigenvalue with a rounding of 1e-16 of the
@@ -67,7 +67,7 @@ class Parts:
         return cls(edges=np.array([*edges, np.inf]), names=(*names, "above"), bands=(*inside, ()))
 
     def above(self, frequency: float) -> np.ndarray:
-        """Whether each of the parts (part) is a pass band above the one driven at ``frequency`` (rad/s)."""
+        """Return whether each of the parts (part) is a pass band above the one driven at ``frequency`` (rad/s)."""
         driven = int(np.searchsorted(self.edges, frequency, side="right")) - 1
         return np.array([bool(b) and i > driven for i, b in enumerate(self.bands)])
 
@@ -93,7 +93,7 @@ def part_energies(
     mapped: Sequence[int] = (),
     sizes: tuple[int, int] = (1, 1),
 ) -> PartEnergies:
-    """Kinetic energies of every part, from ``velocity`` (t, cell, dof) in m/s; maps of the parts ``mapped``.
+    """Return the kinetic energies of every part, from ``velocity`` (t, cell, dof) in m/s; maps of the parts ``mapped``.
 
     ``masses`` (dof,) are in kg, the ``interval`` of samples in s, ``edges`` (part + 1) in rad/s. Energies follow at
     every sample from as few values as the width of a part needs (see ``cosine_squares``). With a ``stride`` above 1 the
@@ -161,7 +161,7 @@ class _StridedSquares:
         self._sums += weight * np.einsum("tn,tn->t", signals, signals)
 
     def _signals(self, spectrum: np.ndarray) -> np.ndarray:
-        """The signals (t', signal) with amplitudes ``spectrum`` (wave from 0, signal) at ``_steps`` + 1 even times.
+        """Return signals (t', signal) with amplitudes ``spectrum`` (wave from 0, signal) at ``_steps`` + 1 even times.
 
         At these times cosines whose numbers of half waves differ by twice the steps have the same values, as have
         those whose numbers add up to it: their amplitudes are added up ("folded") before the transform.
@@ -179,12 +179,12 @@ class _StridedSquares:
         return CosineTransform(*folded.shape)(folded)
 
     def at_samples(self) -> np.ndarray:
-        """The sums at every sample, interpolated."""
+        """Return the sums at every sample, interpolated."""
         return np.interp(np.linspace(0, self._steps, self._last + 1), np.arange(self._steps + 1), self._sums)
 
 
 def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
-    """The values (energy, sample) of ``energies`` of one column each at ``last`` + 1 even times, from 0 on."""
+    """Return the values (energy, sample) of ``energies`` of one column each at ``last`` + 1 even times, from 0 on."""
     amplitudes = np.zeros((last + 1, len(energies)))
     for column, energy in enumerate(energies):
         # At the samples, cosines have equal values if their numbers of half waves, or those numbers with the opposite
@@ -196,7 +196,7 @@ def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
 
 
 def _means_over_samples(energy: Cosines, last: int, samples: int, cells: int) -> np.ndarray:
-    """Means (t', cell') of an ``energy`` (wave, cell) over blocks of ``samples`` and ``cells``.
+    """Return means (t', cell') of an ``energy`` (wave, cell) over blocks of ``samples`` and ``cells``.
 
     The record has ``last`` + 1 samples; its last block may be shorter.
     """
@@ -213,7 +213,7 @@ def _means_over_samples(energy: Cosines, last: int, samples: int, cells: int) ->
 
 
 def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:
-    """Inter-band targeted energy transfer: mean fraction of the energy in the parts ``above`` (part) the driven one.
+    """Return the inter-band targeted energy transfer: mean share of the parts ``above`` (part) the driven one.
 
     ``energy`` (part, t) is in J; the mean is over the samples from ``start`` on at which anything moves. At a sample
     the fraction is that of the sum over all parts: the paper's (E_3 + E_4)/E_total for the four-band lattice driven on

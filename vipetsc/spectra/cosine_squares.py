@@ -43,13 +43,13 @@ class CosineSquares(NamedTuple):
 
     @classmethod
     def zeros(cls, low: int, high: int, columns: int = 1) -> Self:
-        """The sums of no signals."""
+        """Return the sums of no signals."""
         length = fft.next_fast_len(max(2 * (high - low) + 1, 1), real=True)
         shape = (length // 2 + 1, columns)
         return cls(low, high, length, np.zeros(shape), np.zeros(shape, complex))
 
     def of_columns(self, columns: int) -> Self:
-        """The sums of no signals, of the same cosines, in so many ``columns``."""
+        """Return the sums of no signals, of the same cosines, in so many ``columns``."""
         return self.zeros(self.low, self.high, columns)
 
     def add(self, spectrum: np.ndarray, weight: float) -> None:
@@ -71,11 +71,11 @@ class CosineSquares(NamedTuple):
         self.product[:, 0] += other.product.sum(axis=1)
 
     def _signals(self, spectrum: np.ndarray) -> np.ndarray:
-        """The g (point, signal) of signals."""
+        """Return the g (point, signal) of signals."""
         return fft.rfft(spectrum[self.low : self.high + 1], self.length, axis=0)
 
     def cosines(self) -> Cosines:
-        """The cosines (wave, column) of the sums."""
+        """Return the cosines (wave, column) of the sums."""
         width = self.high - self.low
         # Of |g|^2/2 = c_0/2 + sum of c_n cos(n theta) the c_n are real, and c_-n = c_n: only c_0 is halved.
         of_squares = fft.irfft(self.square, self.length, axis=0)[: width + 1]

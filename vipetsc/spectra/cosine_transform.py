@@ -41,7 +41,7 @@ class CosineTransform:
         self._out = np.zeros(shape)
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
-        """``scipy.fft.dct(columns, type=1, axis=0)`` of ``columns`` (t, column): twice the F of each column.
+        """Return ``scipy.fft.dct(columns, type=1, axis=0)`` of ``columns`` (t, column): twice the F of each column.
 
         The array that is returned is filled anew by the next call.
         """
@@ -60,7 +60,7 @@ class CosineTransform:
 
 @lru_cache(maxsize=32)
 def _half_waves(last: int) -> np.ndarray:
-    """Cosine and sine (2, j) of pi j/``last``, for j below ``last``."""
+    """Return cosine and sine (2, j) of pi j/``last``, for j below ``last``."""
     angle = np.pi * np.arange(last) / last
     return np.stack([np.cos(angle), np.sin(angle)])
 

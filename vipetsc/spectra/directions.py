@@ -22,7 +22,7 @@ from vipetsc.lattice.bands import BlochPoint
 
 
 def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Energies in J of the waves on a ring, and their group velocities in cells/s, each (wavenumber, band).
+    """Return energies in J of the waves on a ring, and their group velocities in cells/s, each (wavenumber, band).
 
     ``displacement`` in m and ``velocity`` in m/s are (cell, dof); wavenumbers are in the order of ``fftfreq``.
     """
@@ -37,7 +37,7 @@ def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray
 
 
 def band_envelopes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Energies (band, cell) in J of the envelopes of each band's waves, whose sums over the cells are its energies.
+    """Return energies (band, cell) in J of the envelopes of bands' waves, which sum over cells to the bands' own.
 
     ``displacement`` in m and ``velocity`` in m/s are (cell, dof). The inverse transform of m^(1/2) a_b e_b is a complex
     field of the masses, psi_b(x). A cell has the energy |psi_b|^2/2, summed over its masses: it does not oscillate
@@ -51,12 +51,12 @@ def band_envelopes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarra
 
 @lru_cache(maxsize=4)
 def _waves(cell: UnitCell, cells: int) -> BlochPoint:
-    """The Bloch waves on a ring of ``cells``, in the order of ``fftfreq``."""
+    """Return the Bloch waves on a ring of ``cells``, in the order of ``fftfreq``."""
     return bloch(cell, 2 * np.pi * np.fft.fftfreq(cells, 1.0))
 
 
 def _amplitudes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """The amplitudes a_b(kappa), (wavenumber, band), of fields (cell, dof)."""
+    """Return the amplitudes a_b(kappa), (wavenumber, band), of fields (cell, dof)."""
     point = _waves(cell, len(displacement))
     masses = np.asarray(cell.masses)
     q = np.einsum("kdb,kd->kb", point.vectors.conj(), np.fft.fft(displacement, axis=0) * masses)
@@ -65,7 +65,7 @@ def _amplitudes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) 
 
 
 def by_direction(energy: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Energy (band, direction) in J of the waves (wavenumber, band) that go to higher and to lower cells.
+    """Return the energy (band, direction) in J of the waves (wavenumber, band) that go to higher and to lower cells.
 
     A standing wave goes half to either side.
     """

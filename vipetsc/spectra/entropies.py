@@ -69,7 +69,7 @@ class Entropy:
 
 
 def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1) -> Entropy:
-    """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
+    """Return entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
     ``start`` is the sample at which the linear wave's peak is at the first site. Every ``every``-th sample is
     transformed (a snapshot), and every ``stride``-th cell averaged over; the largest weight of Eq. (d) is sought in the
@@ -92,7 +92,7 @@ def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 
 
 
 def _strongest_others(velocity: np.ndarray, start: int, every: int) -> np.ndarray:
-    """The numbers of the samples from ``start`` on in which the largest weight is sought and that are no snapshots."""
+    """Return the numbers of samples from ``start`` on in which the largest weight is sought, snapshots left out."""
     if every == 1:
         return np.zeros(0, int)
     energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
@@ -101,7 +101,7 @@ def _strongest_others(velocity: np.ndarray, start: int, every: int) -> np.ndarra
 
 
 def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, largest: float = 0.0) -> Entropy:
-    """The averages of ``local`` and ``weight`` (t, cell) of every ``stride``-th cell, from the sample ``start`` on.
+    """Return averages of ``local`` and ``weight`` (t, cell) of every ``stride``-th cell, from the sample ``start`` on.
 
     ``largest`` is the largest weight of samples that are not among them.
     """
@@ -140,7 +140,7 @@ def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, lar
 
 
 def local_entropy(velocity: np.ndarray, stride: int = 1) -> LocalEntropy:
-    """H (t, cell) in bits and W (t, cell) at every ``stride``-th cell of ``velocity`` (t, cell), in chunks of time.
+    """Return H (t, cell) in bits and W (t, cell) at every ``stride``-th cell of ``velocity`` (t, cell), chunk by chunk.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude. Raises
     ValueError for a sample that is not finite.
@@ -178,7 +178,7 @@ class _Filters(NamedTuple):
 
     @classmethod
     def of(cls, filters: np.ndarray) -> Self:
-        """The ``filters`` (kappa, k) from the first to the last wavenumber that any lets through."""
+        """Return the ``filters`` (kappa, k) from the first to the last wavenumber that any lets through."""
         # Whatever does not exceed the rounding of the largest value lets nothing through.
         inside = np.flatnonzero(filters.max(axis=0) > np.finfo(float).eps * filters.max())
         first = int(inside[0])
@@ -197,7 +197,7 @@ class _Octave(NamedTuple):
     groups: list[_Filters]
 
     def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
-        """X (t, kappa, cell) at every ``stride``-th cell of the padded ``signal`` (t, cell), group by group."""
+        """Yield X (t, kappa, cell) at every ``stride``-th cell of the padded ``signal`` (t, cell), group by group."""
         spectrum = fft.rfft(signal, self.padded)
         for group in self.groups:
             x = np.empty((len(signal), len(group.values), self.length), dtype=complex)
@@ -208,7 +208,7 @@ class _Octave(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _octaves(cells: int, stride: int) -> list[_Octave]:
-    """The octaves of the nodes for lattices of ``cells``, of which every ``stride``-th one is needed."""
+    """Return the octaves of the nodes for lattices of ``cells``, of which every ``stride``-th one is needed."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves: list[_Octave] = []
     # Wavelets of higher nodes are shorter: the padding of an octave is that of its lowest node.

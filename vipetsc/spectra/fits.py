@@ -49,7 +49,7 @@ def doubt(points: float, r2: float) -> str:
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
-    """1 - (1 - R^2)(n - 1)/(n - 2) of values ``fitted`` (n,) to ``y`` (n,) with two parameters; NaN if y is constant.
+    """Return 1 - (1 - R^2)(n - 1)/(n - 2) of a fit ``fitted`` (n,) with two parameters to ``y`` (n,), or NaN.
 
     R^2 compares the squared residuals with those of the mean of y: the model must include constants.
     """
@@ -120,17 +120,17 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
 
 
 def _exponential(u: np.ndarray, c: float, b: float) -> np.ndarray:
-    """The model c exp(b u) (n)."""
+    """Return the model c exp(b u) (n)."""
     return np.asarray(c * np.exp(b * u))
 
 
 def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
-    """Derivatives (n, 2) of the model by c and b."""
+    """Return derivatives (n, 2) of the model by c and b."""
     return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
 
 def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
-    """A curve ``y`` (n,) scaled linearly to the range from ``low`` to ``high``; NaN stays NaN.
+    """Return a curve ``y`` (n,) scaled linearly to the range from ``low`` to ``high``; NaN stays NaN.
 
     Raises ValueError if the curve is constant.
     """

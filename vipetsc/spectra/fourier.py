@@ -32,7 +32,7 @@ class Dispersion:
     energy: np.ndarray
 
     def folded(self) -> "Dispersion":
-        """Dispersion with kappa and -kappa added up, on [0, pi]."""
+        """Return dispersion with kappa and -kappa added up, on [0, pi]."""
         zero = (len(self.wavenumber) - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
         energy = self.energy[zero:].copy()
         # 0 is its own opposite, and so is pi, which an even number of wavenumbers has once.
@@ -40,7 +40,7 @@ class Dispersion:
         return Dispersion(wavenumber=self.wavenumber[zero:], frequency=self.frequency, energy=energy)
 
     def pooled(self, wavenumbers: int, frequencies: int) -> "Dispersion":
-        """Dispersion in bins ``wavenumbers`` and ``frequencies`` times as wide: sums of energies, at the bins' middles.
+        """Return the dispersion in bins ``wavenumbers`` and ``frequencies`` times as wide: sums, at bins' middles.
 
         The last bin of either axis may be narrower.
         """
@@ -52,7 +52,7 @@ class Dispersion:
 
 
 def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
-    """Kinetic energy (t, cell) in J of every cell, from ``velocity`` (t, cell, dof) in m/s, masses in kg."""
+    """Return the kinetic energy (t, cell) in J of every cell, from ``velocity`` (t, cell, dof) in m/s, masses in kg."""
     energy = np.zeros(velocity.shape[:-1])
     for j, mass in enumerate(np.asarray(masses)):
         energy += 0.5 * mass * np.square(np.asarray(velocity[..., j]))
@@ -60,7 +60,7 @@ def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
 
 
 def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Kinetic energy per wavenumber over time: kappa (k) in [0, pi] rad per cell, content (t, k) in J.
+    """Return the kinetic energy per wavenumber over time: kappa (k) in [0, pi] rad per cell, content (t, k) in J.
 
     Both signs of kappa are added up; the content of a sample sums to its kinetic energy (Parseval).
     """
@@ -75,7 +75,7 @@ def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndar
 
 
 def taper(length: int, fraction: float) -> np.ndarray:
-    """Tukey window (length) with cosine flanks over ``fraction`` of it, scaled to mean square 1."""
+    """Return Tukey window (length) with cosine flanks over ``fraction`` of it, scaled to mean square 1."""
     x = (np.arange(length) + 0.5) / length
     flank = np.minimum(x, 1 - x)
     window = np.ones(length)
@@ -95,7 +95,7 @@ class CellWindow(NamedTuple):
 def dispersion(
     velocity: np.ndarray, masses: ArrayLike, interval: float, *, tapers: tuple[float, float] = (TAPER, TAPER)
 ) -> Dispersion:
-    """The `dispersions` of all cells of a ``velocity`` (time, cell, dof) in m/s.
+    """Return the `dispersions` of all cells of a ``velocity`` (time, cell, dof) in m/s.
 
     ``masses`` (dof,) are in kg, the ``interval`` of samples in s. Flanks take the fractions ``tapers`` of the record
     and of the cells.
@@ -116,7 +116,7 @@ def dispersions(
     rows: slice = slice(None),
     memory: float = np.inf,
 ) -> list[Dispersion]:
-    """Kinetic energy over wavenumber and frequency in each of ``windows``, by 2-D Fourier transforms of velocities.
+    """Return kinetic energy over wavenumber and frequency in ``windows``, by 2-D Fourier transforms of velocities.
 
     ``velocity`` (t, cell, dof) is in m/s every ``interval`` s, ``masses`` (dof) in kg, ones for a plain velocity
     spectrum; energies are added over the masses. Cosine flanks cover the fraction ``in_time`` of the record, half of it
@@ -162,7 +162,7 @@ def dispersions(
 
 
 def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
-    """Ridge of a dispersion: energetic wavenumbers (k) in rad per cell, and the frequency (k) in rad/s of their peaks.
+    """Return ridge of a dispersion: energetic wavenumbers (k) in rad per cell, frequencies (k) in rad/s of their peaks.
 
     A wavenumber is energetic if its peak exceeds ``floor`` times the largest energy of a bin. The frequency of the peak
     is that of the parabola through the logarithms of the peak and its two neighbours, which is exact for a Gaussian

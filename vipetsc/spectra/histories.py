@@ -54,17 +54,17 @@ class SteadyAmplitude(NamedTuple):
 
 
 def peak(values: np.ndarray) -> float:
-    """The largest magnitude of samples (t,)."""
+    """Return the largest magnitude of samples (t,)."""
     return float(np.abs(values).max())
 
 
 def rms(values: np.ndarray) -> float:
-    """The root of the mean square of samples (t,)."""
+    """Return the root of the mean square of samples (t,)."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, periods: int) -> SteadyAmplitude:
-    """The amplitude of ``values`` (t,) at the frequency of ``drive``, as a lock-in amplifier has it, and its drift.
+    """Return amplitude of ``values`` (t,) at the frequency of ``drive``, as a lock-in amplifier has it, and its drift.
 
     In each of the last three windows of so many ``periods`` of the drive, a constant and sines of up to five harmonics
     are fitted to the samples, at ``time`` (t,) in s, by least squares. The amplitude is that of the first harmonic in
@@ -94,7 +94,7 @@ def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, p
 
 
 def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: int) -> complex:
-    """The complex amplitude A of the part Re(A exp(i w t)) of ``values`` (t,) with the ``frequency`` w in rad/s.
+    """Return the complex amplitude A of the part Re(A exp(i w t)) of ``values`` (t,) with the ``frequency`` w in rad/s.
 
     Sines of so many ``harmonics`` are fitted with it.
     """
@@ -108,7 +108,7 @@ def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: i
 
 
 def transmission(source: np.ndarray, receiver: np.ndarray) -> float:
-    """The rms of the ``receiver`` (t,) over that of the ``source`` (t,); NaN where the source does not move."""
+    """Return the rms of the ``receiver`` (t,) over that of the ``source`` (t,); NaN where the source does not move."""
     source_rms = rms(source)
     if source_rms == 0:
         return np.nan
@@ -123,7 +123,7 @@ def transmission_by_part(
     *,
     goes_on: bool = False,
 ) -> np.ndarray:
-    """Transmission (part,) of the frequencies between the ``edges`` (part + 1) in rad/s, samples ``interval`` s apart.
+    """Return transmission (part,) of frequencies between ``edges`` (part + 1) in rad/s, sampled each ``interval`` s.
 
     ``source`` and ``receiver`` (t,) are continued by their mirror images (cosine transform), without a jump; the mean
     square of a record is the sum of those of its parts. A vibration that ``goes_on`` beyond the record is faded out

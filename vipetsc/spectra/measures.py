@@ -57,7 +57,7 @@ class RunRecord:
     _steady: dict[str, dict[str, SteadyAmplitude]] = field(default_factory=dict)
 
     def steady(self, point: str) -> dict[str, SteadyAmplitude] | None:
-        """The steady amplitude of each quantity at a ``point``; None where the first drive is no lasting sine."""
+        """Return steady amplitude of each quantity at a ``point``; None where the first drive is no lasting sine."""
         if self.drive is None:
             return None
         if point not in self._steady:
@@ -70,14 +70,14 @@ class RunRecord:
         return self._steady[point]
 
     def drift(self, point: str) -> float | None:
-        """The largest drift of the steady amplitudes at a ``point``."""
+        """Return the largest drift of the steady amplitudes at a ``point``."""
         steady = self.steady(point)
         if steady is None:
             return None
         return float(np.max([amplitude.drift for amplitude in steady.values()]))
 
     def settled(self, point: str, quantity: str) -> float | None:
-        """The steady amplitude of a ``quantity`` at a ``point``, NaN and a warning where it has not settled."""
+        """Return the steady amplitude of a ``quantity`` at a ``point``, NaN and a warning where it has not settled."""
         steady = self.steady(point)
         drift = self.drift(point)
         if steady is None or drift is None:
@@ -91,7 +91,7 @@ class RunRecord:
         return np.nan
 
     def _unsettled(self, point: str, drift: float) -> str:
-        """The sentence about a ``point`` whose amplitude is not steady."""
+        """Return the sentence about a ``point`` whose amplitude is not steady."""
         about = f"steady amplitude at {point}: three windows of {self.periods} periods of the drive"
         if not np.isnan(drift):
             return (
@@ -126,7 +126,7 @@ class RunMeasure(NamedTuple):
         return self.dimension, self.unit, self.text
 
     def at(self, *points: str) -> RunMeasure:
-        """The measure of these ``points``: named after them, it has a function of the record alone.
+        """Return the measure of these ``points``: named after them, it has a function of the record alone.
 
         A measure of a run is returned as it is.
         """
@@ -147,7 +147,7 @@ class RunMeasure(NamedTuple):
 
 
 def every_measure() -> dict[str, RunMeasure]:
-    """The shipped measures by name, and those that users' modules register.
+    """Return the shipped measures by name, and those that users' modules register.
 
     While a case is read, these are the modules that it names; else all that are imported.
     """
@@ -168,14 +168,14 @@ def _number_of_part(part: MeasurePart, record: RunRecord) -> float | None:
 
 
 def _foreign(run: xr.Dataset) -> set[str]:
-    """The registered measures of modules that the case of a ``run`` does not name."""
+    """Return the registered measures of modules that the case of a ``run`` does not name."""
     case = tomllib.loads(run.attrs.get("case", ""))
     with only(case.get("plugins", {}).get("modules", [])):
         return {*PARTS[MEASURE]} - {*registered(MEASURE)}
 
 
 def measures_of(points: Sequence[str], pairs: Sequence[Sequence[str]]) -> dict[str, RunMeasure]:
-    """The measures, by name, of a run with these ``points`` and ``pairs`` of them."""
+    """Return the measures, by name, of a run with these ``points`` and ``pairs`` of them."""
     expanded: dict[str, RunMeasure] = {}
     for measure in every_measure().values():
         for one in _expanded(measure, points, pairs):
@@ -184,7 +184,7 @@ def measures_of(points: Sequence[str], pairs: Sequence[Sequence[str]]) -> dict[s
 
 
 def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequence[str]]) -> Iterator[RunMeasure]:
-    """A ``measure`` of a run; one of points or of pairs for each of them."""
+    """Yield a ``measure`` of a run; one of points or of pairs for each of them."""
     if measure.over == "run":
         yield measure
     elif measure.over == "point":
@@ -196,7 +196,7 @@ def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequen
 
 
 def row_of(name: str) -> tuple[str, str, str]:
-    """Dimension, unit and text of the measure ``name``, with points or without; raises KeyError if there is none."""
+    """Return dimension, unit and text of the measure ``name``, with points or without; raises KeyError for none."""
     measures = every_measure()
     if name in measures:
         return measures[name].row
@@ -205,23 +205,23 @@ def row_of(name: str) -> tuple[str, str, str]:
 
 
 def is_measure(name: str) -> bool:
-    """Whether ``name`` is a measure of a run, or of points: ``peak_velocity/tip``."""
+    """Return whether ``name`` is a measure of a run, or of points: ``peak_velocity/tip``."""
     base, _, points = name.partition("/")
     return name in every_measure() or (bool(points) and base in MEASURES and MEASURES[base].over != "run")
 
 
 def _of_name(name: str) -> RunMeasure:
-    """The measure ``name`` in the registry, where a measure of points stands without their names."""
+    """Return the measure ``name`` in the registry, where a measure of points stands without their names."""
     return every_measure().get(name) or MEASURES[name.partition("/")[0]]
 
 
 def power_of(name: str) -> float:
-    """The power of the amplitude to which the measure ``name`` is proportional without contact; 0 if it is unknown."""
+    """Return the power of the amplitude in the measure ``name`` without contact; 0 if it is unknown."""
     return _of_name(name).power or 0.0
 
 
 def can_be_scaled(modules: Sequence[str]) -> bool:
-    """Whether every measure that a sweep takes of the motion is proportional to a power of the amplitude.
+    """Return whether every measure that a sweep takes of the motion is proportional to a power of the amplitude.
 
     The measures are the shipped ones and those of the ``modules`` that the case names.
     """
@@ -230,12 +230,12 @@ def can_be_scaled(modules: Sequence[str]) -> bool:
 
 
 def group_of(name: str) -> Group:
-    """The group of the measure ``name``."""
+    """Return the group of the measure ``name``."""
     return _of_name(name).group
 
 
 def take(record: RunRecord, groups: Collection[str]) -> dict[str, Any]:
-    """The values by name of the measures of these ``groups`` that the run of ``record`` has."""
+    """Return the values by name of the measures of these ``groups`` that the run of ``record`` has."""
     values = {}
     foreign = _foreign(record.run)
     for name, measure in measures_of([*record.points], record.pairs).items():
@@ -276,7 +276,7 @@ def _largest_force(record: RunRecord) -> float | None:
 
 
 def _of_statistics(name: str) -> Callable[[RunRecord], float | None]:
-    """The measure that the run itself has left among its statistics, under this ``name``."""
+    """Return the measure that the run itself has left among its statistics, under this ``name``."""
 
     def of(record: RunRecord) -> float | None:
         statistics = record.run.attrs.get("statistics", {})
@@ -315,7 +315,7 @@ def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float
 
 
 def _of_points(kind: str, quantity: str) -> RunMeasure:
-    """The measure of a ``kind`` (peak, rms, steady) of a ``quantity`` at a point."""
+    """Return the measure of a ``kind`` (peak, rms, steady) of a ``quantity`` at a point."""
     unit = QUANTITIES[quantity]
     name = f"{kind}_{quantity}"
     if kind == "steady":

@@ -34,7 +34,7 @@ class ModalParts:
 
     @classmethod
     def of(cls, chain: Chain) -> Self:
-        """The modes of ``chain`` without its sites, sorted; they are computed once."""
+        """Return the modes of ``chain`` without its sites, sorted; they are computed once."""
         modes = linear_modes(chain)
         parts = Parts.of(pass_bands(chain.cell))
         is_band = np.array([bool(numbers) for numbers in parts.bands])
@@ -50,7 +50,7 @@ class ModalParts:
         return cls(modes=modes, parts=parts, part=part, bin=wavenumber_bin)
 
     def sums(self, energies: np.ndarray) -> np.ndarray:
-        """Sums (part, bin, t) of ``energies`` (t, mode)."""
+        """Return sums (part, bin, t) of ``energies`` (t, mode)."""
         parts = len(self.parts.names)
         index = self.part * BINS + self.bin
         sums = np.zeros((parts, BINS, len(energies)))
@@ -59,7 +59,7 @@ class ModalParts:
         return sums
 
     def energies(self, displacement: Any, velocity: Any, rows: Rows, memory: float = np.inf) -> np.ndarray:
-        """Energies (part, bin, row) in J at the samples ``rows`` of fields (t, cell, dof) in m and m/s.
+        """Return energies (part, bin, row) in J at the samples ``rows`` of fields (t, cell, dof) in m and m/s.
 
         Fields may be datasets of a file; no more than ``memory`` bytes of both are read at once.
         """
@@ -71,7 +71,7 @@ class ModalParts:
         return np.concatenate(energies, axis=-1)
 
     def driven_change(self, state: np.ndarray, drives: Sequence[Drive], span: np.ndarray) -> np.ndarray:
-        """Change, by ``drives``, of the energies (part) in J of a lattice without contacts within a ``span`` (2,) in s.
+        """Return the change, by ``drives``, of energies (part) in J without contacts within a ``span`` (2,) in s.
 
         ``state`` (mode,) are the amplitudes at the beginning of the span. The result is exact.
         """
@@ -87,7 +87,7 @@ class ModalParts:
 def cluster_samples(
     onset: np.ndarray, separation: np.ndarray, time: np.ndarray, stride: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Clusters of contact episodes that overlap between samples, from ``onset`` and ``separation`` (episode) in s.
+    """Return clusters of contact episodes that overlap between samples, by ``onset`` and ``separation`` (episode) in s.
 
     Returns the numbers (cluster, 2) of the samples between which each cluster lies, and the number (episode,), from 0,
     of the cluster that each episode is in. Samples are those at ``time`` whose number is a multiple of ``stride``, and
@@ -112,12 +112,12 @@ def cluster_samples(
 
 
 def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """The numbers (mode,), from 0, of the parts between whose ``edges`` (part + 1) each ``frequency`` (mode,) lies."""
+    """Return numbers (mode,), from 0, of the parts in whose ``edges`` (part + 1) each ``frequency`` (mode,) lies."""
     return np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, len(edges) - 2)
 
 
 def upper_fraction(chain: Chain, drive: Waveform, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
-    """Energy of the pass bands above the driven one over the drive's ``work`` in J, at one instant.
+    """Return the energy of the pass bands above the driven one over the drive's ``work`` in J, at one instant.
 
     After the last impact it is the same at every instant. ``displacement`` in m and ``velocity`` in m/s are (cell, dof)
     of all cells. NaN if there is no such band, or no work.

@@ -88,7 +88,7 @@ UNEVEN = 4.0
 
 
 def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
-    """The largest value at parameters from ``low`` to ``high`` of all ``parts`` of a curve; NaN if none lies there.
+    """Return largest value at parameters from ``low`` to ``high`` of all ``parts`` of a curve; NaN if none lies there.
 
     Between points it is the vertex of the parabola, over the length, through the largest value and its two neighbours.
     """
@@ -113,7 +113,7 @@ def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
 
 
 def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:
-    """Values where a ``part`` passes the parameters ``low`` and ``high``, linear between points, and -inf.
+    """Return values where a ``part`` passes the parameters ``low`` and ``high``, linear between points, and -inf.
 
     The last is the largest one of a part that passes neither.
     """
@@ -127,7 +127,7 @@ def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:
 
 
 def _vertex(s: np.ndarray, y: np.ndarray) -> float:
-    """The largest value of the parabola through three points with the values ``y`` (3,) at the lengths ``s`` (3,).
+    """Return largest value of the parabola through three points with the values ``y`` (3,) at the lengths ``s`` (3,).
 
     The value in the middle where it is not the largest, or the distances are too uneven for a parabola.
     """
@@ -146,7 +146,7 @@ def _vertex(s: np.ndarray, y: np.ndarray) -> float:
 
 
 def widest_gap(parts: list[CurvePart], level: float, low: float, high: float) -> float:
-    """The width of the widest range of the parameter, from ``low`` to ``high``, with responses below a ``level``.
+    """Return width of the widest range of the parameter, from ``low`` to ``high``, with responses below a ``level``.
 
     Between points responses are linear. Where a curve has several states, the largest one counts. A range in which it
     has none counts as below: the ``parts`` must cover all from ``low`` to ``high``.

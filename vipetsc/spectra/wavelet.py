@@ -37,7 +37,7 @@ class Nodes:
 
     @classmethod
     def log(cls, kc: float, voices: float = VOICES) -> Self:
-        """Nodes from pi/60 to pi (1 + 4/kc), both included, ``voices`` an octave or a few more.
+        """Return nodes from pi/60 to pi (1 + 4/kc), both included, ``voices`` an octave or a few more.
 
         Higher nodes would add less than 0.1 % to the sum of the filters at eta = pi (kc = 6). Raises ValueError below
         0.65 kc voices, where the sum over the nodes would ripple.
@@ -56,7 +56,7 @@ class Nodes:
 
 
 def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
-    """Psi(kc eta/kappa) (kappa, eta), zero for eta <= 0.
+    """Return Psi(kc eta/kappa) (kappa, eta), zero for eta <= 0.
 
     Raises ValueError for ``kc`` below 5: the uncorrected Morlet wavelet then has weight at eta = 0.
     """
@@ -69,7 +69,7 @@ def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
 
 @lru_cache
 def constant(kc: float) -> float:
-    """C = integral of |Psi(kc e^x)|^2 over x from log(1e-3) on, by the trapezoidal rule.
+    """Return C = integral of |Psi(kc e^x)|^2 over x from log(1e-3) on, by the trapezoidal rule.
 
     The rule is exact to rounding for a smooth bell that has fallen to nothing at both ends. At the upper end the
     integrand is exp(-49). At the lower one, and on to x = -infinity, it is exp(-kc^2): 2e-16 for the kc = 6 of the
@@ -80,7 +80,7 @@ def constant(kc: float) -> float:
 
 
 def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
-    """Transform length that keeps ``cells`` apart from their periodic images, the next that is fast.
+    """Return transform length that keeps ``cells`` apart from their periodic images, the next that is fast.
 
     Room is left for the wavelet of the node ``lowest`` (rad per cell), until its Gaussian envelope
     exp(-(lowest x / kc)^2 / 2) is below rounding. Within the first ``cells`` the transform is then that of the lattice
@@ -92,12 +92,12 @@ def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
 
 
 def wavenumbers(length: int) -> np.ndarray:
-    """Wavenumbers (k) in rad per cell of a real Fourier transform of so many cells (``length``)."""
+    """Return wavenumbers (k) in rad per cell of a real Fourier transform of so many cells (``length``)."""
     return 2 * np.pi * np.arange(length // 2 + 1) / length
 
 
 def transform_filters(kappa: np.ndarray, kc: float, length: int) -> np.ndarray:
-    """sqrt(kc/kappa) Psi(kc eta/kappa) (kappa, k) over the wavenumbers of a real transform of ``length``."""
+    """Return sqrt(kc/kappa) Psi(kc eta/kappa) (kappa, k) over the wavenumbers of a real transform of ``length``."""
     filters = np.sqrt(kc / kappa)[:, None] * wavelet_spectrum(kappa, kc, wavenumbers(length))
     if length % 2 == 0:
         filters[:, -1] *= 0.5  # eta = pi belongs to both signs
@@ -105,7 +105,7 @@ def transform_filters(kappa: np.ndarray, kc: float, length: int) -> np.ndarray:
 
 
 def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | None = None) -> np.ndarray:
-    """Complex wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell); X in the signal's unit.
+    """Return the wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell), in the signal's unit.
 
     X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
     ``padded_length`` of the lowest node. The first columns over x are those of the cells; the inverse needs the others
@@ -125,7 +125,7 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
 
 
 def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
-    """Parts (bin, ..., x), Eq. (A7), of the signals whose ``transform`` at ``nodes`` is ``x`` (..., kappa, x), not cut.
+    """Return parts (bin, ..., x), Eq. (A7), of signals whose ``transform`` at ``nodes`` is ``x`` (..., kappa, x).
 
     u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
     The parts sum to the signal but for its mean and the wavenumbers near and below pi/60 (see ``Bank``).
@@ -155,7 +155,7 @@ class Bank:
     length: int
 
     def split(self, signal: np.ndarray) -> np.ndarray:
-        """Parts (bin, ..., cell) of real signals (..., cell), without the padding."""
+        """Return parts (bin, ..., cell) of real signals (..., cell), without the padding."""
         spectrum = fft.rfft(signal, self.length)
         cells = signal.shape[-1]
         return np.stack([fft.irfft(transfer * spectrum, self.length)[..., :cells] for transfer in self.transfer])
@@ -163,7 +163,7 @@ class Bank:
 
 @lru_cache(maxsize=16)
 def filter_bank(cells: int, kc: float = 6.0) -> Bank:
-    """The bank of filters of all bins for lattices of ``cells``."""
+    """Return the bank of filters of all bins for lattices of ``cells``."""
     length = padded_length(cells, kc)
     nodes = Nodes.log(kc)
     # The factors sqrt(kc/kappa) of the transform and sqrt(kappa/kc) of its inverse cancel.

@@ -95,7 +95,7 @@ def analyse(
     comm: MPI.Comm = MPI.COMM_SELF,
     case: Case | None = None,
 ) -> xr.Dataset:
-    """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
+    """Return content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, when the peak of the linear wave is at the first site (``spectra.arrivals``); by default it is
@@ -148,7 +148,7 @@ def _dataset(
     about: Mapping[str, Any],
     attributes: Mapping[str, Mapping[str, Any]],
 ) -> xr.Dataset:
-    """The dataset of ``values`` by name in the ``layout``, with attributes of its own and of variables."""
+    """Return the dataset of ``values`` by name in the ``layout``, with attributes of its own and of variables."""
     data = xr.Dataset(tabulated(layout, values), attrs=dict(about))
     for name, texts in attributes.items():
         data[name].attrs.update(texts)
@@ -169,7 +169,7 @@ class Numbers(NamedTuple):
 
 
 def _numbers(run: xr.Dataset, case: Case, options: AnalysisTable, measures: Collection[str]) -> Numbers:
-    """The numbers of a ``run`` by those ``measures`` that ``spectra.measures`` has."""
+    """Return the numbers of a ``run`` by those ``measures`` that ``spectra.measures`` has."""
     record = record_of(run, case, options)
     taken = take(record, measures)
     layout: dict[str, tuple[str, str, str]] = {}
@@ -202,7 +202,7 @@ def _measure(
     by_wavelets: Callable[[VelocityRecord, Collection[str]], dict[str, Any]],
     comm: MPI.Comm,
 ) -> dict[str, Any]:
-    """The variables of ``measures``, by the ranks of ``comm`` together; the ``record`` says what cannot be computed.
+    """Return variables of ``measures``, by the ranks of ``comm`` together; the ``record`` says what cannot be computed.
 
     ``by_wavelets`` gives the partition and the entropy of a record.
     """
@@ -256,7 +256,7 @@ def _measure(
 
 
 def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Kinetic energy of cells and of wavenumbers over time, from blocks of samples that fit into the memory."""
+    """Return kinetic energy of cells and of wavenumbers over time, from blocks of samples that fit into the memory."""
     nt, cells, dofs = record.velocity.shape
     samples = record.sizes[0]
     # Wavenumbers in a bin of the map; there are half as many wavenumbers from 0 to pi as cells.
@@ -290,7 +290,7 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
 
 
 def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
-    """Wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
+    """Return the wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
     nt, cells = record.velocity.shape[:2]
     if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
         record.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
@@ -307,7 +307,7 @@ def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float 
 
 
 def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps: bool) -> dict[str, Any]:
-    """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
+    """Return the entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
     options = record.options
     time = record.time[:: stride * options.snapshot_stride]
     reason = "the peak of the linear wave at the first site: the largest host velocity there"
@@ -353,7 +353,7 @@ def _estimated_peak(record: VelocityRecord) -> float:
 
 
 def _partition(record: VelocityRecord, every: int, maps: bool) -> dict[str, Any]:
-    """Kinetic energies of the wavenumber bins at every ``every``-th sample, with their ``maps``."""
+    """Return the kinetic energies of the wavenumber bins at every ``every``-th sample, with their ``maps``."""
     time = record.time[::every]
     mean_over = record.sizes[1] if maps else 0
     parts = []

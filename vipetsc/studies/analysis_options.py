@@ -15,7 +15,7 @@ from vipetsc.sources import source_key
 
 
 def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
-    """Options ``[analysis]`` of a ``case`` (TOML), or of the case in the run's ``folder``, with ``overrides``."""
+    """Return the options ``[analysis]`` of a ``case`` (TOML), or of that in ``folder``, with ``overrides``."""
     table = tomllib.loads(case)
     if folder and (folder / "case.toml").exists():
         # The user may have changed [analysis] there since the run.
@@ -24,12 +24,12 @@ def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] =
 
 
 def describe_options(options: AnalysisTable) -> str:
-    """The ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
+    """Return the ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
     return json.dumps(options.model_dump(exclude={"memory"}, exclude_none=True))
 
 
 def is_measured(folder: Path) -> bool:
-    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
+    """Return whether ``folder/analysis.h5`` is of this version and of ``run.h5`` as it is; raises as ``open_run``."""
     run = root_attributes(folder / "run.h5", "run", RUN_NEEDS)
     expected = {
         "case": run["case"],

@@ -46,7 +46,7 @@ LAYOUT = {
 
 
 def read_slope(path: Path) -> xr.Dataset:
-    """df/dE of a branch along its regular points: the variables ``branch/...`` of ``LAYOUT``.
+    """Return df/dE of a branch along its regular points: the variables ``branch/...`` of ``LAYOUT``.
 
     Attributes: ``law``, ``reading``, and ``grazing``, the energy in J of the last point without contact, where region I
     passes into II. Raises OSError, or ValueError if the branch does not reach a contact.
@@ -77,7 +77,7 @@ def read_slope(path: Path) -> xr.Dataset:
 
 
 def log_slope(energy: np.ndarray, branch_energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """ln(df/dE) at ``energy`` (point) in J of a branch with the ``slope`` in Hz/J at its energies and regions.
+    """Return ln(df/dE) at ``energy`` (point) in J of a branch with the ``slope`` in Hz/J at its energies and regions.
 
     It is interpolated in logarithms between the branch's points of region III, NaN beyond them. Raises ValueError if
     there are none.
@@ -105,7 +105,7 @@ class Initiation:
 
 
 def initiation_of(folder: Path, case: Case) -> Initiation:
-    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run.
+    """Return the initiation of the members like ``case`` of the sweep in ``folder``, from their linear run.
 
     Until the first contact the lattice is linear, so w grows with the amplitude and the drive's work with its square:
     the smallest amplitude that touches a site is its lesser clearance over the envelope at 1 N. The envelope is that of
@@ -232,7 +232,7 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
 
 
 def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
-    """Curve aligned with its branch, or the reason why there is no branch."""
+    """Return curve aligned with its branch, or the reason why there is no branch."""
     same_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
     if not same_law:
         return f"no branch of the law {case.contacts.law}"
@@ -269,7 +269,7 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of the files from which ``backbone.h5`` is computed, by folder within the one that contains them all."""
+    """Return SHA-256 of the files that ``backbone.h5`` is computed from, by folder within their common one."""
     files = {folder.resolve(): "ensemble.h5"} | {branch.resolve(): BRANCH for branch in branches}
     common = os.path.commonpath([path.parent for path in files])
     return {
@@ -279,7 +279,7 @@ def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
 
 
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
-    """Whether ``folder/backbone.h5`` is of this version and of the sweep and the ``branches`` as they are now."""
+    """Return whether ``folder/backbone.h5`` is of this version, and of sweep and ``branches`` as they are now."""
     with suppress(OSError), open_netcdf(folder / "backbone.h5", "relation") as file:  # none, or one that was cut off
         if file.attrs.get("source") == source_key():
             return bool(json.loads(file.attrs.get("sources", "{}")) == _sources(folder, branches))

@@ -121,7 +121,7 @@ def _span(record: VelocityRecord) -> AveragingSpan:
 def _transfers(
     record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: AveragingSpan, times: dict[str, Any]
 ) -> dict[str, Any]:
-    """The transfer to the bands ``above`` over the ``span``, and as the paper's, to the record's end."""
+    """Return the transfer to the bands ``above`` over the ``span``, and as the paper's, to the record's end."""
     stride = record.options.band_stride
     samples = len(record.time)
     # Energies at twice the stride, interpolated, show the error that the stride makes.
@@ -131,7 +131,7 @@ def _transfers(
     coarse[-1] = np.interp(np.arange(samples), taken, energy[-1, taken])
 
     def transfer(end: int) -> tuple[float, float]:
-        """The transfer up to the sample ``end``, and its error."""
+        """Return the transfer up to the sample ``end``, and its error."""
         value = spectra.ibtet(energy[:, :end], above, span.first)
         if stride == 1:
             return value, 0.0

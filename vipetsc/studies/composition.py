@@ -157,7 +157,7 @@ class Network:
         self.losses = self._losses(driving)
 
     def compose(self, amplitude: float, sites: SiteResponses) -> Composed:
-        """The energies at the end under ``amplitude`` (N, of a wall m), from the response of each site alone."""
+        """Return the energies at the end under ``amplitude`` (N, of a wall m), from the response of each site alone."""
         linear = np.where(self.during, abs(amplitude) * self.linear, 0)
         size = float(np.abs(linear).max())
         c = linear.copy()
@@ -194,7 +194,7 @@ class Network:
         return self._energies(Arriving(c, c3, on), sites, change, solved, amplitude)
 
     def _pulse(self, drive: Waveform) -> np.ndarray:
-        """Spectrum (offset,) of the envelope of a drive of 1 N, or of 1 m of a wall, about its frequency."""
+        """Return the spectrum (offset,) of the envelope of a drive of 1 N, or of 1 m of a wall, about its frequency."""
         if isinstance(drive, ToneBurst):
             # Its sine is -i exp(i Om t), under a Hann window.
             force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
@@ -209,7 +209,7 @@ class Network:
         return np.asarray(2 * transform / self.time[1])
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
-        """Compliances in m/N at the frequencies of a line about ``middle`` in rad/s.
+        """Return compliances in m/N at the frequencies of a line about ``middle`` in rad/s.
 
         The first (frequency, site, force) is that of w at the sites to forces at the sites, then to those of the
         drives. The second (site, frequency) is g, that of a site in an infinite lattice to a pair of forces at itself.
@@ -221,7 +221,7 @@ class Network:
         return response, np.array([alone[pair] for pair in pairs])
 
     def _compliance(self) -> WaveCompliance | DirectCompliance:
-        """The compliance of the sites, with the driven masses as points."""
+        """Return the compliance of the sites, with the driven masses as points."""
         chain = self.model.chain
         driven = tuple((drive.cell, drive.mass) for drive in self.model.drives)
         if chain.is_damped:
@@ -229,7 +229,7 @@ class Network:
         return WaveCompliance(chain, points=driven)
 
     def _losses(self, driving: np.ndarray) -> WaveLosses | None:
-        """Losses of waves in dashpots; ``driving`` (drive, offset) are the spectra of the drives."""
+        """Return losses of waves in dashpots; ``driving`` (drive, offset) are the spectra of the drives."""
         compliance = self._compliance()
         driven = fastest_wave(self.cell, self.om, self.model.chain.contact_pairs[0])
         if isinstance(compliance, WaveCompliance) or driven is None:
@@ -245,12 +245,12 @@ class Network:
         )
 
     def _powers(self, omega: float) -> np.ndarray:
-        """Power (site, 1) in W/m^2 of the wave at ``omega`` in rad/s over the |w|^2 of each site's pair."""
+        """Return the power (site, 1) in W/m^2 of the wave at ``omega`` in rad/s over the |w|^2 of each site's pair."""
         waves = [fastest_wave(self.cell, omega, pair) for pair in self.model.chain.contact_pairs]
         return np.array([[wave.power_per_area] for wave in waves if wave])
 
     def _propagates(self, middle: float) -> np.ndarray:
-        """Whether a wave of each frequency near ``middle`` exists."""
+        """Return whether a wave of each frequency near ``middle`` exists."""
         frequency = bloch(self.cell, np.linspace(0, np.pi, WAVENUMBERS)).frequency
         omega = middle + self.offset
         low = frequency.min(axis=0)
@@ -258,7 +258,7 @@ class Network:
         return np.asarray(((omega[:, None] >= low) & (omega[:, None] <= high)).any(axis=1))
 
     def _sent(self, between: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Waves (site, time) that arrive at every site from ``source`` (site, time) while the run goes on."""
+        """Return waves (site, time) that arrive at every site from ``source`` (site, time) while the run goes on."""
         arriving = self.line.backward(np.einsum("jkt,jt->kt", between, self.line.forward(source)))
         return np.where(self.during, arriving, 0)
 
@@ -279,13 +279,13 @@ class Network:
         return np.asarray(x).reshape(right.shape), flag == 0
 
     def _over_clearance(self, c: np.ndarray, c3: np.ndarray) -> np.ndarray:
-        """z (site, time), the amplitudes of both harmonics together over the clearance."""
+        """Return z (site, time), the amplitudes of both harmonics together over the clearance."""
         return np.asarray((np.abs(c) + np.abs(c3)) / self.clearance[:, None])
 
     def _energies(
         self, waves: Arriving, sites: SiteResponses, change: float, solved: bool, amplitude: float
     ) -> Composed:
-        """The energies at the end, of ``waves`` that arrive at the sites under ``amplitude``."""
+        """Return the energies at the end, of ``waves`` that arrive at the sites under ``amplitude``."""
         c = waves.first
         z = self._over_clearance(c, waves.third)
         step = float(self.time[1])
@@ -344,7 +344,7 @@ class Network:
         )
 
     def _third_gain(self, waves: Arriving, third: np.ndarray) -> np.ndarray:
-        """Power (site, time) in W by which third harmonics of the sites give more together than each alone."""
+        """Return power (site, time) in W by which third harmonics of the sites give more together than each alone."""
         c = waves.first
         alone = third * np.abs(c) * unit_phase(c) ** 3 * waves.on
         rate = 1j * (3 * self.om + self.offset - 1j * self.line.decay)
@@ -354,7 +354,7 @@ class Network:
         return np.asarray(0.5 * ((force * together.conj()).real - (alone * apart.conj()).real))
 
     def _absorbed(self, emitted: np.ndarray, on: np.ndarray, sites: SiteResponses) -> float:
-        """Sum over time of the power in W that sites in contact take from what others have ``emitted`` (site, time)."""
+        """Return the sum over time of the power in W that sites take from what others ``emitted`` (site, time)."""
         assert self.third
         rate = self.losses.rate(self.third) if self.losses else 0.0
         cells = np.array(self.model.chain.sites)
@@ -376,7 +376,7 @@ class Network:
 
 
 def _half_width(drive: Waveform) -> float:
-    """Half the width in rad/s of what is followed of a ``drive`` about its frequency."""
+    """Return the half the width in rad/s of what is followed of a ``drive`` about its frequency."""
     half = WIDTH * 2 * np.pi / drive.duration
     if isinstance(drive, ToneBurst):
         return half
@@ -384,7 +384,7 @@ def _half_width(drive: Waveform) -> float:
 
 
 def _of_sites(values: np.ndarray) -> np.ndarray:
-    """The ``values`` (site,) as factors of arrays (site, time): one number where all sites have the same."""
+    """Return the ``values`` (site,) as factors of arrays (site, time): one number where all sites have the same."""
     # A product with a number and one with equal numbers in an array differ by rounding.
     if np.all(values == values[0]):
         return values[0]

@@ -52,7 +52,7 @@ class OptimumSearch:
         self.asked = self.designs
 
     def _design(self, values: np.ndarray, generation: int) -> Design:
-        """The design of ``values`` (variable), with its runs, or with the reason why it is not possible."""
+        """Return the design of ``values`` (variable), with its runs, or with the reason why it is not possible."""
         try:
             case = self.plan.design(values)
             return Design(values, generation, case, [*self.objective.runs(case).values()])
@@ -60,7 +60,7 @@ class OptimumSearch:
             return Design(values, generation, reason="; ".join(map(str, error.problems)))
 
     def runs(self) -> list[Case]:
-        """The runs of the designs that are not judged yet."""
+        """Return the runs of the designs that are not judged yet."""
         return [run for design in self.asked for run in design.runs]
 
     def tell_and_ask(self) -> bool:
@@ -96,7 +96,7 @@ class OptimumSearch:
         return True
 
     def _values(self, point: np.ndarray) -> np.ndarray:
-        """The values (variable,) at a ``point`` (variable,) of the unit cube that the sampler asks for."""
+        """Return the values (variable,) at a ``point`` (variable,) of the unit cube that the sampler asks for."""
         values = self.plan.space.from_unit(point)
         # NSGA-II asks for the start, too. On the way into the cube and back its values are rounded, and would make
         # another design with runs of its own.
@@ -113,16 +113,16 @@ class OptimumSearch:
         self.sampler.tell(losses, excess)
 
     def losses(self) -> np.ndarray:
-        """Losses of all designs (design, objective)."""
+        """Return losses of all designs (design, objective)."""
         return np.array([design.losses for design in self.designs])
 
     def feasible_losses(self) -> np.ndarray:
-        """Losses of all designs (design, objective), NaN for those that miss a constraint."""
+        """Return losses of all designs (design, objective), NaN for those that miss a constraint."""
         is_feasible = np.array([design.excess == 0 for design in self.designs])
         return np.where(is_feasible[:, None], self.losses(), np.nan)
 
     def compared(self) -> dict[str, int]:
-        """The numbers of the designs to be compared by name: the case, and the best or the front's ends and knee."""
+        """Return numbers of the designs to be compared by name: the case, and the best or the front's ends and knee."""
         losses = self.feasible_losses()
         best = front(losses)
         if not best.size:

@@ -20,7 +20,7 @@ HEADROOM = 1.5
 
 
 def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
-    """Dispersion of all cells, of those before and of those after the first site."""
+    """Return dispersion of all cells, of those before and of those after the first site."""
     nt, cells = record.velocity.shape[:2]
     if cells < 2:
         record.left_out.append("dispersion: a single cell was recorded")
@@ -63,7 +63,7 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
 
 
 def _windows(record: VelocityRecord) -> dict[str, spectra.CellWindow]:
-    """The recorded cells of which a dispersion is taken, by its name."""
+    """Return the recorded cells of which a dispersion is taken, by its name."""
     windows = {"dispersion": spectra.CellWindow()}
     if record.site is None:
         record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")

@@ -211,7 +211,7 @@ class Results:
                 energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
 
     def gaps(self) -> list[str]:
-        """Sentences on measures that only some of the members have that did not fail; the others' are NaN."""
+        """Return sentences on measures that only some of the members have that did not fail; the others' are NaN."""
         done = (self.status == COMPLETE) | (self.status == SCALED)
         names: dict[int, list[str]] = {}
         for name in _layout(self):
@@ -249,13 +249,13 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
 
 
 def _dimensions(plan: Sweep) -> tuple[str, ...]:
-    """The name of each axis of the sweep: that of its first key."""
+    """Return the name of each axis of the sweep: that of its first key."""
     names = plan.names()
     return tuple(names[next(iter(axis))] for axis in plan.axes)
 
 
 def _coordinates(plan: Sweep) -> Variables:
-    """The swept values of every key."""
+    """Return the swept values of every key."""
     names = plan.names()
     data: Variables = {}
     for axis, dimension in zip(plan.axes, _dimensions(plan), strict=True):
@@ -265,7 +265,7 @@ def _coordinates(plan: Sweep) -> Variables:
 
 
 def _member_variables(results: Results) -> Variables:
-    """Variables of how every member ended, and its name."""
+    """Return variables of how every member ended, and its name."""
     plan = results.plan
     dims = _dimensions(plan)
     flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}
@@ -277,7 +277,7 @@ def _member_variables(results: Results) -> Variables:
 
 
 def _measured_variables(results: Results) -> Variables:
-    """``STATISTICS`` and the measures that some member has, with the coordinates that they need."""
+    """Return ``STATISTICS`` and the measures that some member has, with the coordinates that they need."""
     plan = results.plan
     dims = _dimensions(plan)
     parts = _joined(results.parts.values())
@@ -335,13 +335,13 @@ def _over_parts(table: np.ndarray, cuts: Mapping[int, tuple[str, ...]], parts: l
 
 
 def _layout(results: Results) -> dict[str, tuple[str, str, str]]:
-    """Rows of all that the ``results`` may hold, in an order that does not depend on that of the members."""
+    """Return rows of all that the ``results`` may hold, in an order that does not depend on that of the members."""
     of_points = sorted(of_motion(results.tables))
     return STATISTICS | MEASURES | {name: row_of(name) for name in of_points}
 
 
 def _fit_variables(results: Results, data: Variables) -> Variables:
-    """Power laws over the amplitude; statistics over samples of disorder, and power laws of their means."""
+    """Return the power laws over the amplitude; statistics over samples of disorder, and power laws of their means."""
     plan = results.plan
     names = plan.names()
     fits: Variables = {}
@@ -358,7 +358,7 @@ def _fit_variables(results: Results, data: Variables) -> Variables:
 
 
 def _fits(data: Variables, along: str) -> Variables:
-    """Power laws over the amplitude, the coordinate ``along``, from the peak on: in ``FITS`` and ``NORMALISED_FITS``.
+    """Return power laws over the amplitude, the coordinate ``along``, from the peak on: ``FITS``, ``NORMALISED_FITS``.
 
     A curve that is scaled to [0.01, 1] has another exponent, which depends on the range of amplitudes: the lowest value
     that the sweep has becomes 0.01.
@@ -373,7 +373,7 @@ def _fits(data: Variables, along: str) -> Variables:
 
 
 def _fits_of(item: xr.Variable, along: xr.Variable, prefix: str, normalise: bool) -> Variables:
-    """Power laws of a measure, the ``item``, over the amplitudes ``along``, as variables ``prefix``/..."""
+    """Return the power laws of a measure, the ``item``, over the amplitudes ``along``, as variables ``prefix``/..."""
     curves = item.transpose(..., *along.dims)
     dims = [*map(str, curves.dims[:-1])]
     amplitude = along.values.astype(float)
@@ -391,7 +391,7 @@ def _fits_of(item: xr.Variable, along: xr.Variable, prefix: str, normalise: bool
 
 
 def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict[str, float]:
-    """The entries of ``FIT`` for one ``curve`` (amplitude,) over the ``amplitude`` (amplitude,); NaN without a fit.
+    """Return entries of ``FIT`` for one ``curve`` (amplitude,) over the ``amplitude`` (amplitude,); NaN without a fit.
 
     From the curve's peak on y = factor A^exponent, A the amplitude's size, by a straight line of log y over log A and
     by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first. A member without a drive, in a

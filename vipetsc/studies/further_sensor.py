@@ -21,7 +21,7 @@ MOST_NUMBERS = 5_000_000
 
 
 def _further_sensor(sensors: Sequence[SensorTable], noise: np.ndarray) -> tuple[str, float]:
-    """The quantity that one more sensor would measure, and its noise in that quantity's unit.
+    """Return the quantity that one more sensor would measure, and its noise in that quantity's unit.
 
     They are those of the first of the ``sensors`` that measures motion, and the mean ``noise`` (sensor,) of all that
     measure the same; without any, a velocity with a noise of 1 m/s.
@@ -34,7 +34,7 @@ def _further_sensor(sensors: Sequence[SensorTable], noise: np.ndarray) -> tuple[
 
 
 def further_sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
-    """The mass at which one more sensor of the first record with contact would lower each error most.
+    """Return the mass at which one more sensor of the first record with contact would lower each error most.
 
     ``windows`` is the fit, ``z`` (coordinate,) its solution. The ``uncertainty`` is that of all coordinates: the sensor
     also measures an initial state that is estimated. Returns variables of ``identified.h5`` by name: the cell and the
@@ -54,7 +54,7 @@ def further_sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: U
     stride = -(-len(times) * len(candidates) * len(z) // MOST_NUMBERS)
 
     def measured(moved: np.ndarray) -> np.ndarray:
-        """What sensors at all candidates would measure (sample, mass) at the coordinates ``moved``."""
+        """Return what sensors at all candidates would measure (sample, mass) at the coordinates ``moved``."""
         response = misfit.respond(moved, record, candidates.tolist(), times[::stride])
         return response.motion[:, :, ROWS[quantity]]
 

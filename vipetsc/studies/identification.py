@@ -51,7 +51,7 @@ def run_identification(
 
 
 def read_measured_records(plan: IdentifyCase) -> list[Measured]:
-    """The measured records of ``plan``; raises CaseError for one that is not as it was when the case was read."""
+    """Return measured records of ``plan``; raises CaseError for one that is not as it was when the case was read."""
     records = []
     for number, table in enumerate(plan.options.records, 1):
         at = f"identify.records[{number}]"
@@ -77,11 +77,11 @@ class Identification:
         self.team = team
 
     def windows(self) -> GrowingWindows:
-        """A fit that begins anew: no window is solved, and solutions are not recorded."""
+        """Return a fit that begins anew: no window is solved, and solutions are not recorded."""
         return self._windows((), lambda number, z: None)
 
     def _windows(self, solved: Sequence[Sequence[float]], keep: Callable[[int, np.ndarray], None]) -> GrowingWindows:
-        """A fit whose first windows are ``solved``; the numbers and solutions of the others are given to ``keep``."""
+        """Return a fit whose first windows are ``solved``; what the others solve is given to ``keep``."""
         return GrowingWindows(
             Misfit(self.plan, self.measured, compute=lambda jobs: divided(self.team, jobs)),
             check=lambda: self.stop.check(self.team),
@@ -90,7 +90,7 @@ class Identification:
         )
 
     def starts(self) -> np.ndarray:
-        """The coordinates (start, coordinate) at which fits begin: those of the case, then a Latin hypercube.
+        """Return the coordinates (start, coordinate) at which fits begin: those of the case, then a Latin hypercube.
 
         Initial states that are estimated begin at rest.
         """
@@ -112,7 +112,7 @@ class Identification:
         solved: Sequence[Sequence[float]] = (),
         keep: Callable[[int, np.ndarray], None] = lambda number, z: None,
     ) -> Record:
-        """The record of the fit from the start of that ``number``; ``solved`` and ``keep`` as of GrowingWindows.
+        """Return the record of the fit from the start of that ``number``; ``solved`` and ``keep`` as of GrowingWindows.
 
         Coordinates are (coordinate,), those of parameters before those of initial states.
         """
@@ -138,18 +138,18 @@ class Identification:
         }
 
     def solution(self, record: Record) -> tuple[GrowingWindows, np.ndarray]:
-        """The fit of a ``record``, with the noise that it found, and its coordinates (coordinate,)."""
+        """Return the fit of a ``record``, with the noise that it found, and its coordinates (coordinate,)."""
         windows = self.windows()
         windows.misfit.noise = [np.array(noise) for noise in record["noise"]]
         return windows, np.array(record["coordinates"])
 
     def profile(self, record: Record) -> MisfitProfile:
-        """The values at which each parameter is held about the fit of a ``record``."""
+        """Return the values at which each parameter is held about the fit of a ``record``."""
         windows, z = self.solution(record)
         return profile_about(windows, z, self.plan.options.profile)
 
     def profile_record(self, record: Record, profile: MisfitProfile, number: int, side: Side) -> Record:
-        """The record of the ``costs`` with parameter ``number`` held on one ``side`` of the fit of a ``record``."""
+        """Return record of the ``costs`` with parameter ``number`` held on one ``side`` of the fit of a ``record``."""
         windows, z = self.solution(record)
         return {"costs": profile_costs(windows, z, profile, number, side)}
 
@@ -184,7 +184,7 @@ def _make(plan: IdentifyCase, work: StudyWork) -> Callable[[], xr.Dataset]:
 
 
 def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.ndarray) -> ProfileCosts:
-    """The costs of a ``profile`` about the fit ``z`` (coordinate,), from the ``records`` of its sides."""
+    """Return the costs of a ``profile`` about the fit ``z`` (coordinate,), from the ``records`` of its sides."""
     costs = np.full(profile.places.shape, np.nan)
     for number in range(len(costs)):
         for side in SIDES:
@@ -194,13 +194,13 @@ def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.
 
 
 def _recorded_runs(fitting: Identification, work: StudyWork, ranks: int) -> RecordedRuns:
-    """The records of fits by teams of so many ``ranks``."""
+    """Return the records of fits by teams of so many ``ranks``."""
     failures = (*FAILURES, CaseError, MotionError)
     return RecordedRuns("identified-runs", work.folder, work.comm, fitting.stop, ranks=ranks, failures=failures).read()
 
 
 def _fits(fitting: Identification, starts: list[str], work: StudyWork) -> list[Record]:
-    """The records of the fits from all ``starts``, which the ranks divide."""
+    """Return the records of the fits from all ``starts``, which the ranks divide."""
     recorded = _recorded_runs(fitting, work, ranks=max(work.comm.size // len(starts), 1))
     by_team = Identification(fitting.plan, fitting.measured, fitting.stop, recorded.team)
 
@@ -223,7 +223,7 @@ def _fits(fitting: Identification, starts: list[str], work: StudyWork) -> list[R
 def _results(
     fitting: Identification, fits: list[Record], best: int, profile: ProfileCosts, work: StudyWork
 ) -> xr.Dataset:
-    """The content of ``identified.h5``; writes the case that was fitted, ``identified.toml``.
+    """Return the content of ``identified.h5``; writes the case that was fitted, ``identified.toml``.
 
     ``best`` is the number of the best one of the ``fits``.
     """
@@ -240,7 +240,7 @@ def _results(
 
 
 def read_identified(folder: str | Path) -> xr.Dataset:
-    """The content of ``identified.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    """Return the content of ``identified.h5`` in ``folder``; raises OSError or ValueError if it is none."""
     with open_netcdf(Path(folder) / "identified.h5", "identification", ("value", "summary")) as data:
         return data.load()
 

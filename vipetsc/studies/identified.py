@@ -117,7 +117,7 @@ SAME_VALLEY = 1e-3
 def identified_values(
     windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: ProfileCosts
 ) -> dict[str, Any]:
-    """All values by name in ``LAYOUT``, at the best fit's coordinates ``z`` (coordinate,).
+    """Return all values by name in ``LAYOUT``, at the best fit's coordinates ``z`` (coordinate,).
 
     ``fits`` are the records of the starts, of which number ``best`` is the best, ``profile`` the costs about it.
     """
@@ -145,7 +145,7 @@ def identified_values(
 def _parameter_values(
     windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray, uncertainty: Uncertainty
 ) -> dict[str, Any]:
-    """Parameters with their ``uncertainty``, and what is not determined; ``jacobian`` is that of all coordinates."""
+    """Return parameters with ``uncertainty``, and what is not determined; ``jacobian`` is that of all coordinates."""
     misfit = windows.misfit
     parameters = misfit.plan.parameters
     reached = reached_by(misfit, z, windows.last)
@@ -185,7 +185,7 @@ def _parameter_values(
 
 
 def _bounds_met(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray, uncertainty: Uncertainty) -> np.ndarray:
-    """Of each parameter (parameter,): -1 at its lower bound, 1 at its upper one, else 0.
+    """Return for each parameter (parameter,) -1 at its lower bound, 1 at its upper one, else 0.
 
     It is at a bound, or the data want it beyond: the next step of the fit without bounds ends there.
     """
@@ -208,7 +208,7 @@ def _bounds_met(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray, un
 
 
 def _window_values(windows: GrowingWindows, record: Record) -> dict[str, Any]:
-    """The windows of the best start."""
+    """Return the windows of the best start."""
     rows = record["windows"]
     return {
         "window": np.arange(1, len(rows) + 1),
@@ -220,7 +220,7 @@ def _window_values(windows: GrowingWindows, record: Record) -> dict[str, Any]:
 
 
 def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors: np.ndarray) -> dict[str, Any]:
-    """All starts with what they found, in valleys; ``errors`` (parameter,) are standard errors of coordinates."""
+    """Return all starts with what they found, in valleys; ``errors`` (parameter,) are coordinates' standard errors."""
     misfit = windows.misfit
     starts = misfit.plan.options.starts
     shape = (starts, len(errors))
@@ -247,7 +247,7 @@ def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors
 
 
 def _valley(z: np.ndarray, bottoms: list[np.ndarray], distance: np.ndarray) -> int:
-    """The index of the valley whose bottom lies within a ``distance`` (parameter,) of ``z``; a new one is added."""
+    """Return index of the valley whose bottom lies within a ``distance`` (parameter,) of ``z``; a new one is added."""
     for index, bottom in enumerate(bottoms):
         if np.all(abs(z - bottom) <= distance):
             return index
@@ -256,7 +256,7 @@ def _valley(z: np.ndarray, bottoms: list[np.ndarray], distance: np.ndarray) -> i
 
 
 def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) -> dict[str, Any]:
-    """The initial states that are estimated, their errors, and what the data without the prior tell of each."""
+    """Return the initial states that are estimated, their errors, and what the data without the prior tell of each."""
     misfit = windows.misfit
     dofs = misfit.plan.base.lattice.unit_cell().dofs
     data_rows = len(jacobian) - len(misfit.prior())
@@ -293,7 +293,7 @@ def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) 
 
 
 def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
-    """All channels with their residuals."""
+    """Return all channels with their residuals."""
     misfit = windows.misfit
     rows: list[dict[str, Any]] = []
     data: list[dict[str, np.ndarray]] = []
@@ -331,7 +331,7 @@ def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
 
 
 def warnings_of(data: xr.Dataset) -> list[str]:
-    """Sentences on residuals that the fit does not explain, and on values that the data do not determine."""
+    """Return sentences on residuals that the fit does not explain, and on values that the data do not determine."""
     return [
         *_warnings_of_channels(data),
         *_warnings_of_parameters(data),
@@ -341,7 +341,7 @@ def warnings_of(data: xr.Dataset) -> list[str]:
 
 
 def _warnings_of_channels(data: xr.Dataset) -> Iterator[str]:
-    """Sentences on residuals that are larger than the noise, or not white."""
+    """Yield sentences on residuals that are larger than the noise, or not white."""
     names = data["channel"].values
     misfit = data["channels/misfit"].values
     ratio = misfit / data["channels/noise"].values
@@ -365,7 +365,7 @@ def _warnings_of_channels(data: xr.Dataset) -> Iterator[str]:
 
 
 def few_samples(data: xr.Dataset, name: str) -> Iterator[str]:
-    """A sentence on a channel of that ``name`` whose misfit is that of a few samples; ``data`` are its samples."""
+    """Yield a sentence on a channel ``name`` whose misfit is that of a few samples of its ``data``."""
     residuals = data["data/model"].values - data["data/measured"].values
     order = np.argsort(-(residuals**2), kind="stable")
     shares = np.cumsum(residuals[order] ** 2) / np.sum(residuals**2)
@@ -384,7 +384,7 @@ def few_samples(data: xr.Dataset, name: str) -> Iterator[str]:
 
 
 def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
-    """Sentences on clearances that are not reached, and on parameters that are not determined."""
+    """Yield sentences on clearances that are not reached, and on parameters that are not determined."""
     at_least = data["at_least"].values
     for name, least in zip(data["parameter"].values, at_least, strict=True):
         if np.isfinite(least):
@@ -413,7 +413,7 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
 
 
 def _warnings_of_states(data: xr.Dataset) -> Iterator[str]:
-    """A sentence on each initial state of which the data determine only a part."""
+    """Yield a sentence on each initial state of which the data determine only a part."""
     for record in np.unique(data["initial/of_record"].values):
         singular = data["initial/singular"].values[data["initial/of_record"].values == record]
         determined = int(np.sum(singular >= 1 / DETERMINED))
@@ -425,7 +425,7 @@ def _warnings_of_states(data: xr.Dataset) -> Iterator[str]:
 
 
 def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:
-    """A sentence if starts end in different valleys."""
+    """Yield a sentence if starts end in different valleys."""
     valley = data["starts/valley"].values
     valleys = int(valley.max(initial=0))
     if valleys > 1:
@@ -434,7 +434,7 @@ def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:
 
 
 def summary_of(data: xr.Dataset) -> str:
-    """A table of the results, with a line for every parameter, and the warnings."""
+    """Return a table of the results, with a line for every parameter, and the warnings."""
     lines = [
         f"{data.sizes['parameter']} parameters from {data.sizes['datum']} values of {data.sizes['channel']} channels;"
         f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys"
@@ -455,7 +455,7 @@ class _ParameterRow(NamedTuple):
 
     @classmethod
     def of(cls, parameter: xr.Dataset) -> "_ParameterRow":
-        """The row of one ``parameter``."""
+        """Return the row of one ``parameter``."""
         value = f"{float(parameter['value']):.7g}"
         error = ""
         if np.isfinite(parameter["at_least"]):
@@ -472,7 +472,7 @@ class _ParameterRow(NamedTuple):
 
 
 def parameter_lines(data: xr.Dataset, confidence: float) -> list[str]:
-    """A line of headings and one of each parameter, with its interval of that ``confidence``, from 0 to 1.
+    """Return a line of headings and one of each parameter, with its interval of that ``confidence``, from 0 to 1.
 
     ``data`` has the variables of ``LAYOUT`` over (parameter,). Columns are as wide as their longest text.
     """
@@ -490,7 +490,7 @@ def parameter_lines(data: xr.Dataset, confidence: float) -> list[str]:
 
 
 def _channel_line(channel: xr.Dataset) -> str:
-    """The line of one channel: misfit, noise, whiteness."""
+    """Return the line of one channel: misfit, noise, whiteness."""
     noise = "noise given" if channel["channels/is_given"] else "noise estimated"
     misfit = f"{float(channel['channels/misfit']):.3g} {channel['channels/unit'].values}"
     white = f"whiteness p = {float(channel['channels/probability']):.2g}"

@@ -50,7 +50,7 @@ LAYOUT = {
 
 
 def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm) -> xr.Dataset | None:
-    """The ``count`` linear modes nearest to ``near`` in rad/s, on rank 0, which writes ``folder/modes.h5``.
+    """Return the ``count`` linear modes nearest to ``near`` in rad/s, on rank 0, which writes ``folder/modes.h5``.
 
     All ranks must call it. Raises CaseError if there are not so many, or SLEPc is missing.
     """
@@ -108,7 +108,7 @@ def check_modes(case: Case, count: int, near: float) -> None:
 
 
 def pressed_contacts(model: Model) -> list[float]:
-    """Stiffness in N/m of each contact of a ``model`` for small motions: the slope of its force, 0 if not pressed."""
+    """Return stiffnesses in N/m of contacts of a ``model`` for small motions: slopes, 0 if not pressed."""
     stiffness = []
     for law, stops in zip(model.law_of_sites, model.gaps, strict=True):
         pressed = -min(stops)
@@ -120,7 +120,7 @@ def pressed_contacts(model: Model) -> list[float]:
 
 
 def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
-    """Bands, cells and kinds of modes with ``frequency`` (mode) and ``shape`` (mode, cell, dof), by name."""
+    """Return bands, cells and kinds of modes with ``frequency`` (mode) and ``shape`` (mode, cell, dof), by name."""
     energy = np.sum(shape**2 * chain.masses().reshape(shape.shape[1:]), axis=2)
     end = max(int(END * chain.cells), 1)
     left = energy[:, :end].sum(axis=1)
@@ -143,7 +143,7 @@ def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str
 
 
 def first_largest(values: np.ndarray) -> np.ndarray:
-    """The place (mode) of the first of the largest ``values`` (mode, place) of each mode.
+    """Return the place (mode) of the first of the largest ``values`` (mode, place) of each mode.
 
     In a lattice that is its own mirror image two places have equal values. Which of them rounding makes the larger one
     may differ between two calls on the same ranks, because the direct solver of several ranks adds in the order in
@@ -153,7 +153,7 @@ def first_largest(values: np.ndarray) -> np.ndarray:
 
 
 def _band_of(bands: Sequence[Band], frequency: float) -> int:
-    """The number of the first of ``bands`` that ``frequency`` in rad/s lies in; 0 in a gap."""
+    """Return the number of the first of ``bands`` that ``frequency`` in rad/s lies in; 0 in a gap."""
     if not bands:
         return 0
     tolerance = EDGE * bands[-1].high
@@ -164,7 +164,7 @@ def _band_of(bands: Sequence[Band], frequency: float) -> int:
 
 
 def _place(chain: Chain, cell: int, at_ends: float) -> str:
-    """Place of a mode in a gap whose energy is largest in ``cell`` (from 0).
+    """Return the place of a mode in a gap whose energy is largest in ``cell`` (from 0).
 
     ``at_ends`` is the fraction of its energy at the ends.
     """
@@ -177,7 +177,7 @@ def _place(chain: Chain, cell: int, at_ends: float) -> str:
 
 
 def modes_report(data: xr.Dataset) -> str:
-    """The modes as a table."""
+    """Return the modes as a table."""
     lines = ["mode  frequency (rad/s)  band  cells taking part  left   right  kind"]
     for number in range(data.sizes["mode"]):
         mode = data.isel(mode=number)

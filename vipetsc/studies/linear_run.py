@@ -84,11 +84,11 @@ class LinearRun(NamedTuple):
         return wave
 
     def arrival_at(self, site: int) -> float | None:
-        """The paper's t_hat in s, when the peak is at the first ``site`` (cell); None for no site."""
+        """Return the paper's t_hat in s, when the peak is at the first ``site`` (cell); None for no site."""
         return float(self.arrival[site - 1]) if site else None
 
     def reached(self, case: Case) -> np.ndarray:
-        """Linear relative displacement over the lesser clearance (site) at the amplitude of ``case``.
+        """Return linear relative displacement over the lesser clearance (site) at the amplitude of ``case``.
 
         It is inf where contacts join other masses than the cell's pair, to which the envelope does not apply.
         """
@@ -101,7 +101,7 @@ class LinearRun(NamedTuple):
         return self._replace(measures=other.measures | self.measures)
 
     def record(self, name: str) -> Record:
-        """The run as a record of the linear run ``name``."""
+        """Return the run as a record of the linear run ``name``."""
         return {
             "linear": name,
             "envelope": self.envelope.tolist(),
@@ -112,7 +112,7 @@ class LinearRun(NamedTuple):
 
     @classmethod
     def from_record(cls, record: Record) -> Self:
-        """The run that a ``record`` holds."""
+        """Return the run that a ``record`` holds."""
         return cls(
             envelope=np.array(record["envelope"], float),
             arrival=np.array(record["arrival"], float),
@@ -135,7 +135,7 @@ def simulate_linear(case: Case, comm: MPI.Comm, stop: StopRequest) -> tuple[xr.D
 
 
 def linear_arrival(case: Case, comm: MPI.Comm, stop: StopRequest) -> float | None:
-    """The time in s at which the linear wave of ``case`` arrives at its first site; None without sites.
+    """Return the time in s at which the linear wave of ``case`` arrives at its first site; None without sites.
 
     All ranks of ``comm`` must call it: they simulate the linear run together.
     """
@@ -144,7 +144,7 @@ def linear_arrival(case: Case, comm: MPI.Comm, stop: StopRequest) -> float | Non
 
 
 def envelope_squares(run: xr.Dataset, stops: Sequence[int]) -> np.ndarray:
-    """Largest w^2 + (w'/Om)^2 in m^2 of each cell's contact pair in blocks of a linear ``run`` with both fields.
+    """Return largest w^2 + (w'/Om)^2 in m^2 of each cell's contact pair in blocks of a linear ``run`` with both fields.
 
     The first block begins at the first sample, and each (block, cell) ends before one of the ``stops``.
     """
@@ -166,7 +166,7 @@ def envelope_squares(run: xr.Dataset, stops: Sequence[int]) -> np.ndarray:
 
 
 def reached(envelope: np.ndarray, case: Case) -> np.ndarray:
-    """Linear relative displacement over the lesser clearance (..., site) of ``case``, from an ``envelope`` (..., cell).
+    """Return linear relative displacements over lesser clearances (..., site), by ``envelope`` (..., cell).
 
     The envelope in m is that of the linear run. It does not apply, and the result is inf, where contacts join other
     masses than the cell's pair, and at sites that touch their stop at rest.
@@ -183,7 +183,7 @@ def reached(envelope: np.ndarray, case: Case) -> np.ndarray:
 
 
 def measured(analysis: xr.Dataset) -> Record:
-    """Values that the ensemble takes from an ``analysis``: measures of the registry and their attributes.
+    """Return values that the ensemble takes from an ``analysis``: measures of the registry and their attributes.
 
     ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``,
     ``unsettled``: sentences about steady amplitudes that are none.
@@ -217,25 +217,25 @@ def measured(analysis: xr.Dataset) -> Record:
 
 
 def of_motion(names: Iterable[str]) -> list[str]:
-    """The ``names`` that are measures of the group "motion", perhaps of points."""
+    """Return the ``names`` that are measures of the group "motion", perhaps of points."""
     return [name for name in names if is_measure(name) and group_of(name) == "motion"]
 
 
 def other_pairs(case: Case) -> tuple[Pair, ...]:
-    """The masses that contacts join, if not everywhere those of the cell's pair."""
+    """Return the masses that contacts join, if not everywhere those of the cell's pair."""
     sites = case.contacts.sites if isinstance(case.contacts.sites, list) else []
     return pairs_of_sites(case.contacts, case.lattice.unit_cell(), len(sites))
 
 
 def is_proportional(case: Case) -> bool:
-    """Whether the motion is proportional to the amplitude of a single drive until the first contact."""
+    """Return whether the motion is proportional to the amplitude of a single drive until the first contact."""
     if case.initial or case.drive.more or other_pairs(case):
         return False
     return case.model().chain.is_linear
 
 
 def signed_factor(case: Case) -> float:
-    """Ratio of the motion of ``case`` before its first contact to that of its linear run."""
+    """Return the ratio of the motion of ``case`` before its first contact to that of its linear run."""
     # Otherwise the linear run has the case's own amplitude: an initial motion or a second drive is not scaled by it.
     if not is_proportional(case):
         return 1.0
@@ -243,12 +243,12 @@ def signed_factor(case: Case) -> float:
 
 
 def factor(case: Case) -> float:
-    """Ratio of the wave of ``case`` to that of its linear run."""
+    """Return the ratio of the wave of ``case`` to that of its linear run."""
     return abs(signed_factor(case))
 
 
 def linear_case(case: Case) -> Case:
-    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone have it in common.
+    """Return the lattice of ``case`` without contacts under 1 N; cases that differ in those alone have it in common.
 
     Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
     pair may be all that joins the cells: they stay.
@@ -257,7 +257,7 @@ def linear_case(case: Case) -> Case:
 
 
 def linear_name(case: Case) -> str:
-    """The name of the linear run of ``case``: a hash of its resolved case."""
+    """Return the name of the linear run of ``case``: a hash of its resolved case."""
     return _name_of(json.dumps(_linear_table(case), sort_keys=True))
 
 
@@ -265,12 +265,12 @@ def linear_name(case: Case) -> str:
 # runs.
 @lru_cache(maxsize=64)
 def _name_of(table: str) -> str:
-    """The name of the linear run with this ``table`` in JSON."""
+    """Return the name of the linear run with this ``table`` in JSON."""
     return case_id(Case.from_table(json.loads(table)))
 
 
 def _linear_table(case: Case) -> dict[str, Any]:
-    """The table of ``linear_case``."""
+    """Return the table of ``linear_case``."""
     amplitude = REFERENCE if is_proportional(case) else case.drive.amplitude
     output = case.output.of_points()
     drive = {"amplitude": amplitude}
@@ -283,20 +283,20 @@ def _linear_table(case: Case) -> dict[str, Any]:
 
 
 def first_site_cell(case: Case) -> int:
-    """Cell (1-based) of the site nearest to the drive; 0 without sites."""
+    """Return the cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
     first = Topology(case.lattice.cells, case.lattice.ends).nearest_index(cells, case.drive.cell)
     return 0 if first is None else int(cells[first])
 
 
 def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
-    """The ``linear`` run as a member whose ``site`` (cell; 0 for none) has no contact."""
+    """Return the ``linear`` run as a member whose ``site`` (cell; 0 for none) has no contact."""
     cells = [site] if site else []
     return linear.drop_dims("site").assign({"sites/cell": ("site", np.array(cells, np.int64))})
 
 
 def read_linear(sweep: Path, case: Case) -> LinearRun | None:
-    """The linear run of ``case`` in the folder of a ``sweep``; None if there is no record of one."""
+    """Return the linear run of ``case`` in the folder of a ``sweep``; None if there is no record of one."""
     run = None
     name = linear_name(case)
     for _, record, _ in RecordPaths(sweep, MEMBERS).read():

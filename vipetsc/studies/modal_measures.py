@@ -38,7 +38,7 @@ MODAL = {
 
 
 def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """The variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
+    """Return variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
     time = record.time
     parts = _modal_parts(run, record)
     if parts is None:
@@ -71,7 +71,7 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
 
 
 def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
-    """The modes by part of the frequency axis; None, and why in the ``record``, where they cannot be measured."""
+    """Return modes by part of the frequency axis; None, and why in the ``record``, where they cannot be measured."""
     chain = record.model.chain
     reason = ""
 
@@ -93,7 +93,7 @@ def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
 
 
 def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict[str, Any]:
-    """Energies at every ``modal_stride``-th sample and at the bounds of clusters, and the transfers of these."""
+    """Return energies at every ``modal_stride``-th sample and at the bounds of clusters, and the transfers of these."""
     time = record.time
     displacement = record.field(run["displacement"])
     clusters = _clusters(run, time)
@@ -145,7 +145,7 @@ class Clusters(NamedTuple):
 
 
 def _clusters(run: xr.Dataset, time: np.ndarray) -> Clusters:
-    """The clusters of contacts of a ``run`` by so large a stride that at most ``MOST_BRACKETS`` samples bound them."""
+    """Return the clusters of contacts of a ``run``, strided so that at most ``MOST_BRACKETS`` samples bound them."""
     onset = run["impacts/onset"].values
     separation = run["impacts/separation"].values
     stride = 1

@@ -61,7 +61,7 @@ class ObjectiveRuns:
         self.recorded = RecordedRuns("optimum-runs", folder, comm, stop, ranks=plan.options.ranks).read()
 
     def runs(self, design: Case) -> dict[Condition, Case]:
-        """The runs of a ``design`` by amplitude and number of the disorder's sample, and its frequency responses.
+        """Return runs of a ``design`` by amplitude and number of the disorder's sample, and its frequency responses.
 
         Raises CaseError.
         """
@@ -85,19 +85,19 @@ class ObjectiveRuns:
         self.recorded.make(cases, lambda name: self._record(cases[name]), allow_failures=True)
 
     def _record(self, case: Case) -> Record:
-        """The record of measured values of a run, or of frequency responses, which its whole team computes."""
+        """Return the record of measured values of a run, or of frequency responses, which its whole team computes."""
         if isinstance(case, NfrcCase):
             return measured_responses(case, self._tables(case), self.recorded.team, self.recorded.stop)
         data, result = self.recorded.run_in_memory(case)
         return {"values": on_root(self.recorded.team, lambda: measured(data, result.statistics, self._tables(case)))}
 
     def _tables(self, case: Case) -> list[MeasuredTable]:
-        """The objectives and constraints that are measured of a run, or of the frequency responses, of a ``case``."""
+        """Return the objectives and constraints that are measured of a run or frequency responses of a ``case``."""
         is_of_responses = isinstance(case, NfrcCase)
         return [table for table in self.plan.options.measured if table.is_of_responses == is_of_responses]
 
     def judge(self, design: Case) -> Judgement:
-        """The judgement of a ``design`` whose runs are recorded."""
+        """Return the judgement of a ``design`` whose runs are recorded."""
         options = self.plan.options
         constraints = options.constraint or []
         records: dict[Condition, Record] = {}
@@ -136,7 +136,7 @@ class ObjectiveRuns:
         return Judgement(losses, bounded, excess)
 
     def _failure(self, run: Case) -> str:
-        """The reason why a ``run`` that has a record cannot be used; empty if it can."""
+        """Return the reason why a ``run`` that has a record cannot be used; empty if it can."""
         record = self.recorded.records[case_id(run)]
         if "reason" in record:
             return str(record["reason"])
@@ -147,23 +147,23 @@ class ObjectiveRuns:
         return ""
 
     def values(self, run: Case) -> dict[str, Any]:
-        """Values measured of a ``run`` that has a record; none of one that failed."""
+        """Return values measured of a ``run`` that has a record; none of one that failed."""
         return dict(self.recorded.records[case_id(run)].get("values", {}))
 
     def curves(self, responses: NfrcCase) -> list[dict[str, Any]]:
-        """The curves of frequency ``responses`` that have a record, as ``measured_responses`` returns them."""
+        """Return the curves of frequency ``responses`` that have a record, as ``measured_responses`` returns them."""
         return list(self.recorded.records[case_id(responses)].get("curves", []))
 
 
 def _conditions(table: MeasuredTable, design: Case) -> list[float | None]:
-    """The amplitudes at which a ``design`` is measured for an objective or a constraint; None for responses."""
+    """Return the amplitudes at which a ``design`` is measured for an objective or a constraint; None for responses."""
     if table.is_of_responses:
         return [None]
     return [*table.amplitudes] or [amplitude_of(design)]
 
 
 def _means(table: MeasuredTable, design: Case, records: Mapping[Condition, Record]) -> list[float]:
-    """The mean over samples of a measure, at each amplitude or of each curve; ``records`` by condition and sample."""
+    """Return the mean over samples of a measure, at each amplitude or curve; ``records`` by condition and sample."""
     means: list[float] = []
     for condition in _conditions(table, design):
         samples = [row["values"][table.name] for (at, _), row in records.items() if at == condition]
@@ -172,7 +172,7 @@ def _means(table: MeasuredTable, design: Case, records: Mapping[Condition, Recor
 
 
 def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
-    """Values of a ``run`` that objectives and constraints, the ``tables``, need, by their names; and some of all runs.
+    """Return values of a ``run`` that objectives and constraints, the ``tables``, need, by name, and some of all runs.
 
     The values of all runs are fractions of the energy that the lattice received, the drive's work and the energy of the
     motion at t = 0: ``bands`` (pass band), ``upper_share_at_end`` (bands above the driven one) and ``transmitted``
@@ -200,7 +200,7 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
 def _of_bands(
     model: Model, u: np.ndarray, v: np.ndarray, work: float, tables: Sequence[MeasuredTable]
 ) -> dict[str, Any]:
-    """Energies of the bands over the ``work`` in J in the state ``u``, ``v`` (1, cell, dof) in m and m/s.
+    """Return energies of the bands over the ``work`` in J in the state ``u``, ``v`` (1, cell, dof) in m and m/s.
 
     ``bands`` (pass band), ``upper_share_at_end``, and those parts of a band that ``tables`` ask for, by their names;
     NaN where contacts alone join the cells, so that there are no bands.
@@ -235,7 +235,7 @@ def _of_bands(
 
 
 def _analysed(run: xr.Dataset, tables: Sequence[MeasuredTable]) -> dict[str, Any]:
-    """Values of those ``tables`` that ask for a measure of the registry, by their names, and ``warnings``."""
+    """Return values of those ``tables`` that ask for a measure of the registry, by their names, and ``warnings``."""
     if not tables:
         return {}
     names = {table.name: RENAMED.get(table.measure, table.measure) for table in tables}
@@ -258,7 +258,7 @@ def _analysed(run: xr.Dataset, tables: Sequence[MeasuredTable]) -> dict[str, Any
 
 
 def _part_of(parts: Sequence[str], band: int) -> int:
-    """The number (from 0) of that of the ``parts``, named as ``spectra.Parts`` does, that holds a ``band``."""
+    """Return the number (from 0) of that of the ``parts``, named as ``spectra.Parts`` does, that holds a ``band``."""
     for number, name in enumerate(parts):
         if name.startswith("band ") and str(band) in name.removeprefix("band ").split("+"):
             return number
@@ -266,7 +266,7 @@ def _part_of(parts: Sequence[str], band: int) -> int:
 
 
 def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:
-    """Energy in J of the cells beyond the site that is farthest from the drive.
+    """Return the energy in J of the cells beyond the site that is farthest from the drive.
 
     Springs between these cells count in full; the spring k at the boundary counts as k u_b (u_b - u_a)/2, u_b beyond
     it. NaN without a site, and on a ring, where both sides of a site are on the way to it.

@@ -115,11 +115,11 @@ class ScatteringRuns:
         self.recorded.make(points, work, what="runs of the law", progress=progress)
 
     def amplitude(self, z: float) -> float:
-        """Amplitude of the drive in N, for a largest linear relative displacement of ``z`` clearances."""
+        """Return the amplitude of the drive in N, for a largest linear relative displacement of ``z`` clearances."""
         return self.ring.amplitude(z, self.peak)
 
     def _linear(self) -> Record:
-        """The run without a site: the wave at the site over time, and its energies at the end."""
+        """Return the run without a site: the wave at the site over time, and its energies at the end."""
         setting = self.setting
         run = self.ring.run_to_end(1.0, with_site=False)
         energy, speed = wave_energies(self.cell, *_last_state(run))
@@ -135,7 +135,7 @@ class ScatteringRuns:
         }
 
     def _linear_at_site(self) -> Record:
-        """The run without a site in a lattice with dashpots: the wave at the site, and the energies that pass there."""
+        """Return the run without a site in a lattice with dashpots: the wave there, and the energies that pass."""
         waves = self.site_waves
         motion = self.ring.motion(self.ring.run_at_site(1.0, with_site=False))
         return self._arrival(motion) | {
@@ -146,7 +146,7 @@ class ScatteringRuns:
         }
 
     def _arrival(self, motion: PairMotion) -> Record:
-        """The wave at the site, from the ``motion`` under 1 N without the site."""
+        """Return the wave at the site, from the ``motion`` under 1 N without the site."""
         w = motion.displacement[:, 0]
         rate = motion.velocity[:, 0]
         of_wall = {"wall_peak": self.ring.wall_peak()} if self.case.drive.end else {}
@@ -157,7 +157,7 @@ class ScatteringRuns:
         }
 
     def _scattered(self, z: Any) -> Record:
-        """A run with the site; energies over the amplitude's square."""
+        """Return a run with the site; energies over the amplitude's square."""
         setting = self.setting
         amplitude = self.amplitude(z)
         square = amplitude**2
@@ -172,7 +172,7 @@ class ScatteringRuns:
         } | self._contact(run, amplitude)
 
     def _scattered_at_site(self, z: Any) -> Record:
-        """A run with the site in a lattice with dashpots; energies over the amplitude's square."""
+        """Return a run with the site in a lattice with dashpots; energies over the amplitude's square."""
         amplitude = self.amplitude(z)
         square = amplitude**2
         run = self.ring.run_at_site(amplitude, with_site=True, neighbours=NEAR)
@@ -193,7 +193,7 @@ class ScatteringRuns:
         } | contact
 
     def _contact(self, run: xr.Dataset, amplitude: float) -> Record:
-        """Times, forces and losses of the contact in a ``run`` under ``amplitude`` in N; energies over its square."""
+        """Return times, forces and losses of the contact in a ``run`` under ``amplitude`` in N, and energies."""
         square = amplitude**2
         span = ContactSpan.of(run)
         linear = self.records[LINEAR]
@@ -208,7 +208,7 @@ class ScatteringRuns:
         }
 
     def jittered(self, z: float) -> list[float]:
-        """The runs that represent the point ``z``; none for z = 1, where nothing is touched."""
+        """Return the runs that represent the point ``z``; none for z = 1, where nothing is touched."""
         if z <= 1:
             return []
         options = self.case.law
@@ -220,7 +220,7 @@ class ScatteringRuns:
         return [*dict.fromkeys((z * (1 + width * spread)).tolist())]
 
     def outcomes(self, z: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Mean and deviation over the runs at the point ``z``: by name, "share" (band, direction), others numbers."""
+        """Return mean and deviation over the runs at ``z``: by name, "share" (band, direction), others numbers."""
         untouched = {"energy": self.reference}
         records = [self.records[run] for run in self.jittered(z)] or [untouched]
         rows = [self._outcome(record) for record in records]
@@ -234,7 +234,7 @@ class ScatteringRuns:
         return mean, deviation
 
     def _outcome(self, record: Record) -> dict[str, Any]:
-        """Fractions and times of one run by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
+        """Return fractions and times of one run by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
         fraction = (np.array(record["energy"]) - self.reference) / self.arrived
         # The reference holds the whole transmitted wave: where nothing is touched the difference is 0, and T is 1.
@@ -255,7 +255,7 @@ class ScatteringRuns:
         }
 
     def dataset(self, errors: dict[float, float]) -> xr.Dataset:
-        """The content of ``law.h5`` at the points that have interpolation ``errors``."""
+        """Return the content of ``law.h5`` at the points that have interpolation ``errors``."""
         linear = self.records[LINEAR]
         points = sorted(errors)
         outcomes = [self.outcomes(z) for z in points]
@@ -289,7 +289,7 @@ class ScatteringRuns:
         return data.assign(tabulated(LAYOUT, {"efficiency": efficiency}))
 
     def _about(self) -> dict[str, Any]:
-        """The attributes of ``law.h5`` that describe the runs without a site."""
+        """Return the attributes of ``law.h5`` that describe the runs without a site."""
         setting = self.setting
         linear = self.records[LINEAR]
         time = np.array(linear["time"])
@@ -341,7 +341,7 @@ def refine(runs: ScatteringRuns, progress: bool = False) -> dict[float, float]:
 
 
 def _distance_from_line(runs: ScatteringRuns, z: float, low: float, high: float) -> tuple[float, bool]:
-    """Largest distance at ``z`` from the line between ``low`` and ``high``; whether more points are needed there."""
+    """Return largest distance at ``z`` from the line between ``low`` and ``high``, and whether points are needed."""
     tolerance = runs.case.law.tolerance
     mean, deviation = runs.outcomes(z)
     left, _ = runs.outcomes(low)
@@ -361,11 +361,11 @@ def _distance_from_line(runs: ScatteringRuns, z: float, low: float, high: float)
 
 
 def _deviation(x: np.ndarray, weight: np.ndarray) -> float:
-    """Standard deviation of ``x`` under ``weight``."""
+    """Return standard deviation of ``x`` under ``weight``."""
     mean = np.average(x, weights=weight)
     return float(np.sqrt(np.average((x - mean) ** 2, weights=weight)))
 
 
 def _last_state(run: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement and velocity (cell, dof) at the last sample."""
+    """Return the displacement and velocity (cell, dof) at the last sample."""
     return run["displacement"].values[-1], run["velocity"].values[-1]

@@ -84,7 +84,7 @@ COUNTED = {"runs": "runs", "responses": "frequency responses"}
 
 
 def curves_of(search: OptimumSearch) -> dict[str, list[Case]]:
-    """The runs of the compared designs over the amplitude."""
+    """Return the runs of the compared designs over the amplitude."""
     options = search.plan.options
     case_amplitude = search.plan.amplitude
     amplitudes = options.curve
@@ -110,7 +110,7 @@ def curves_of(search: OptimumSearch) -> dict[str, list[Case]]:
 
 
 def optimum_of(search: OptimumSearch, folder: Path) -> xr.Dataset:
-    """The content of ``optimum.h5`` of a search that has ended; writes its best cases to ``folder``."""
+    """Return the content of ``optimum.h5`` of a search that has ended; writes its best cases to ``folder``."""
     plan = search.plan
     cases: dict[str, Case] = {}
     for name, number in search.compared().items():
@@ -135,7 +135,7 @@ def optimum_of(search: OptimumSearch, folder: Path) -> xr.Dataset:
 
 
 def _counts(search: OptimumSearch) -> dict[str, int]:
-    """The numbers of runs and of cases whose frequency responses were followed, for all designs."""
+    """Return the numbers of runs and of cases whose frequency responses were followed, for all designs."""
     options = search.plan.options
     kinds = {case_id(run): isinstance(run, NfrcCase) for design in search.designs for run in design.runs}
     counts = {}
@@ -147,7 +147,7 @@ def _counts(search: OptimumSearch) -> dict[str, int]:
 
 
 def _design_values(search: OptimumSearch) -> dict[str, Any]:
-    """Variables, and all designs with their results, by name in ``LAYOUT``."""
+    """Return variables, and all designs with their results, by name in ``LAYOUT``."""
     designs = search.designs
     variables = search.plan.variables()
     objectives = search.plan.options.objective
@@ -187,14 +187,14 @@ def _design_values(search: OptimumSearch) -> dict[str, Any]:
 
 
 def _mean_of(name: str, rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Mean of what is called ``name`` over the runs of a design; NaN if one failed, or there are none."""
+    """Return the mean of what is called ``name`` over the runs of a design; NaN if one failed, or there are none."""
     if not rows:
         return np.nan
     return np.mean([row.get(name, np.nan) for row in rows])
 
 
 def _comparison_values(search: OptimumSearch, cases: Sequence[Case]) -> dict[str, Any]:
-    """Sites and clearances of the compared designs, whose ``cases`` are given, by name in ``LAYOUT``."""
+    """Return sites and clearances of the compared designs, whose ``cases`` are given, by name in ``LAYOUT``."""
     compared = search.compared()
     chains = [case.model().chain for case in cases]
     return {
@@ -207,7 +207,7 @@ def _comparison_values(search: OptimumSearch, cases: Sequence[Case]) -> dict[str
 
 
 def _curve_values(search: OptimumSearch) -> dict[str, Any]:
-    """Values of the compared designs over the amplitude, by name in ``LAYOUT``."""
+    """Return values of the compared designs over the amplitude, by name in ``LAYOUT``."""
     curves = curves_of(search)
     measured = [[search.objective.values(run) for run in runs] for runs in curves.values()]
     bands = len(search.plan.base.lattice.unit_cell().masses)
@@ -224,7 +224,7 @@ def _curve_values(search: OptimumSearch) -> dict[str, Any]:
 
 
 def _response_values(search: OptimumSearch, cases: Mapping[str, Case]) -> dict[str, Any]:
-    """Frequency responses of the compared designs, without scatter or with the first sample, by name in ``LAYOUT``."""
+    """Return frequency responses of the compared designs, without scatter or of the first sample, by ``LAYOUT``."""
     objectives = search.plan.options.objective
     values: dict[str, Any] = {name: [] for name in LAYOUT if name.startswith("response/")}
     for compared, case in cases.items():
@@ -246,7 +246,7 @@ def _response_values(search: OptimumSearch, cases: Mapping[str, Case]) -> dict[s
 
 
 def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
-    """A table of the results, with a line for every compared design."""
+    """Return a table of the results, with a line for every compared design."""
     unit = plan.amplitude_unit
     reasons = [reason for reason in data["reason"].values if reason]
     counts = [f"{data.attrs[name]} {text}" for name, text in COUNTED.items() if name in data.attrs]

@@ -80,7 +80,7 @@ def _make(plan: OptimiseCase, work: StudyWork) -> Callable[[], xr.Dataset]:
 
 
 def read_optimum(folder: str | Path) -> xr.Dataset:
-    """The content of ``optimum.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    """Return the content of ``optimum.h5`` in ``folder``; raises OSError or ValueError if it is none."""
     with open_netcdf(Path(folder) / "optimum.h5", "search for an optimum", ("value", "summary")) as data:
         return data.load()
 
@@ -89,7 +89,7 @@ STUDY = Study(OPTIMUM, "optimum.h5", make=_make, read=read_optimum)
 
 
 def _start(plan: OptimiseCase, work: StudyWork) -> np.ndarray:
-    """The values (variable) at which the search begins; all ranks must call it. Raises StoppedError."""
+    """Return the values (variable) at which the search begins; all ranks must call it. Raises StoppedError."""
     if plan.options.start == "case":
         return plan.begin()
 
@@ -112,7 +112,7 @@ def _start(plan: OptimiseCase, work: StudyWork) -> np.ndarray:
 
 
 def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
-    """The sampler of ``plan`` from the values ``start`` (variable) on."""
+    """Return the sampler of ``plan`` from the values ``start`` (variable) on."""
     options = plan.options
     point = plan.space.to_unit(start)
     if len(options.objective) == 2:

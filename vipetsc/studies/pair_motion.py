@@ -23,7 +23,7 @@ class PairMotion(NamedTuple):
 
     @classmethod
     def between(cls, run: xr.Dataset, columns: Sequence[int], pairs: Sequence[Pair]) -> Self:
-        """The motion of ``pairs``, each with its host in one of the ``columns`` of the recorded cells of a ``run``.
+        """Return motion of ``pairs``, each with its host in one of the ``columns`` of the recorded cells of a ``run``.
 
         A pair that joins cells has its resonator in the next column, behind the last one in the first.
         """
@@ -35,7 +35,7 @@ class PairMotion(NamedTuple):
         return cls(time=run["time"].values, displacement=relative("displacement"), velocity=relative("velocity"))
 
     def reached(self, gaps: Sequence[tuple[float, float]]) -> list[float]:
-        """Largest w (pair) on either side, at or between the samples, over the clearance there.
+        """Return the largest w (pair) on either side, at or between the samples, over the clearance there.
 
         ``gaps`` (pair) are the clearances on the sides + and -, in any unit.
         """
@@ -46,7 +46,7 @@ class PairMotion(NamedTuple):
 def largest_between(
     times: np.ndarray, w: np.ndarray, rate: np.ndarray, gaps: tuple[float, float] = (1.0, 1.0)
 ) -> float:
-    """Largest of w and -w at or between samples at ``times``, over the ``gaps`` of both sides; at least 0.
+    """Return the largest of w and -w at or between samples at ``times``, over the ``gaps`` of both sides; at least 0.
 
     It is that of the cubic through ``w`` (time,) in m with slopes ``rate`` (time,) in m/s.
     """
@@ -72,7 +72,7 @@ class ContactSpan(NamedTuple):
 
     @classmethod
     def of(cls, run: xr.Dataset) -> Self:
-        """The span of all contacts in the log of a ``run``."""
+        """Return the span of all contacts in the log of a ``run``."""
         onset = run["impacts/onset"].values
         if not len(onset):
             return cls(first=np.nan, last=np.nan)

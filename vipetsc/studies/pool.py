@@ -183,7 +183,7 @@ class TaskPool:
         return end
 
     def _judge(self, error: Exception) -> JobEnd:
-        """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
+        """Return whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
         is_failure = isinstance(error, self.failures) and not isinstance(error, PROGRAMMING)
         if isinstance(error, PartError) and not (isinstance(error, PartFailure) and is_failure):
             return JobEnd(JobEnding.PART, str(error))
@@ -196,7 +196,7 @@ class TaskPool:
 
 
 def reason_of(error: Exception) -> str:
-    """Why a job failed, in words: the message of its ``error``, after the type where another program worded it."""
+    """Return why a job failed, in words: its ``error``'s message, after the type where another program worded it."""
     # RuntimeErrors of this program are sentences; of others the type says what they are about.
     if isinstance(error, RuntimeError):
         return str(error)

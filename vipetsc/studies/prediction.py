@@ -81,7 +81,7 @@ def _make(case: PredictCase, work: StudyWork) -> Callable[[], xr.Dataset]:
 
 
 def read_prediction(folder: str | Path) -> xr.Dataset:
-    """The content of ``prediction.h5`` in ``folder``; raises OSError or ValueError if it is none."""
+    """Return the content of ``prediction.h5`` in ``folder``; raises OSError or ValueError if it is none."""
     with open_netcdf(Path(folder) / "prediction.h5", "prediction", ("predicted", "onset_amplitude")) as data:
         return data.load()
 
@@ -90,7 +90,7 @@ STUDY = Study(PREDICTION, "prediction.h5", make=_make, read=read_prediction)
 
 
 def composed(case: PredictCase, records: Records) -> xr.Dataset:
-    """The content of ``prediction.h5``, without its provenance."""
+    """Return the content of ``prediction.h5``, without its provenance."""
     begin = time.process_time()
     model = case.model()
     cell = model.chain.cell
@@ -130,7 +130,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
 
 
 def prediction_warnings(values: dict[str, np.ndarray]) -> list[str]:
-    """Sentences on predictions that have not converged; ``values`` (amplitude,) by name in ``LAYOUT``."""
+    """Return sentences on predictions that have not converged; ``values`` (amplitude,) by name in ``LAYOUT``."""
     warnings = []
     change = values["predicted/change"]
     moving = change > CLOSE
@@ -157,7 +157,7 @@ def prediction_warnings(values: dict[str, np.ndarray]) -> list[str]:
 def _predicted(
     network: Network, sites: SiteResponses, amplitudes: np.ndarray, linear: Record, driven: int
 ) -> dict[str, np.ndarray]:
-    """Predicted values at every amplitude, by their names in ``LAYOUT``; ``driven`` is the drive's band from 0."""
+    """Return predicted values at every amplitude, named as in ``LAYOUT``; ``driven`` is the drive's band from 0."""
     onset = onset_of(linear)
     untouched = np.array(linear["bands"]) / linear["work"]
     losses = network.losses
@@ -208,7 +208,7 @@ def _predicted(
 
 
 def _simulated(members: Sequence[Record], driven: int, chain: Chain) -> dict[str, np.ndarray]:
-    """Simulated values at every amplitude of a ``chain``, by their names in ``LAYOUT``."""
+    """Return simulated values at every amplitude of a ``chain``, by their names in ``LAYOUT``."""
     work = np.array([member["work"] for member in members])
     bands = np.array([member["bands"] for member in members]) / work[:, None]
     measured = {
@@ -225,12 +225,12 @@ def _simulated(members: Sequence[Record], driven: int, chain: Chain) -> dict[str
 
 
 def _sums(bands: np.ndarray, driven: int) -> dict[str, np.ndarray]:
-    """Energy (amplitude) of the bands above the ``driven`` one, and of all others but it."""
+    """Return the energy (amplitude) of the bands above the ``driven`` one, and of all others but it."""
     return {"upper": bands[:, driven + 1 :].sum(axis=1), "other": np.delete(bands, driven, axis=1).sum(axis=1)}
 
 
 def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
-    """Errors of a prediction by its simulations, with ``values`` (amplitude,) by name in ``LAYOUT``.
+    """Return errors of a prediction by its simulations, with ``values`` (amplitude,) by name in ``LAYOUT``.
 
     ``rms_`` and ``worst_`` of ``upper`` and ``other`` are in decades of the energies of these bands, over the
     amplitudes with contacts. ``worst_dissipated`` and ``worst_dashpots`` are differences of fractions of the work, over

@@ -73,7 +73,7 @@ class Records(NamedTuple):
 
 
 def onset_of(linear: Record) -> float:
-    """The amplitude in N whose linear wave just touches a site, from the ``linear`` run's record.
+    """Return the amplitude in N whose linear wave just touches a site, from the ``linear`` run's record.
 
     Raises StudyError if that run moves no site.
     """
@@ -84,7 +84,7 @@ def onset_of(linear: Record) -> float:
 
 
 def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
-    """The amplitudes (amplitude,) in N, in rising order."""
+    """Return the amplitudes (amplitude,) in N, in rising order."""
     if case.predict.amplitudes:
         return np.unique(case.predict.amplitudes)
     onset = onset_of(linear)
@@ -92,7 +92,7 @@ def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
 
 
 def site_points(case: PredictCase, largest: float) -> list[float]:
-    """The z of the runs of one site, up to the largest that is needed; ``largest`` is ``BEYOND`` times that one."""
+    """Return z of the runs of one site, up to the largest that is needed; ``largest`` is ``BEYOND`` times that one."""
     # Above the onset the response changes with the logarithm of z.
     high = np.geomspace(HIGH, largest / BEYOND, case.predict.points - len(NEAR_ONSET))
     return [1 + z for z in NEAR_ONSET] + np.unique(high).tolist()
@@ -110,7 +110,7 @@ class PredictionRuns:
         self.progress = progress
 
     def make_all(self) -> Records:
-        """The records of all runs; the missing ones are simulated now. Collective; raises RuntimeError if one fails."""
+        """Return the records of all runs; simulate the missing ones. Collective; raises RuntimeError if one fails."""
         # The linear run comes first: it says which z the amplitudes reach, and so which runs of one site are needed.
         linear = self.make([Job(LINEAR, 1.0)])[0]
         amplitudes = amplitudes_of(self.case, linear)
@@ -126,7 +126,7 @@ class PredictionRuns:
         return Records(linear, sites, members, largest)
 
     def make(self, jobs: Sequence[Job], largest: float = 0.0) -> list[Record]:
-        """The records of ``jobs``; the missing ones are simulated now. Collective; raises RuntimeError if one fails.
+        """Return records of ``jobs``; the missing ones are simulated now. Collective; raises RuntimeError if one fails.
 
         ``largest`` is the largest z of the one site's runs, whose sums are over bins up to it.
         """
@@ -145,7 +145,7 @@ class PredictionRuns:
         return [self.recorded.records[job] for job in jobs]
 
     def _linear(self, amplitude: float) -> Record:
-        """The lattice without contacts: the largest w at the sites over the clearances, work, energies."""
+        """Return the lattice without contacts: the largest w at the sites over the clearances, work, energies."""
         chain = self.model.chain
         linear = self.case.varied(without=("output",), drive={"amplitude": amplitude}, contacts=NO_SITES)
         run, statistics = self._run(linear)
@@ -154,7 +154,7 @@ class PredictionRuns:
         return {"reached": reached} | self._energies(run, statistics)
 
     def _site(self, z: float, kind: int, largest: float) -> Record:
-        """Record of one site of a ``kind`` under a burst that reaches ``z`` clearances: sums over its contact."""
+        """Return the record of one site of a ``kind`` under a burst that reaches ``z`` clearances."""
         ring = self.rings[kind]
         linear = self._linear_wave(kind)
         clearance = ring.setting.clearance
@@ -177,7 +177,7 @@ class PredictionRuns:
         return record
 
     def _linear_wave(self, kind: int) -> LinearWave:
-        """The linear wave at one site of a ``kind`` under 1 N; simulated once."""
+        """Return the linear wave at one site of a ``kind`` under 1 N; simulated once."""
         if kind not in self.linear_waves:
             ring = self.rings[kind]
             motion = ring.motion(ring.run_at_site(1.0, with_site=False))
@@ -194,7 +194,7 @@ class PredictionRuns:
         return self.linear_waves[kind]
 
     def _member(self, amplitude: float) -> Record:
-        """The case under ``amplitude``, for the comparison."""
+        """Return the case under ``amplitude``, for the comparison."""
         first_and_last = {"stride": self.model.samples - 1}
         run, statistics = self._run(
             self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=first_and_last)
@@ -204,19 +204,19 @@ class PredictionRuns:
         )
 
     def _run(self, case: Case) -> tuple[xr.Dataset, dict[str, Any]]:
-        """A run of ``case`` in memory, and its statistics."""
+        """Return a run of ``case`` in memory, and its statistics."""
         data, result = self.recorded.run_in_memory(case)
         return data, result.statistics
 
     def _energies(self, run: xr.Dataset, statistics: dict[str, Any]) -> Record:
-        """Energies in J of a ``run``: the work, the bands at the end, and what dashpots took, if there are any."""
+        """Return energies in J of a ``run``: work, bands at the end, and what dashpots took, if there are any."""
         record = {"work": statistics["work"], "bands": self._band_energies(run)}
         if self.model.chain.is_damped:
             record["dashpots"] = statistics["dissipated_by_damping"]
         return record
 
     def _band_energies(self, run: xr.Dataset) -> list[float]:
-        """Energy in J of the pass bands at the last sample; modes in gaps count to the band below."""
+        """Return the energy in J of the pass bands at the last sample; modes in gaps count to the band below."""
         modes = ModalParts.of(self.model.chain.without_dashpots()).modes
         u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
         energy = np.abs(modes.amplitudes(u, v)[0]) ** 2 / 2

@@ -61,7 +61,7 @@ class Rays:
         self.bins = np.pi * (np.arange(BINS) + 0.5) / BINS
 
     def of_bands(self, site: int, spectrum: np.ndarray) -> RayFractions:
-        """Fractions (band, time) of the energy that a ``site`` (cell, from 0) sends into the bands.
+        """Return fractions (band, time) of the energy that a ``site`` (cell, from 0) sends into the bands.
 
         ``spectrum`` (band, bin) is how the energy of a band is divided between the ``BINS`` of the wavenumber.
         """
@@ -71,16 +71,16 @@ class Rays:
         )
 
     def of_wave(self, site: int, band: int, kappa: float) -> RayFractions:
-        """Fractions (time,) of the energy that a ``site`` (cell, from 0) sends into one wave of a ``band`` (from 0)."""
+        """Return the share (time,) of the energy that a ``site`` (cell, from 0) sends into a wave of a ``band``."""
         remaining, absorbed = self._fractions(site, np.array([kappa]))
         return RayFractions(remaining=remaining[band, 0], absorbed=absorbed[band, 0])
 
     def rate(self, band: int, kappa: float) -> float:
-        """Rate in 1/s at which dashpots of the reference cell take the energy of a wave of a ``band`` (from 0)."""
+        """Return the rate in 1/s at which reference dashpots take the energy of a wave of a ``band`` (from 0)."""
         return float(-2 * damped_bloch(self.model.chain.cell, kappa).rate.real[band])
 
     def _fractions(self, site: int, kappas: np.ndarray) -> RayFractions:
-        """Fractions (band, kappa, time) of the energy that a ``site`` (cell, from 0) sends into each wave."""
+        """Return fractions (band, kappa, time) of the energy that a ``site`` (cell, from 0) sends into each wave."""
         chain = self.model.chain
         point = bloch(chain.cell, kappas)
         speed = np.abs(point.group_velocity).T
@@ -104,7 +104,7 @@ class Rays:
         return RayFractions(remaining=self._sent_at(remaining), absorbed=self._sent_at(absorbed))
 
     def _cells(self, position: np.ndarray) -> np.ndarray:
-        """The cell at each ``position`` of a ray, in cells along a straight line without end."""
+        """Return the cell at each ``position`` of a ray, in cells along a straight line without end."""
         count = self.model.chain.cells
         cells = np.rint(position).astype(int)
         if self.model.chain.ends == "periodic":
@@ -114,7 +114,7 @@ class Rays:
         return np.minimum(there_and_back, 2 * count - 1 - there_and_back)
 
     def _sent_at(self, values: np.ndarray) -> np.ndarray:
-        """The ``values`` (..., age) at the ages that energy has reached at the end of the run: (..., time)."""
+        """Return the ``values`` (..., age) at the ages that energy has reached at the end of the run: (..., time)."""
         place = self.since / self.age[1]
         # The last age has no later one to interpolate to.
         before = np.minimum(place.astype(int), STEPS - 2)
@@ -123,5 +123,5 @@ class Rays:
 
 
 def _from_first(values: np.ndarray) -> np.ndarray:
-    """The ``values`` (..., step) at the ends of steps, after a 0 for the beginning of the first one: (..., age)."""
+    """Return ``values`` (..., step) at the ends of steps, after a 0 for the beginning of the first one: (..., age)."""
     return np.concatenate([np.zeros_like(values[..., :1]), values], axis=-1)

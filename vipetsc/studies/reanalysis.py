@@ -95,7 +95,7 @@ def _reassemble(folder: Path) -> Path:
 
 
 def _measurable(path: Path) -> Iterator[MeasurableRun]:
-    """The runs in ``path`` that can be measured, all checked; raises FolderError."""
+    """Yield the runs in ``path`` that can be measured, all checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
     sweep = SWEEP.is_in(folder)
     if not sweep and not (folder / "run.h5").exists():
@@ -119,7 +119,7 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
 
 
 def _containing_folder(folder: Path) -> Path:
-    """The folder that contains ``folder``."""
+    """Return the folder that contains ``folder``."""
     # Made absolute: "." has no parent of its own. Not resolved: a member may be a link to another disk.
     return Path(os.path.abspath(folder)).parent
 
@@ -182,7 +182,7 @@ def _put_into_summary(path: Path, numbers: Mapping[str, float | list[float]]) ->
 
 
 def numbers_of(analysis: xr.Dataset) -> dict[str, float | list[float]]:
-    """The numbers in an ``analysis``, by the names that ``spectra.measures`` has for them, without histories and maps.
+    """Return the numbers in an ``analysis``, named as in ``spectra.measures``, without histories and maps.
 
     A measure of the parts of the frequency axis (bands and gaps) is a list over them.
     """

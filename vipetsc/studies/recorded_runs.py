@@ -43,15 +43,15 @@ class RecordPaths:
         return self.folder / f"{self.name}.jsonl"
 
     def for_rank(self, rank: int) -> Path:
-        """The file that ``rank`` appends to."""
+        """Return the file that ``rank`` appends to."""
         return self.folder / f"{self.name}-{rank}.jsonl"
 
     def by_rank(self) -> list[Path]:
-        """The files of ranks that are there."""
+        """Return the files of ranks that are there."""
         return sorted(self.folder.glob(f"{self.name}-*.jsonl"))
 
     def existing(self) -> list[Path]:
-        """Existing files, the merged one first; of two records of one run the later in this order counts."""
+        """Return existing files, the merged one first; of two records of one run the later in this order counts."""
         files = self.by_rank()
         # What ranks appended after the last merger is newer than all that is in the merged file.
         if self.merged.exists():
@@ -214,7 +214,7 @@ class RecordedRuns:
         return completed(simulate(case, output, self.team, stop=self.stop))
 
     def run_in_memory(self, case: Case) -> tuple[xr.Dataset, Result]:
-        """Dataset of a run of ``case`` by the team, empty on all ranks but its first, and how it ended.
+        """Return dataset of a run of ``case`` by the team, empty on all ranks but its first, and how it ended.
 
         Raises as ``simulate``.
         """
@@ -235,7 +235,7 @@ class RecordedRuns:
 
 
 def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, Result]:
-    """Dataset of a run of ``case`` by all ranks of ``team``, empty on all but the first, and how it ended.
+    """Return dataset of a run of ``case`` by all ranks of ``team``, empty on all but the first, and how it ended.
 
     Raises StoppedError if the run was stopped, RuntimeError if it failed.
     """
@@ -245,7 +245,7 @@ def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dat
 
 
 def completed(result: Result) -> Result:
-    """The ``result`` of a run that is complete; raises StoppedError if it was stopped, RuntimeError if it failed."""
+    """Return ``result`` of a run that is complete; raises StoppedError if it was stopped, RuntimeError if it failed."""
     if result.resumable:
         raise StoppedError(result.sentence)
     if not result.complete:

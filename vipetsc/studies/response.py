@@ -41,7 +41,7 @@ TOP = 1.02
 
 
 def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
-    """Compliance g (omega,) in m/N of a ``pair`` in an infinite lattice of ``cell``.
+    """Return the compliance g (omega,) in m/N of a ``pair`` in an infinite lattice of ``cell``.
 
     It is the relative displacement of the pair by opposite unit forces on its masses. ``omega`` (omega,) in rad/s lie
     below the real axis, where the waves that decay away from the pair are those that leave it.
@@ -67,7 +67,7 @@ class TravellingWave(NamedTuple):
 
 
 def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | None:
-    """The fastest wave at ``omega`` in rad/s, with the relative displacement of a ``pair``; None in a gap."""
+    """Return the fastest wave at ``omega`` in rad/s, with the relative displacement of a ``pair``; None in a gap."""
     waves = waves_at(cell, omega)
     if not waves:
         return None
@@ -89,7 +89,7 @@ def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | N
 
 
 def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
-    """Whether sites (site, time) are in contact: from z > 1 until z < ``release`` (site)."""
+    """Return whether sites (site, time) are in contact: from z > 1 until z < ``release`` (site)."""
     on = np.zeros(z.shape, bool)
     state = np.zeros(len(z), bool)
     # Instant by instant: between release and 1 the state before decides.
@@ -100,7 +100,7 @@ def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
 
 
 def unit_phase(c: np.ndarray) -> np.ndarray:
-    """c/|c| of complex numbers ``c`` (...); 0 where c is."""
+    """Return c/|c| of complex numbers ``c`` (...); 0 where c is."""
     return c / np.maximum(np.abs(c), TINY)
 
 
@@ -143,11 +143,11 @@ class Burst:
         self.c = self.envelope(self.linear, drive, FIRST_LINE * drive)
 
     def spectrum(self, w: np.ndarray) -> np.ndarray:
-        """Fourier transform (omega,) of a signal ``w`` (time,) at ``omega`` - i decay."""
+        """Return Fourier transform (omega,) of a signal ``w`` (time,) at ``omega`` - i decay."""
         return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), self.padded))
 
     def envelope(self, spectrum: np.ndarray, middle: float, half: float) -> np.ndarray:
-        """Envelope a (time,) of a signal's part Re a exp(i middle t), from its ``spectrum`` (omega,).
+        """Return the envelope a (time,) of a signal's part Re a exp(i middle t), from its ``spectrum`` (omega,).
 
         The part has the frequencies that are less than ``half`` from ``middle``, both in rad/s.
         """
@@ -157,7 +157,7 @@ class Burst:
         return np.asarray(np.fft.ifft(part)[: len(self.time)] * np.exp((self.decay - 1j * middle) * self.time))
 
     def sums(self, run: SiteRun, largest: float) -> Record:
-        """Sums over the samples of a ``run`` in contact, as its record holds them.
+        """Return sums over the samples of a ``run`` in contact, as its record holds them.
 
         ``sums`` (quantity, bin) are over bins of log z, the first of ``LOWEST``, the last of ``largest``. The
         quantities are |c|^2 in m^2 (``SQUARE``), Re and Im of f1 c*, Re and Im of f3 (c*/|c|)^3 |c| in N m, the power
@@ -191,7 +191,7 @@ class Burst:
         }
 
     def _force_rows(self, c: np.ndarray, force: np.ndarray, incident: np.ndarray) -> list[np.ndarray]:
-        """The quantities of ``sums`` from ``SQUARE`` to ``GIVEN``, each over time."""
+        """Return the quantities of ``sums`` from ``SQUARE`` to ``GIVEN``, each over time."""
         drive = self.drive
         f1 = self.envelope(force, drive, FIRST_LINE * drive)
         f3 = self.envelope(force, 3 * drive, THIRD_LINE * drive)
@@ -208,7 +208,7 @@ class Burst:
         ]
 
     def _band_powers(self, force: np.ndarray) -> list[np.ndarray]:
-        """Power in W that the ``force`` radiates into each band, over time."""
+        """Return the power in W that the ``force`` radiates into each band, over time."""
         powers = []
         for band in self.bands:
             middle = (band.low + band.high) / 2
@@ -219,7 +219,7 @@ class Burst:
         return powers
 
     def _rate(self) -> np.ndarray:
-        """Factor (omega) that turns a spectrum into that of the time derivative."""
+        """Return factor (omega) that turns a spectrum into that of the time derivative."""
         return np.asarray(1j * (self.omega - 1j * self.decay))
 
 
@@ -274,7 +274,7 @@ class SiteResponse(NamedTuple):
 
     @classmethod
     def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float, pair: Pair) -> Self:
-        """The response of a ``pair`` from the ``records`` of all runs, in any order; zero if none had a contact.
+        """Return the response of a ``pair`` from the ``records`` of all runs, in any order; zero if none had a contact.
 
         ``drive`` is the frequency in rad/s, ``largest`` the z of the last bin, as ``Burst.sums`` was given them.
         """
@@ -333,7 +333,7 @@ class SiteResponse(NamedTuple):
         )
 
     def at(self, z: np.ndarray) -> ContactState:
-        """The response at the amplitudes ``z`` (...), in clearances; beyond the bins that of the first or last one."""
+        """Return response at amplitudes ``z`` (...) in clearances; beyond the bins that of the first or last one."""
         x = np.log(np.maximum(z, LOWEST))
         return ContactState(
             fundamental=self._interpolated(x, self.fundamental),
@@ -343,11 +343,11 @@ class SiteResponse(NamedTuple):
         )
 
     def _interpolated(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Complex ``values`` (bin,) of the response, interpolated at ``x`` (...)."""
+        """Return complex ``values`` (bin,) of the response, interpolated at ``x`` (...)."""
         return np.asarray(np.interp(x, self.x, values.real) + 1j * np.interp(x, self.x, values.imag))
 
     def over_bursts(self, largest: np.ndarray) -> BurstState:
-        """Factors, release and spectra of bursts with these ``largest`` z (...), at most those of the last run."""
+        """Return factors, release and spectra of bursts with these ``largest`` z (...), at most the last run's."""
         x = np.log(np.maximum(largest, TINY))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
         spectrum = np.zeros((*np.shape(x), *self.spectrum.shape[:-1]))
@@ -365,11 +365,11 @@ class SiteResponses(NamedTuple):
     kind: np.ndarray
 
     def of_site(self, site: int) -> SiteResponse:
-        """The response of one ``site`` (from 0)."""
+        """Return the response of one ``site`` (from 0)."""
         return self.of_kind[self.kind[site]]
 
     def at(self, z: np.ndarray) -> ContactState:
-        """What sites in contact do at the amplitudes ``z`` (site, time), in clearances."""
+        """Return what sites in contact do at the amplitudes ``z`` (site, time), in clearances."""
         if len(self.of_kind) == 1:
             return self.of_kind[0].at(z)
         states = [self.of_site(site).at(row) for site, row in enumerate(z)]
@@ -381,7 +381,7 @@ class SiteResponses(NamedTuple):
         )
 
     def over_bursts(self, largest: np.ndarray) -> BurstState:
-        """Factors, release and spectra of bursts with these ``largest`` z (site,)."""
+        """Return factors, release and spectra of bursts with these ``largest`` z (site,)."""
         if len(self.of_kind) == 1:
             return self.of_kind[0].over_bursts(largest)
         states = [self.of_site(site).over_bursts(np.asarray(z)) for site, z in enumerate(largest)]
@@ -394,7 +394,7 @@ class SiteResponses(NamedTuple):
 
 
 def _fractions(energies: list[list[float]]) -> np.ndarray:
-    """The ``energies`` (band, bin) over their sums in each band; 0 in a band without energy."""
+    """Return the ``energies`` (band, bin) over their sums in each band; 0 in a band without energy."""
     values = np.array(energies)
     sums = values.sum(axis=1, keepdims=True)
     return np.divide(values, sums, out=np.zeros_like(values), where=sums > 0)

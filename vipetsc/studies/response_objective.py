@@ -37,7 +37,7 @@ def measured_responses(
 
 
 def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
-    """The record of ``measured_responses`` from the ``branches`` of a case; raises as it does."""
+    """Return the record of ``measured_responses`` from the ``branches`` of a case; raises as it does."""
     for branch in branches:
         if branch.ended.ending is Ending.STOPPED:
             raise StoppedError(branch.ended.sentence)
@@ -72,7 +72,7 @@ def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[Me
 
 
 def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
-    """Why a curve has no states in a part of its range; empty if it has."""
+    """Return why a curve has no states in a part of its range; empty if it has."""
     if not branch.complete:
         return branch.ended.sentence
     # An isolated part covers what it covers.
@@ -86,7 +86,7 @@ def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
 
 
 def _values(branch: Branch[Any], response: ResponseMeasure) -> np.ndarray:
-    """The values (point,) of a ``response`` in the states of a curve: of its member, or the largest of all members."""
+    """Return the values (point,) of a ``response`` in the states of a curve: its member's, or the largest of all."""
     values = measure(branch, response.quantity).reshape(len(branch.points), -1)
     if response.member is None:
         return np.asarray(values.max(axis=1))
@@ -94,7 +94,7 @@ def _values(branch: Branch[Any], response: ResponseMeasure) -> np.ndarray:
 
 
 def _part(branch: Branch[Any], response: ResponseMeasure) -> CurvePart:
-    """The values of a ``response`` along a curve, by which they are interpolated."""
+    """Return the values of a ``response`` along a curve, by which they are interpolated."""
     # With the length along the curve, which rises, while the parameter turns back at folds.
     steps = np.linalg.norm(np.diff(branch.column("xi"), axis=0), axis=1)
     return CurvePart(

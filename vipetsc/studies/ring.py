@@ -40,21 +40,21 @@ class Ring:
         self.recorded = recorded
 
     def amplitude(self, z: float, peak: float) -> float:
-        """Amplitude in N at which the linear wave reaches ``z`` clearances at the site.
+        """Return the amplitude in N at which the linear wave reaches ``z`` clearances at the site.
 
         ``peak`` in m is what the wave of 1 N reaches there, as ``peak_of`` measures it.
         """
         return z * self.setting.clearance / peak
 
     def peak_of(self, motion: PairMotion) -> float:
-        """Largest w in m of a ``motion``; on a side whose clearance is r times the lesser one, w counts as w/r.
+        """Return largest w in m of a ``motion``; on a side whose clearance is r times the lesser one, w counts as w/r.
 
         The motion touches a stop if this exceeds the lesser clearance.
         """
         return motion.reached([self.kind.sides])[0]
 
     def motion(self, run: xr.Dataset) -> PairMotion:
-        """The relative motion of the site's masses in a ``run_at_site``."""
+        """Return the relative motion of the site's masses in a ``run_at_site``."""
         (column,) = np.flatnonzero(run["cell"].values == self.setting.site + 1)
         return PairMotion.between(run, [int(column)], [self.kind.pair])
 
@@ -73,7 +73,7 @@ class Ring:
         return self._run(amplitude, with_site, {"window": [first, last]})
 
     def wall_peak(self) -> float:
-        """Largest w in m of the linear wave at the site's distance from the case's wall, which moves by 1 m."""
+        """Return largest w in m of the linear wave at the site's distance from the case's wall, which moves by 1 m."""
         setting = self.setting
         # The lattice has the case's ends, and the length of the ring, within which no wave returns before the end.
         cell = setting.distance + 1
@@ -91,7 +91,7 @@ class Ring:
         return self.peak_of(PairMotion.between(run, [0], [self.kind.pair]))
 
     def _contacts(self) -> dict[str, Any]:
-        """The changes of ``[contacts]`` that leave one site of the kind."""
+        """Return the changes of ``[contacts]`` that leave one site of the kind."""
         sites = self.case.kinds.sites(self.setting.kind)
         cell = self.setting.site + 1
         # Every run has the law's one clearance: z is changed by the amplitude alone.

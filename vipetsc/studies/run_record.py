@@ -12,7 +12,7 @@ from vipetsc.spectra.measures import PERIODS, QUANTITIES, TOLERANCE, RunRecord
 
 
 def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
-    """The record of a ``run`` of ``case``, open or in memory; ``options`` say how its steady state is found."""
+    """Return the record of a ``run`` of ``case``, open or in memory; ``options`` say how its steady state is found."""
     output = case.output
     cell = case.lattice.unit_cell()
     # Cells that contacts alone join have no bands: the whole frequency axis is one part.
@@ -41,7 +41,7 @@ def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
 
 
 def steady_drive(case: Case) -> SteadyDrive | None:
-    """The harmonic part of the first drive of ``case``, between its ramps; None without a harmonic drive."""
+    """Return the harmonic part of the first drive of ``case``, between its ramps; None without a harmonic drive."""
     drive = case.drive
     if drive.kind != "harmonic" or not drive.amplitude or not drive.frequency:
         return None

@@ -13,7 +13,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def over_samples(data: Variables, seed: str, names: Iterable[str]) -> Variables:
-    """Mean, standard deviation and ``QUANTILES`` of the variables ``names`` in ``data`` over the dimension ``seed``.
+    """Return mean, deviation and ``QUANTILES`` of the variables ``names`` in ``data`` over the dimension ``seed``.
 
     They are called ``statistics/<name>/mean``, ``deviation`` and ``quantiles``, and are of the samples that have a
     value, whose number is ``statistics/<name>/samples``; ``statistics/samples`` is the number of those that did not
@@ -33,7 +33,7 @@ def over_samples(data: Variables, seed: str, names: Iterable[str]) -> Variables:
 
 
 def _statistics(prefix: str, item: xr.Variable) -> Variables:
-    """Mean, deviation and quantiles of an ``item`` over its first dimension, called ``prefix``/..."""
+    """Return mean, deviation and quantiles of an ``item`` over its first dimension, called ``prefix``/..."""
     dims = tuple(map(str, item.dims[1:]))
     units = item.attrs["units"]
     text = item.attrs["long_name"]

@@ -68,7 +68,7 @@ class CmaEs:
         self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
-        """The next generation (design, variable), each coordinate in [0, 1]."""
+        """Return the next generation (design, variable), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         unbounded = self._centre + np.array(self._asked) @ self._directions.T
         # Mirrored at 0 and 1, again and again: the triangle wave of period 2.
@@ -123,7 +123,7 @@ class Nsga2:
         self._search.setup(self._problem, termination=NoTermination(), seed=seed)
 
     def ask(self) -> np.ndarray:
-        """The next generation (design, variable), each coordinate in [0, 1]."""
+        """Return the next generation (design, variable), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         return np.array(self._asked.get("X"), float)
 
@@ -145,7 +145,7 @@ Sampler = CmaEs | Nsga2
 
 
 def smooth(count: int) -> np.ndarray:
-    """Directions (variable, direction) of ``count`` variables in a row, such as clearances of neighbouring sites.
+    """Return directions (variable, direction) of ``count`` variables in a row, as clearances of neighbouring sites.
 
     They are cosines over the row, the k-th from 0 with k half waves and the root mean square 1/(1 + k): a step changes
     the mean most, the slope half as much, the bend a third as much, and differences of neighbours least.
@@ -157,7 +157,7 @@ def smooth(count: int) -> np.ndarray:
 
 
 def front(losses: np.ndarray) -> np.ndarray:
-    """Numbers of the designs in the Pareto front of ``losses`` (design, objective), sorted by the first objective.
+    """Return the numbers of the designs in the Pareto front of ``losses`` (design, objective), by the first objective.
 
     No other design is as good in every objective; of equal designs the first is taken. Designs with a loss that is not
     finite are left out. For one objective the front is the best design.
@@ -173,7 +173,7 @@ def front(losses: np.ndarray) -> np.ndarray:
 
 
 def knee(losses: np.ndarray) -> int:
-    """Number of the design of a front whose ``losses`` (design, objective) are farthest below the line of its ends."""
+    """Return the number of the design whose ``losses`` (design, objective) are farthest below the ends' line."""
     # Over its span the front has the ends (0, 1) and (1, 0), and a design is below their line by what its sum is less.
     span = np.ptp(losses, axis=0)
     scaled = (losses - losses.min(axis=0)) / np.where(span > 0, span, 1.0)

@@ -107,13 +107,13 @@ class ScatteringLaw:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """The law in a file ``law.h5``; raises OSError or ValueError if it is none."""
+        """Return the law in a file ``law.h5``; raises OSError or ValueError if it is none."""
         with open_netcdf(path, "law", ("share", "drive_band")) as data:
             return cls.of(data)
 
     @classmethod
     def of(cls, data: xr.Dataset) -> Self:
-        """The law in the content ``data`` of ``law.h5``."""
+        """Return the law in the content ``data`` of ``law.h5``."""
         # Fractions that a lattice does not have (``DAMPED``) are not in its file.
         none = xr.zeros_like(data["dissipated"])
         mean = {name: data.get(name, none).values for name in ScatteringOutcome._fields}
@@ -131,18 +131,18 @@ class ScatteringLaw:
         )
 
     def at(self, z: ArrayLike) -> ScatteringOutcome:
-        """Outcome of a wave at ``z`` (any shape), interpolated linearly in log z.
+        """Return the outcome of a wave at ``z`` (any shape), interpolated linearly in log z.
 
         Below the first point, at which nothing is touched yet, and above the last one the outcome is that of the point.
         """
         return self._interpolated(self.mean, z)
 
     def deviation(self, z: ArrayLike) -> ScatteringOutcome:
-        """The scatter at ``z`` (any shape), interpolated as ``at`` interpolates the mean."""
+        """Return the scatter at ``z`` (any shape), interpolated as ``at`` interpolates the mean."""
         return self._interpolated(self.scatter, z)
 
     def _interpolated(self, values: ScatteringOutcome, z: ArrayLike) -> ScatteringOutcome:
-        """The ``values`` of the points at ``z`` (any shape), as ``at`` has them."""
+        """Return the ``values`` of the points at ``z`` (any shape), as ``at`` has them."""
         x = np.log(np.clip(np.asarray(z, float), self.z[0], self.z[-1]))
         grid = np.log(self.z)
         right = np.clip(np.searchsorted(grid, x), 1, len(grid) - 1)
@@ -157,7 +157,7 @@ class ScatteringLaw:
         return ScatteringOutcome(*map(between, values))
 
     def efficiency(self) -> np.ndarray:
-        """Efficiency of the transfer (z,): U/(1-T), both averaged over 5 % of z on either side.
+        """Return the efficiency of the transfer (z,): U/(1-T), both averaged over 5 % of z on either side.
 
         It is 0 where the driven wave loses less than ``LEAST`` at any z of that range.
         """
@@ -168,7 +168,7 @@ class ScatteringLaw:
         return np.where(lost.min(axis=0) > LEAST, mean_efficiency, 0.0)
 
     def matched(self) -> tuple[float, float]:
-        """Best amplitude z* for the transfer to upper bands, and the transmitted fraction T there.
+        """Return the best amplitude z* for the transfer to upper bands, and the transmitted fraction T there.
 
         The efficiency U/(1-T) is flat about its maximum. Of the points within 10 % of it, z* is the one with the
         largest T, which leaves most for further sites. Raises ValueError if no energy is transferred.
@@ -182,7 +182,7 @@ class ScatteringLaw:
         return float(self.z[best]), float(self.at(self.z[best]).transmitted)
 
     def summary(self) -> list[tuple[str, str]]:
-        """Rows (name, text) of a table that describes the law: its ring, the packet, its points, some of its values."""
+        """Return rows (name, text) of a table on the law: its ring, the packet, its points, some of its values."""
         about = self.about
         mean = self.mean
         sums = mean.share.sum(axis=(1, 2)) + mean.dissipated + mean.contact + mean.dashpots
@@ -206,7 +206,7 @@ class ScatteringLaw:
         return [*rows, ("matched", best)]
 
     def _fractions_at(self, z: float) -> str:
-        """The fractions at ``z`` with their scatter, as text: T, R and U, L dissipated, D taken by dashpots."""
+        """Return the fractions at ``z`` with their scatter, as text: T, R and U, L dissipated, D taken by dashpots."""
         mean = self.at(z)
         scatter = self.deviation(z)
         symbols = {"T": "transmitted", "R": "reflected", "U": "upper", "L": "dissipated"}
@@ -218,7 +218,7 @@ class ScatteringLaw:
 
 
 def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:
-    """Clearances (site,) in m with which all ``sites`` (cells from 1, in the order of the wave) operate at z*.
+    """Return clearances (site,) in m with which all ``sites`` (cells from 1, in the order of the wave) operate at z*.
 
     D_k = A env(s_k) sqrt(T^k)/z* for the site k = 0, 1, ...: the envelope env of the ``linear`` run under 1 N, times
     the ``amplitude`` A in N, times what the k sites before leave of the wave. Raises ValueError as ``matched``.

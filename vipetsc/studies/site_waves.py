@@ -109,7 +109,7 @@ class SiteWaves:
             self.arriving[node, band] = leaving * forward.factor**setting.distance
 
     def _sent(self, omega: float, up: complex, drive_mass: int) -> tuple[SentWave, SentWave]:
-        """The waves of one band that are sent forward and backward at ``omega`` in rad/s.
+        """Return the waves of one band that are sent forward and backward at ``omega`` in rad/s.
 
         ``up`` is the factor of the band's wave to higher cells without dashpots, near which the damped one lies.
         ``drive_mass`` is the mass, from 0, on which the drive acts.
@@ -141,7 +141,7 @@ class SiteWaves:
         return directions[0], directions[1]
 
     def _amplitudes_of_pair(self, waves: Waves) -> np.ndarray:
-        """Amplitudes (wave,) in m at the site's cell by a force of 1 N on its resonator and -1 N on its host."""
+        """Return amplitudes (wave,) in m at the site's cell by a force of 1 N on its resonator and -1 N on its host."""
         resonator = np.zeros(self.cell.dofs)
         resonator[self.pair.resonator] = 1.0
         amplitudes = np.concatenate(amplitudes_sent(waves, resonator, "right"))
@@ -156,7 +156,7 @@ class SiteWaves:
         return np.asarray(amplitudes)
 
     def amplitudes(self, force: np.ndarray | None = None) -> np.ndarray:
-        """Spectrum (direction, node, band) in m s, in the site's cell, of the waves that leave the site.
+        """Return the spectrum (direction, node, band) in m s, in the site's cell, of the waves that leave the site.
 
         The drive is one of 1 N, ``force`` (time,) in N the contact's force on the resonator under it. Without a force
         the waves of the drive pass.
@@ -167,11 +167,11 @@ class SiteWaves:
         return np.asarray(passing + self.sends * spectrum_of(force, self.setting.interval, self.frequency))
 
     def energies(self, force: np.ndarray | None = None) -> np.ndarray:
-        """Energies (band, direction) in J that the waves of ``amplitudes`` carry past the site."""
+        """Return energies (band, direction) in J that the waves of ``amplitudes`` carry past the site."""
         return np.asarray((self.weight * self.flux * np.abs(self.amplitudes(force)) ** 2).sum(axis=1).T)
 
     def sent_by_bins(self, force: np.ndarray, bins: int) -> np.ndarray:
-        """Energies (band, bin) in J that the contact's ``force`` (time,) in N sends out, in equal ``bins`` of kappa."""
+        """Return energies (band, bin) in J that the contact's ``force`` (time,) in N sends, by ``bins`` of kappa."""
         amplitudes = self.sends * spectrum_of(force, self.setting.interval, self.frequency)
         energies = (self.weight * self.flux * np.abs(amplitudes) ** 2).sum(axis=0)
         # By whole numbers: with the quotient of two floats a node on the border of bins would be a matter of rounding.
@@ -195,14 +195,14 @@ class SiteWaves:
         return self_response(self.cell, omega - 1j * self.decay, self.pair)
 
     def late(self, since: float) -> float:
-        """Energy in J of waves of the drive's band that take longer than ``since`` s from the drive to the site."""
+        """Return the energy in J of waves of the drive's band that take over ``since`` s from the drive to the site."""
         band = self.setting.band
         slow = self.speed[:, band] * since < self.setting.distance
         energy = self.weight * self.flux[0] * np.abs(self.arriving) ** 2
         return float(energy[slow, band].sum())
 
     def taken_before(self) -> float:
-        """Fraction that dashpots take before the site, of the energy that the drive sends forward in its band."""
+        """Return the share that dashpots take before the site of the energy sent forward in the drive's band."""
         band = self.setting.band
         energies = self.weight * self.flux[0]
         sent = (energies * np.abs(self.leaving_drive) ** 2)[:, band].sum()
@@ -210,7 +210,7 @@ class SiteWaves:
         return float(1 - arrives / sent)
 
     def force(self, motion: PairMotion, linear: np.ndarray, begin: float, end: float) -> np.ndarray:
-        """The contact's force (time,) in N on the resonator, from a ``motion`` of the pair; the host has its opposite.
+        """Return the contact's force (time,) in N on the resonator, opposite on the host, by a ``motion`` of the pair.
 
         ``linear`` (time,) in m is the relative displacement without the contact, which is first touched at ``begin`` s
         and left for good at ``end`` s.
@@ -227,7 +227,7 @@ class SiteWaves:
 
 
 def _power_past_end(waves: Waves, wave: int, omega: float) -> float:
-    """Mean power in W through the springs between a cell and the next higher one, of a ``wave`` of 1 m in that cell.
+    """Return the mean power in W through springs from a cell to the next higher one, of a ``wave`` of 1 m there.
 
     A dashpot parallel to a spring takes a part of the power, so that the two ends of the spring pass on different
     powers. What the spring alone carries is their mean, to the second order in the dashpot.
@@ -238,7 +238,7 @@ def _power_past_end(waves: Waves, wave: int, omega: float) -> float:
 
 
 def spectrum_of(signal: np.ndarray, step: float, omega: np.ndarray) -> np.ndarray:
-    """Fourier integral of a ``signal`` (time,), sampled every ``step`` s from t = 0, at any ``omega`` (...) in rad/s.
+    """Return the Fourier integral of a ``signal`` (time,), sampled each ``step`` s from 0, at ``omega`` (...) in rad/s.
 
     It has the shape of ``omega`` and the unit of the signal times s.
     """

@@ -41,9 +41,9 @@ class SpectralLine:
         return DECAY / self.length
 
     def forward(self, a: np.ndarray) -> np.ndarray:
-        """Spectrum (..., offset) of an envelope ``a`` (..., time): a sum over instants, without their distance in s."""
+        """Return the spectrum (..., offset) of an envelope ``a`` (..., time): a sum, without the step in s."""
         return np.asarray(np.fft.fftshift(np.fft.fft(a * np.exp(-self.decay * self.time)), axes=-1))
 
     def backward(self, spectrum: np.ndarray) -> np.ndarray:
-        """Envelope (..., time) of a spectrum (..., offset)."""
+        """Return the envelope (..., time) of a spectrum (..., offset)."""
         return np.asarray(np.fft.ifft(np.fft.ifftshift(spectrum, axes=-1)) * np.exp(self.decay * self.time))

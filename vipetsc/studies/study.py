@@ -95,7 +95,7 @@ class Study(Generic[Result]):
 
 
 def _is_there(path: Path) -> bool:
-    """Whether a result is there; warns of one that is computed again."""
+    """Return whether a result is there; warns of one that is computed again."""
     lost: list[str] = []
     whole = is_whole(path, lost)
     for sentence in lost:
@@ -104,7 +104,7 @@ def _is_there(path: Path) -> bool:
 
 
 def is_whole(path: Path, lost: list[str]) -> bool:
-    """Whether an HDF5 file is there and can be opened; if it is there and cannot, ``lost`` gets a sentence.
+    """Return whether an HDF5 file is there and can be opened; if it is there and cannot, ``lost`` gets a sentence.
 
     HDF5 does not open a file that is shorter than it says itself.
     """

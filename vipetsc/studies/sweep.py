@@ -69,7 +69,7 @@ class SweepResult:
         return open_ensemble(self.folder)
 
     def _repr_html_(self) -> str:
-        """The numbers of members by how they ended, and the warnings, as a notebook shows them."""
+        """Return the numbers of members by how they ended, and the warnings, as a notebook shows them."""
         rows: list[tuple[str, object]] = [(name, self.count(code) or None) for code, name in enumerate(STATUS)]
         rows += [("time in s", round(self.seconds, 1)), ("ensemble", self.folder or "in memory, as `dataset`")]
         rows += [("warning", warning) for warning in self.warnings]
@@ -91,7 +91,7 @@ class SweepResult:
         return self.count(MISSING) > 0
 
     def count(self, status: int) -> int:
-        """Number of members with this ``status``."""
+        """Return the number of members with this ``status``."""
         return int((self.status == status).sum())
 
 
@@ -246,7 +246,7 @@ class _Survey(NamedTuple):
     lost: list[str]
 
     def order(self, linear: dict[str, LinearRun]) -> list[int]:
-        """The numbers of the missing members in the order in which they are simulated.
+        """Return the numbers of the missing members in the order in which they are simulated.
 
         Members of one linear run follow each other, since ranks keep few of these runs. The longest come first, so that
         no rank ends with a long one while the others wait. What a member will cost is judged by its contacts, which
@@ -308,7 +308,7 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
 
 
 def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:
-    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all first sites."""
+    """Return linear runs of the ``drawn`` members, by name, that are not there or not measured for all first sites."""
     runs: dict[str, NeededRun] = {}
     for member in drawn:
         run = runs.setdefault(member.linear, NeededRun(member.case, []))
@@ -350,7 +350,7 @@ def has_all_records(folder: Path) -> bool:
 
 
 def summarise(sentences: Sequence[str]) -> list[str]:
-    """Warnings of members in short: of ``sentences`` that differ in numbers alone one, after how many there are.
+    """Return warnings of members in short: of ``sentences`` that differ in numbers alone one, after how many there are.
 
     It is the last one in the alphabet, so that the choice does not depend on the order of the members.
     """

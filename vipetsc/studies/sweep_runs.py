@@ -262,7 +262,7 @@ def _linear_key(name: str, sites: Iterable[int]) -> str:
 
 
 def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
-    """The record of a member without contact: its ``linear`` run ``name``, scaled to the amplitude of ``case``.
+    """Return the record of a member without contact: its ``linear`` run ``name``, scaled to the amplitude of ``case``.
 
     ``site`` is the member's first site (cell), for which the linear run was measured.
     """
@@ -282,13 +282,13 @@ def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
 
 
 def _with_everything(case: Case, fields: list[str]) -> Case:
-    """The ``case`` of which all samples and cells of the ``fields`` are recorded."""
+    """Return the ``case`` of which all samples and cells of the ``fields`` are recorded."""
     output = {"fields": fields, "window": None, "every": 1, "stride": 1}
     return case.model_copy(update={"output": case.output.model_copy(update=output)})
 
 
 def measures_of(plan: Sweep) -> set[str]:
-    """Measures that ``analyse`` takes of a member: those asked for, and those of its pictures if fields are kept."""
+    """Return the measures that ``analyse`` takes of a member: those asked for, and its pictures' if fields are kept."""
     asked: Mapping[str, Sequence[str]] = ANALYSED
     if plan.options.fields:
         asked = WHOLE
@@ -299,7 +299,7 @@ def measures_of(plan: Sweep) -> set[str]:
 
 
 def keeps_all(case: Case) -> bool:
-    """Whether all cells of the velocity are kept at all samples."""
+    """Return whether all cells of the velocity are kept at all samples."""
     output = case.output
     return "velocity" in output.fields and (output.window, output.every, output.stride) == (None, 1, 1)
 

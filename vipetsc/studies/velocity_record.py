@@ -57,7 +57,7 @@ class VelocityRecord:
         self.warnings: list[str] = []
 
     def blank(self) -> Self:
-        """A copy of the record of which nothing has been measured: no attributes, nothing left out, no warnings."""
+        """Return a copy of the record without measures: no attributes, nothing left out, no warnings."""
         record = copy(self)
         record.attributes = {}
         record.left_out = []
@@ -65,7 +65,7 @@ class VelocityRecord:
         return record
 
     def field(self, field: xr.DataArray, factor: ArrayLike = 1.0) -> Any:
-        """A recorded ``field`` (t, cell, dof) times a ``factor``, a number 1 or (cell, dof).
+        """Return a recorded ``field`` (t, cell, dof) times a ``factor``, a number 1 or (cell, dof).
 
         It is an array if it fits into the memory, else an object that reads slices from the file.
         """
@@ -74,7 +74,7 @@ class VelocityRecord:
         return field.values * factor if np.ndim(factor) else field.values
 
     def unresolved(self) -> set[str]:
-        """Names of the groups of measures that what was kept does not resolve, with a warning for each.
+        """Return names of the groups of measures that what was kept does not resolve, with a warning for each.
 
         Fields that are stored at too few samples, or of too few cells, show waves as slower or longer ones (aliasing).
         """
@@ -97,7 +97,7 @@ class VelocityRecord:
         return names
 
     def mean(self, energy: np.ndarray) -> np.ndarray:
-        """Means of an ``energy`` (t, cell) over the blocks of a map, in single precision."""
+        """Return means of an ``energy`` (t, cell) over the blocks of a map, in single precision."""
         over_time = spectra.block_means(energy, self.sizes[0], 0)
         # Single precision halves the file, and is finer than any colour scale.
         return spectra.block_means(over_time, self.sizes[1], 1).astype(np.float32)

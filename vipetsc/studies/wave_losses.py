@@ -96,11 +96,11 @@ class WaveLosses:
         return len(self.dashpots) > 0
 
     def rate(self, wave: TravellingWave) -> float:
-        """Rate in 1/s at which the dashpots of the cells take the energy of a ``wave``."""
+        """Return the rate in 1/s at which the dashpots of the cells take the energy of a ``wave``."""
         return self.rays.rate(wave.band, wave.wavenumber)
 
     def at_end(self, sent: SentPowers, amplitude: float) -> EndEnergies:
-        """The energies at the end of a run under ``amplitude`` in N (in m of a wall) whose contacts have ``sent``."""
+        """Return energies at the end of a run under ``amplitude`` in N (m of a wall) whose contacts have ``sent``."""
         step = float(self.line.time[1])
         remaining = np.zeros(len(sent.bands))
         absorbed = 0.0
@@ -124,11 +124,11 @@ class WaveLosses:
         return EndEnergies(remaining=remaining, absorbed=absorbed + float(in_ends.sum()) * step)
 
     def absorbed_without_contacts(self) -> float:
-        """Energy in J that absorbing ends take in the run without contacts, under a drive of 1 N (1 m of a wall)."""
+        """Return the energy in J that absorbing ends take without contacts, under a drive of 1 N (1 m of a wall)."""
         return float(self._power_in_ends(1.0).sum()) * float(self.line.time[1])
 
     def _power_in_ends(self, amplitude: float, force: np.ndarray | None = None) -> np.ndarray:
-        """Power (time,) in W that absorbing ends take from the driven wave, averaged over a period of the drive.
+        """Return power (time,) in W that absorbing ends take from the driven wave, averaged over a period of the drive.
 
         ``force`` (site, time) in N are the envelopes of the contacts' forces; None for the run without contacts.
         """

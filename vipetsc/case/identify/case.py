@@ -72,7 +72,7 @@ class IdentifyCase(StudyCase):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields, and everything that is wrong with the section, the data or the case."""
+        """Return the fields, and everything that is wrong with the section, the data or the case."""
         remedy = "give [[identify.records]] with their sensors, and [[identify.unknowns]]"
         table, section, missing = cls.divide(table, remedy)
         if missing:
@@ -103,17 +103,17 @@ class IdentifyCase(StudyCase):
         return fields, problems
 
     def warnings(self) -> list[str]:
-        """Warnings of settings in the case that are probably unintended."""
+        """Return warnings of settings in the case that are probably unintended."""
         # Warnings about times and samples of a run do not apply: those of the records are used.
         return [*unit_warnings(self.base.drive, self.base.model().chain), *loss_warnings(self.base.lattice)]
 
     def to_toml(self) -> str:
-        """The case as TOML; reading it back gives the same identification."""
+        """Return the case as TOML; reading it back gives the same identification."""
         section = self.options.model_dump(exclude_none=True)
         return tomli_w.dumps({"name": self.name} | self.table | {"identify": section})
 
     def runs(self) -> list[CaseFile]:
-        """The case whose parameters are sought."""
+        """Return the case whose parameters are sought."""
         return [self.base]
 
     @property
@@ -150,16 +150,16 @@ class IdentifyCase(StudyCase):
         return parameters
 
     def case_of(self, values: Iterable[float], name: str = "model") -> Case:
-        """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
+        """Return the case with the ``values`` (parameter,); raises CaseError if it is impossible."""
         return changed_case(self.base, self.parameters, values, name)
 
     def trials(self, number: int) -> TrialCases:
-        """Cases of the record of that ``number`` (from 0), with its drive and its initial motion."""
+        """Return cases of the record of that ``number`` (from 0), with its drive and its initial motion."""
         return TrialCases(self.base, self.parameters, _varied_sections(self.options.records[number]))
 
 
 def _varied_sections(record: RecordTable) -> dict[str, Any]:
-    """The sections of a case in which a ``record`` differs from it."""
+    """Return the sections of a case in which a ``record`` differs from it."""
     sections = {}
     if record.drive:
         # A copy: tables are changed as they are read.
@@ -172,7 +172,7 @@ def _varied_sections(record: RecordTable) -> dict[str, Any]:
 def _group_problems(
     unknown: UnknownTable, groups: Sequence[Sequence[int]], base: Case, taken: set[tuple[str, int]], at: str
 ) -> Iterator[Problem]:
-    """Problems of the ``groups`` of members of an ``unknown`` at the path ``at``; each group has one value.
+    """Yield problems of the ``groups`` of members of an ``unknown`` at the path ``at``; each group has one value.
 
     ``taken`` are the pairs of a quantity and a member that are sought already. Those of the unknown are added to it.
     """
@@ -189,7 +189,7 @@ def _group_problems(
 
 
 def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
-    """Problems of the unknowns in a case."""
+    """Yield problems of the unknowns in a case."""
     # Pairs of a quantity and a member: two unknowns that change one value would not be determined.
     taken: set[tuple[str, int]] = set()
     for index, unknown in enumerate(options.unknowns, 1):
@@ -261,7 +261,7 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
 
 
 def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
-    """Problems of the records' keys, their sensors and their drives."""
+    """Yield problems of the records' keys, their sensors and their drives."""
     dofs = base.lattice.unit_cell().dofs
     masses = base.lattice.cells * dofs
     for number, record in enumerate(options.records, 1):
@@ -301,12 +301,12 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
 
 
 def _touches(base: Case) -> bool:
-    """Whether a site of the case touches its stop, or is pressed against it, at rest."""
+    """Return whether a site of the case touches its stop, or is pressed against it, at rest."""
     return any(min(gaps) <= 0 for gaps in base.model().gaps)
 
 
 def _force_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:
-    """Problems of sensors of a drive's force; ``drives`` are those of the ``record``."""
+    """Yield problems of sensors of a drive's force; ``drives`` are those of the ``record``."""
     for number, sensor in enumerate(record.sensors, 1):
         drive = sensor.drive or 1
         if sensor.quantity != "force" or drive > len(drives):
@@ -321,7 +321,7 @@ def _force_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) ->
 
 
 def _with_hashes(options: IdentifyTable) -> tuple[IdentifyTable, list[Problem]]:
-    """The ``options`` with the hash of every record's file, and what is wrong with the data."""
+    """Return the ``options`` with the hash of every record's file, and what is wrong with the data."""
     records = []
     problems = []
     for number, record in enumerate(options.records, 1):

@@ -95,7 +95,7 @@ class MeasuredError(ValueError):
 
 
 def read_measured(record: RecordTable) -> Measured:
-    """The times and values of a ``record`` between its ``begin`` and ``end``; raises MeasuredError for bad data."""
+    """Return times and values of a ``record`` between its ``begin`` and ``end``; raises MeasuredError for bad data."""
     try:
         path = resolved_path(record.file)
         digest = file_hash(path)
@@ -153,7 +153,7 @@ def _check_count(key: str, value: Any, count: int) -> None:
 
 
 def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.ndarray:
-    """Even times (count,) in s from the ``rate`` or from the ``column`` of times."""
+    """Return even times (count,) in s from the ``rate`` or from the ``column`` of times."""
     if record.rate is not None:
         return np.arange(count) / record.rate
     assert column is not None
@@ -172,7 +172,7 @@ def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.nda
 
 
 def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
-    """The places of all columns of a record, by their keys."""
+    """Yield the places of all columns of a record, by their keys."""
     if record.time is not None:
         yield "time", record.time
     for number, sensor in enumerate(record.sensors, 1):
@@ -180,7 +180,7 @@ def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
 
 
 def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives: int) -> Iterator[Problem]:
-    """Problems of the sensors of a ``record`` at the path ``at``.
+    """Yield problems of the sensors of a ``record`` at the path ``at``.
 
     The lattice has ``cells`` cells with ``dofs`` masses each, and as many ``drives``.
     """

@@ -64,13 +64,13 @@ class SoughtParameter(NamedTuple):
         return self.quantity in QUANTITIES and QUANTITIES[self.quantity].of != "site"
 
     def to_coordinate(self, value: float) -> float:
-        """The fit's coordinate of a ``value``."""
+        """Return the fit's coordinate of a ``value``."""
         if self.is_logarithmic:
             return float(np.log(value))
         return (value - self.low) / (self.high - self.low)
 
     def from_coordinate(self, z: float) -> float:
-        """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
+        """Return the value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
         value = self.low + (self.high - self.low) * z
         if self.is_logarithmic:
             # Clipped before the exponential, which would overflow far outside.
@@ -78,7 +78,7 @@ class SoughtParameter(NamedTuple):
         return float(np.clip(value, self.low, self.high))
 
     def slope(self, z: float) -> float:
-        """Derivative of the value by the fit's coordinate at ``z``."""
+        """Return the derivative of the value by the fit's coordinate at ``z``."""
         if self.is_logarithmic:
             # The derivative of exp(z) is exp(z), the value itself.
             return self.from_coordinate(z)
@@ -91,7 +91,7 @@ def values_of(case: Case, quantity: str) -> list[float]:
 
 
 def groups_of(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
-    """The members (0-based) of each value of an unknown of ``count`` members."""
+    """Return the members (0-based) of each value of an unknown of ``count`` members."""
     if unknown.of == "all":
         return [tuple(range(count))]
     if unknown.of == "each":
@@ -100,7 +100,7 @@ def groups_of(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
 
 
 def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, unit: str) -> SoughtParameter:
-    """The parameter of an ``unknown``, in its ``unit``, with one value at the ``members``; it begins at ``start``."""
+    """Return the parameter of an ``unknown``, in its ``unit``, with one value at the ``members``, and its ``start``."""
     low, high = unknown.bounds
     name: str = unknown.quantity
     if unknown.of != "all":
@@ -120,7 +120,7 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, un
 
 
 def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
-    """The parameters of an ``unknown`` of the case ``base``, which begin at its values unless a start is given."""
+    """Return parameters of an ``unknown`` of the case ``base``, which begin at its values unless a start is given."""
     values = values_of(base, unknown.quantity)
     unit = QUANTITIES[unknown.quantity].unit or drive_unit(base.drive)
     parameters = []
@@ -137,7 +137,7 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
 
 
 def numbers_of(base: Case, parameters: Sequence[SoughtParameter], values: Iterable[float]) -> dict[str, list[float]]:
-    """The numbers (member,) of each quantity that is sought, by its name.
+    """Return the numbers (member,) of each quantity that is sought, by its name.
 
     Members that a parameter has are given its value, out of ``values`` (parameter,); others keep that of ``base``.
     """

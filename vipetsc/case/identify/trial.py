@@ -43,7 +43,7 @@ class TrialCases:
         self._case = lru_cache(maxsize=KEPT)(self._new_case)
 
     def case(self, values: Iterable[float]) -> Case:
-        """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
+        """Return the case with the ``values`` (parameter,); raises CaseError if it is impossible."""
         return self._case(tuple(float(value) for value in values))
 
     @cached_property
@@ -52,11 +52,11 @@ class TrialCases:
         return self._with_changes(self._base)
 
     def read(self, values: Sequence[float]) -> Case:
-        """The same case as ``case`` gives, read from its table; raises CaseError."""
+        """Return the same case as ``case`` gives, read from its table; raises CaseError."""
         return self._with_changes(changed_case(self._base, self._parameters, values, "model"))
 
     def _with_changes(self, case: Case) -> Case:
-        """The ``case`` with what the record changes."""
+        """Return the ``case`` with what the record changes."""
         if not self._changes:
             return case
         # A copy: tables are changed as they are read.
@@ -85,7 +85,7 @@ class TrialCases:
 
 
 def _problems(trial: Case, case: Case) -> list[Problem]:
-    """Problems with the numbers of a ``trial``, which differs from the valid ``case`` in these alone.
+    """Return problems with the numbers of a ``trial``, which differs from the valid ``case`` in these alone.
 
     Two problems that reading a case finds are left out: samples that are too coarse for the bands, and a drive that
     sends no wave. Samples and frequencies of an identification are those that were measured.

@@ -80,7 +80,7 @@ class NfrcCase(Case):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections, and everything that is wrong with them."""
+        """Return the resolved sections, and everything that is wrong with them."""
         if isinstance(table.get("nfrc"), dict) and "family" in table["nfrc"]:
             return cls._read_family(table)
         if isinstance(table.get("nfrc"), dict) and is_key(table["nfrc"].get("over")):
@@ -122,7 +122,7 @@ class NfrcCase(Case):
 
     @classmethod
     def _read_family(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections of the first member, and everything that is wrong with the first invalid one."""
+        """Return the resolved sections of the first member, and everything that is wrong with the first invalid one."""
         family, problems = family_of(table)
         if problems:
             return {}, problems
@@ -138,7 +138,7 @@ class NfrcCase(Case):
 
     @classmethod
     def _read_over_key(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections at the lower end of a key's range, and everything that is wrong within the range."""
+        """Return resolved sections at the lower end of a key's range, and everything that is wrong within the range."""
         options, problems = read_section(NfrcTable, table["nfrc"], "nfrc")
         problems = problems or key_problems(table)
         if problems:
@@ -170,7 +170,7 @@ class NfrcCase(Case):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """Problems between keys."""
+        """Yield problems between keys."""
         yield from super().check(sections, valid)
         if not valid("nfrc"):
             return
@@ -225,11 +225,11 @@ class NfrcCase(Case):
                     yield from _check_linear(sections, valid)
 
     def warnings(self) -> list[str]:
-        """No warnings: those about runs in time do not concern steady states."""
+        """Return no warnings: those about runs in time do not concern steady states."""
         return []
 
     def at(self, value: float, amplitude: float) -> "NfrcCase":
-        """The case whose key ``nfrc.over`` has a ``value``, for states over the amplitude from ``amplitude`` on.
+        """Return the case whose key ``nfrc.over`` has a ``value``, for states over the amplitude from ``amplitude`` on.
 
         Raises CaseError where the case is invalid with that value.
         """
@@ -243,12 +243,12 @@ class NfrcCase(Case):
         return case.model_copy(update={"nfrc": case.nfrc.model_copy(update=update)})
 
     def physics(self) -> "NfrcCase":
-        """The part of the case that a resumed curve must keep: all except the number of points."""
+        """Return the part of the case that a resumed curve must keep: all except the number of points."""
         nfrc = self.nfrc.model_copy(update={"points": 1})
         return self.model_copy(update={"nfrc": nfrc, "table": None})
 
     def to_toml(self) -> str:
-        """The resolved case as TOML; with keys that vary it is the table that was read, whose other keys may follow."""
+        """Return resolved case as TOML; with keys that vary, the table that was read, since other keys may follow."""
         if self.table is None:
             return super().to_toml()
         table = self.table | {"name": self.name, "nfrc": self.table["nfrc"] | {"points": self.nfrc.points}}
@@ -267,7 +267,7 @@ class NfrcCase(Case):
         return self.nfrc.range[0]
 
     def laws(self, restitution: float) -> list[Contact]:
-        """The law of each site, with the ``restitution`` unless the case gives each site one of its own."""
+        """Return the law of each site, with the ``restitution`` unless the case gives each site one of its own."""
         model = self.model()
         laws = list(model.law_of_sites)
         if self.contacts.each and self.contacts.each.restitution:
@@ -299,7 +299,7 @@ class NfrcCase(Case):
         return measures_of(self.nfrc, self.lattice, self.output, self.model().chain)
 
     def every_curve(self) -> list[ResponseCurve]:
-        """The curves of all members of the family; of a case without one its own."""
+        """Return the curves of all members of the family; of a case without one its own."""
         curves = []
         for number, (member, case) in enumerate(self._members):
             # Without a family there is one member, whose name is empty.
@@ -328,7 +328,7 @@ class NfrcCase(Case):
 
 
 def has_waves(chain: Chain) -> bool:
-    """Whether motions of ``chain`` consist of Bloch waves, which are those of equal linear cells without loss.
+    """Return whether motions of ``chain`` consist of Bloch waves, which are those of equal linear cells without loss.
 
     Springs must join the cells: waves do not go through contacts unchanged.
     """
@@ -336,7 +336,7 @@ def has_waves(chain: Chain) -> bool:
 
 
 def needs_modes(chain: Chain) -> bool:
-    """Whether the response of the finite ``chain`` is computed from all of its modes.
+    """Return whether the response of the finite ``chain`` is computed from all of its modes.
 
     It is if its motions do not consist of Bloch waves, or if contacts join other masses than the cell's pair.
     """
@@ -344,7 +344,7 @@ def needs_modes(chain: Chain) -> bool:
 
 
 def _fastest_band(nfrc: NfrcTable, cell: UnitCell) -> int | None:
-    """The band of the fastest wave at the frequency at which a curve begins; None in a gap."""
+    """Return the band of the fastest wave at the frequency at which a curve begins; None in a gap."""
     frequency = nfrc.range[0]
     if nfrc.over == "amplitude":
         frequency = nfrc.fixed[0]
@@ -356,7 +356,7 @@ def _fastest_band(nfrc: NfrcTable, cell: UnitCell) -> int | None:
 
 
 def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
-    """Problems with drives besides the first: none acts with an incident wave, and all have one frequency."""
+    """Yield problems with drives besides the first: none acts with an incident wave, and all have one frequency."""
     for path, drive in drives.every[1:]:
         if nfrc.source == "wave":
             yield Problem(path, None, 'a wave that is incident acts alone; omit it, or nfrc.source = "force"')
@@ -366,7 +366,7 @@ def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
 
 
 def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
+    """Yield problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
     gaps = gaps_of_sites(contacts, list(chain.clearances))
     if nfrc.symmetric and not has_equal_sides(gaps):
         yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; omit it")
@@ -397,7 +397,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
 
 
 def _check_linear(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-    """Problems with the curve of a linear lattice: a force or a wall moves named masses, over amplitude or frequency.
+    """Yield problems with the curve of a linear lattice: force or wall, named masses, over amplitude or frequency.
 
     Other keys of ``[nfrc]`` are of stability and continuation, which it does not have.
     """
@@ -417,7 +417,7 @@ def _check_linear(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
 
 
 def _check_points_at(nfrc: NfrcTable, measures: Mapping[str, Any]) -> Iterator[Problem]:
-    """Problems with quantities of ``nfrc.points_at`` that states do not have."""
+    """Yield problems with quantities of ``nfrc.points_at`` that states do not have."""
     names = [*PARAMETERS, *(name.removeprefix(RESPONSE) for name in measures)]
     for name in nfrc.points_at:
         if name not in names:
@@ -425,7 +425,7 @@ def _check_points_at(nfrc: NfrcTable, measures: Mapping[str, Any]) -> Iterator[P
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with frequencies where a curve begins and the band has no wave."""
+    """Yield problems with frequencies where a curve begins and the band has no wave."""
     if nfrc.source != "wave":
         return
     key = "nfrc.range"

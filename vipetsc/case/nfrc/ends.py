@@ -12,7 +12,7 @@ from vipetsc.lattice import Chain
 
 
 def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
-    """Whether springs tie the ``lattice`` to a wall."""
+    """Return whether springs tie the ``lattice`` to a wall."""
     is_open = nfrc.infinite
     if nfrc.open_ends and lattice.absorbing:
         is_open = is_open or lattice.absorbing.end == "both"
@@ -22,7 +22,7 @@ def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
 def are_contacts_springs(
     nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
 ) -> bool:
-    """Whether the contacts that are pressed at rest are springs of the linear lattice.
+    """Return whether the contacts that are pressed at rest are springs of the linear lattice.
 
     They are if nothing else holds the masses: contacts with the ground in a lattice without walls, and all contacts in
     a lattice without springs. A mean force would push masses that no spring holds away without bound. ``gaps`` are the
@@ -35,7 +35,7 @@ def are_contacts_springs(
 
 
 def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with an incident wave or an infinite lattice where no motions of ``chain`` are sums of Bloch waves."""
+    """Yield problems with an incident wave or an infinite lattice where motions of ``chain`` are no Bloch waves."""
     reason = "a wave in springs that are not linear changes its shape as it travels"
     if not chain.cell.joins_cells:
         reason = "no linear wave travels through cells that contacts alone join"
@@ -52,7 +52,7 @@ def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
 def check_ground(
     nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
 ) -> Iterator[Problem]:
-    """Problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds.
+    """Yield problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds.
 
     ``gaps`` are the clearances in m of the sites of ``chain`` on both sides.
     """
@@ -76,7 +76,7 @@ def check_ground(
 
 
 def check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
-    """Problems with ``nfrc.open_ends``, by which the lattice goes on for ever in place of its absorbing ends."""
+    """Yield problems with ``nfrc.open_ends``, by which the lattice goes on for ever in place of its absorbing ends."""
     absorbing = sections["lattice"].absorbing
     cell, _ = check_cell(sections["lattice"])
     moved = sections["drive"].end

@@ -36,7 +36,7 @@ class Family(NamedTuple):
 
 
 def family_of(table: Table) -> tuple[Family, list[Problem]]:
-    """The family of a ``table`` with ``[nfrc.family]``, and what is wrong with that section.
+    """Return the family of a ``table`` with ``[nfrc.family]``, and what is wrong with that section.
 
     There is a member for each combination of the values of all keys; the last key varies fastest. Values are lists or
     ranges, as in ``[sweep]``.
@@ -84,13 +84,13 @@ def family_of(table: Table) -> tuple[Family, list[Problem]]:
 
 
 def _named(values: Values, texts: Sequence[str]) -> list[str]:
-    """The parts of a file's name: the short name of each key without brackets, and the text of its value."""
+    """Return the parts of a file's name: the short name of each key without brackets, and the text of its value."""
     short = short_names(list(values))
     return [f"{re.sub(r'[][]', '', name)}-{text}" for name, text in zip(short.values(), texts, strict=True)]
 
 
 def _texts(values: Sequence[Any]) -> list[str]:
-    """A text for each of the ``values``, for names of files; no two are equal.
+    """Return a text for each of the ``values``, for names of files; no two are equal.
 
     Numbers are written with the digits that distinguish them, and plain words as they are; if there is any other value,
     or one that comes twice, all are numbered: "no-1", "no-2", ...

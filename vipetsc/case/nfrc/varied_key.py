@@ -14,12 +14,12 @@ TRIED = (0.0, 0.381966, 1.0)
 
 
 def is_key(over: Any) -> bool:
-    """Whether ``nfrc.over`` is the path of a key."""
+    """Return whether ``nfrc.over`` is the path of a key."""
     return isinstance(over, str) and over not in PARAMETERS and "." in over
 
 
 def table_at(table: Table, value: float) -> tuple[Table, list[Problem]]:
-    """The ``table`` of a case whose key ``nfrc.over`` has a ``value``, for states over the amplitude; its problems."""
+    """Return the ``table`` of a case whose key ``nfrc.over`` has a ``value``, over the amplitude, and its problems."""
     changed = copy.deepcopy(table)
     nfrc = changed["nfrc"]
     key = nfrc["over"]
@@ -33,7 +33,7 @@ def table_at(table: Table, value: float) -> tuple[Table, list[Problem]]:
 
 
 def key_problems(table: Table) -> list[Problem]:
-    """Problems with the key that varies, its range and the fixed values, before any value of the key is tried."""
+    """Return problems with the key that varies, its range and fixed values, before any value of the key is tried."""
     nfrc = table["nfrc"]
     key = nfrc["over"]
     problems = []

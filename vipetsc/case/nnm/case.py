@@ -82,12 +82,12 @@ class NnmCase(CaseFile):
     @classmethod
     @cache
     def sections(cls) -> dict[str, type[Section]]:
-        """Class of each section that the verb reads; a resolved case has the drawn values instead of ``[disorder]``."""
+        """Return class of each section that the verb reads; a resolved case has drawn values, not ``[disorder]``."""
         return super().sections() | {"disorder": DisorderTable}
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The sections, with the preset's material and clearances, and everything that is wrong with them."""
+        """Return the sections, with the preset's material and clearances, and everything that is wrong with them."""
         contacts = with_preset(table).get("contacts", {})
         nnm = table.get("nnm", {})
         has_no_lattice = isinstance(nnm, dict) and nnm.get("system") == "own"
@@ -124,7 +124,7 @@ class NnmCase(CaseFile):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
-        """Problems between keys."""
+        """Return problems between keys."""
         if not valid("lattice", "contacts", "nnm"):
             return []
         lattice = sections["lattice"]
@@ -180,7 +180,7 @@ class NnmCase(CaseFile):
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 
     def physics(self) -> tuple[Any, ...]:
-        """Keys that a resumed branch must keep: the system and the shooting map."""
+        """Return keys that a resumed branch must keep: the system and the shooting map."""
         nnm = self.nnm
         # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
@@ -192,7 +192,7 @@ class NnmCase(CaseFile):
         return self.nnm.system == "condensed" or self.nnm.method == "condensed"
 
     def chain(self) -> Chain:
-        """The lattice with its sites, without dashpots."""
+        """Return the lattice with its sites, without dashpots."""
         return self.damped_chain.without_dashpots()
 
     @cached_property
@@ -201,7 +201,7 @@ class NnmCase(CaseFile):
         return build_chain(self.lattice, self.contacts)
 
     def forced_mass(self) -> int | None:
-        """The mass (from 0, through all cells) that the key ``nnm.forced`` names; None without it."""
+        """Return the mass (from 0, through all cells) that the key ``nnm.forced`` names; None without it."""
         if self.nnm.forced is None:
             return None
         *cell, mass = self.nnm.forced
@@ -211,36 +211,36 @@ class NnmCase(CaseFile):
         return masses_before + mass - 1
 
     def gaps(self) -> Gaps:
-        """Clearances in m of each contact on the sides + and -; inf where there is no stop."""
+        """Return clearances in m of each contact on the sides + and -; inf where there is no stop."""
         return gaps_of_sites(self.contacts, self._clearances())
 
     def _clearances(self) -> list[float]:
-        """The clearance in m of each contact, that of the side + unless its only stop is on the side -."""
+        """Return the clearance in m of each contact, that of the side + unless its only stop is on the side -."""
         if self.nnm.custom is not None:
             return [pair.clearance for pair in self.nnm.custom.contacts]
         count = _contact_count(self.nnm, self.lattice, self.contacts)
         return clearances(self.lattice, self.contacts, count)[:count]
 
     def laws(self) -> list[Contact]:
-        """The law of each contact, with its dissipation; the stiffness is 0 where none is given."""
+        """Return the law of each contact, with its dissipation; the stiffness is 0 where none is given."""
         count = len(self._clearances())
         contacts = with_stiffness(self.contacts, count)
         return list(laws_of_sites(contacts, count) or (contact_of(contacts),) * count)
 
     def elastic_laws(self) -> list[Contact]:
-        """The law of each contact without dissipation."""
+        """Return the law of each contact without dissipation."""
         return [replace(law, restitution=1.0) for law in self.laws()]
 
 
 def _contact_count(nnm: NnmTable, lattice: LatticeTable, contacts: ContactsTable) -> int:
-    """The number of contacts of a system that is built of the cells of a lattice."""
+    """Return the number of contacts of a system that is built of the cells of a lattice."""
     if nnm.system == "reduced":
         return 1
     return len(site_cells(lattice, contacts))
 
 
 def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], valid: Valid) -> Iterator[Problem]:
-    """Problems with the contacts and the modes of a system of one's own, whose keys have the problems ``wrong``."""
+    """Yield problems with contacts and modes of a system of one's own, whose keys have the problems ``wrong``."""
     custom = nnm.custom
     if custom is None:
         return
@@ -277,7 +277,7 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
 
 
 def _check_stops(contacts: ContactsTable, given: list[float], valid: Valid) -> Iterator[Problem]:
-    """Problems with the laws and stops of contacts whose clearances in m are ``given``."""
+    """Yield problems with the laws and stops of contacts whose clearances in m are ``given``."""
     problems = list(check_per_site(contacts, given, [False] * len(given), valid))
     yield from problems
     if not problems:
@@ -285,7 +285,7 @@ def _check_stops(contacts: ContactsTable, given: list[float], valid: Valid) -> I
 
 
 def _check_modes(nnm: NnmTable, dofs: int, rigid: int, wrong: list[Problem]) -> list[Problem]:
-    """Problems with the modes of a system of ``dofs`` masses, of which the first ``rigid`` ones are rigid motions."""
+    """Return problems with the modes of a system of ``dofs`` masses, the first ``rigid`` of them rigid motions."""
     still = [mode for mode in nnm.modes if mode <= rigid]
     problems = []
     if still:

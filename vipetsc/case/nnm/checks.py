@@ -29,7 +29,7 @@ ONE_CONTACT = "the reduced model has one contact"
 
 
 def check_options(nnm: NnmTable) -> Iterator[Problem]:
-    """Problems with a user-defined system, and with the bounds of a branch and its steps."""
+    """Yield problems with a user-defined system, and with the bounds of a branch and its steps."""
     if (nnm.system == "own") != (nnm.custom is not None):
         yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
     # On the way down the energy may tend to 0, which no number of steps in its logarithm reaches.
@@ -53,7 +53,7 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
 
 
 def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Problem]:
-    """Problems with the forced mass of a lattice of ``cells`` cells with ``masses`` each.
+    """Yield problems with the forced mass of a lattice of ``cells`` cells with ``masses`` each.
 
     For a system that is no lattice, ``cells`` is None and ``masses`` is the number of all its masses.
     """
@@ -71,7 +71,7 @@ def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Prob
 
 
 def check_size(lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
-    """The problem of a chain of ``cell`` with more masses than have all their modes computed."""
+    """Return the problem of a chain of ``cell`` with more masses than have all their modes computed."""
     dofs = lattice.cells * cell.dofs
     if dofs <= MOST_MASSES:
         return []
@@ -80,7 +80,7 @@ def check_size(lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
 
 
 def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with keys that do not apply to the reduced model, two masses of one ``cell`` and their contact."""
+    """Yield problems with keys that do not apply to the reduced model, two masses of one ``cell`` and their contact."""
     if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
         yield Problem("contacts.clearance", contacts.clearance, ONE_CONTACT)
     if contacts.clearance is None and lattice.preset is None:
@@ -107,7 +107,7 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
 
 
 def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Problem]:
-    """Problems with contacts that touch at rest; ``gaps`` are the clearances in m on both sides."""
+    """Yield problems with contacts that touch at rest; ``gaps`` are the clearances in m on both sides."""
     if not valid("contacts.clearance"):
         return
     if any(0 in gap for gap in gaps):
@@ -121,7 +121,7 @@ def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Pr
 def check_lattice(
     lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the cells and sites of a whole lattice of such cells, with the clearances ``gaps`` in m."""
+    """Yield problems with the cells and sites of a whole lattice of such cells, with the clearances ``gaps`` in m."""
     yield from check_inhomogeneity(lattice, [])
     sites = site_cells(lattice, contacts)
     if not valid("contacts"):
@@ -140,7 +140,7 @@ def check_lattice(
 
 
 def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> Iterator[Problem]:
-    """The problem of a lattice that nothing but stops to ground could hold, between which it moves freely.
+    """Yield the problem of a lattice that nothing but stops to ground could hold, between which it moves freely.
 
     ``gaps`` are the clearances in m of its sites on both sides.
     """
@@ -165,14 +165,14 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 
 def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
-    """Whether springs to the walls or to the ground, or a contact pressed to the ground, hold a lattice at rest."""
+    """Return whether springs to walls or ground, or a contact pressed to the ground, hold a lattice at rest."""
     # Springs tie the ends to the walls: a lattice that contacts alone join has none.
     has_walls = lattice.ends == "fixed" and cell.joins_cells
     return has_walls or cell.is_grounded or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
 
 
 def rigid_motions(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> int:
-    """How many motions of a valid lattice are those of bodies that nothing holds, so that their frequency is 0.
+    """Return how many motions of a valid lattice are those of bodies that nothing holds, so that their frequency is 0.
 
     Cells that contacts alone join are bodies of their own unless the contacts are pressed at rest. ``gaps`` are the
     clearances in m of its sites on both sides.
@@ -184,7 +184,7 @@ def rigid_motions(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
 
 
 def rigid_motions_of_pair(cell: UnitCell) -> int:
-    """How many motions of the reduced model of a ``cell`` are those of bodies that no spring holds."""
+    """Return how many motions of the reduced model of a ``cell`` are those of bodies that no spring holds."""
     # Node 0 stands for the middle of a spring to any other mass, where the model holds it.
     nodes = {cell.host: 1, cell.resonator: 2}
     joined = [(0, 0)]
@@ -198,20 +198,20 @@ def rigid_motions_of_pair(cell: UnitCell) -> int:
 
 
 def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
-    """The clearances on both sides of the contacts with the ground; ``gaps`` are those of all sites."""
+    """Return the clearances on both sides of the contacts with the ground; ``gaps`` are those of all sites."""
     # There are no pairs if all sites join the cell's own pair, which the ground is no part of.
     pairs = pairs_of_sites(contacts, cell, len(gaps))
     return [gaps[number] for number, pair in enumerate(pairs) if pair.host < 0]
 
 
 def _is_odd(lattice: LatticeTable) -> bool:
-    """Whether the springs' forces change sign with the elongation: no spring of any cell has a quadratic part."""
+    """Return whether the springs' forces are odd: no spring of any cell has a quadratic part."""
     varied = [key for key in lattice.nonlinear_keys if key.endswith('.quadratic"')]
     return not varied and not any(spring.quadratic for spring in lattice.undamped_cell().springs)
 
 
 def check_method(nnm: NnmTable) -> Iterator[Problem]:
-    """Problems with keys of another method than the one by which motions are found."""
+    """Yield problems with keys of another method than the one by which motions are found."""
     foreign: tuple[str, ...]
     if nnm.method == "damped":
         if nnm.system == "condensed":
@@ -233,7 +233,7 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
 
 
 def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid: Valid) -> Iterator[Problem]:
-    """Problems with the start of motions of the lattice ``chain`` without dashpots, and with its size."""
+    """Yield problems with the start of motions of the lattice ``chain`` without dashpots, and with its size."""
     yield from check_stiffness(contacts, bool(chain.sites), valid)
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
@@ -261,7 +261,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
 
 
 def check_damped(nnm: NnmTable, masses: int) -> Iterator[Problem]:
-    """The problem of damped modes of too many ``masses``, each of which has harmonics of its own."""
+    """Yield the problem of damped modes of too many ``masses``, each of which has harmonics of its own."""
     unknowns = masses * (2 * min(nnm.harmonics, MOST_OF_DAMPED) + 1)
     if nnm.method == "damped" and unknowns > MOST_UNKNOWNS:
         remedy = f"{masses} masses have up to {unknowns} unknown harmonics, of at most {MOST_UNKNOWNS}; decrease it"
@@ -269,7 +269,7 @@ def check_damped(nnm: NnmTable, masses: int) -> Iterator[Problem]:
 
 
 def check_start_sites(nnm: NnmTable, count: int) -> Iterator[Problem]:
-    """The problem of motions that begin at numbers of sites other than 1 to ``count``; signs are directions."""
+    """Yield the problem of motions that begin at numbers of sites other than 1 to ``count``; signs are directions."""
     outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
     if outside:
         yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")

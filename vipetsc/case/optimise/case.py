@@ -93,7 +93,7 @@ class OptimiseCase(StudyCase):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields, and everything that is wrong with the section or with the case to begin with."""
+        """Return the fields, and everything that is wrong with the section or with the case to begin with."""
         remedy = "give the quantities that vary, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
         table, section, missing = cls.divide(table, remedy)
         if missing:
@@ -120,16 +120,16 @@ class OptimiseCase(StudyCase):
         return {"table": table, "options": options, "base": base}, problems
 
     def warnings(self) -> list[str]:
-        """Warnings of settings in the initial case, and of variables, that are probably unintended."""
+        """Return warnings of settings in the initial case, and of variables, that are probably unintended."""
         return [*self.base.warnings(), *variable_warnings(self.options.variables, self.base)]
 
     def to_toml(self) -> str:
-        """The case as TOML; reading it back gives the same search."""
+        """Return the case as TOML; reading it back gives the same search."""
         section = self.options.model_dump(exclude_none=True)
         return tomli_w.dumps({"name": self.name} | self.table | {"optimise": section})
 
     def runs(self) -> list[CaseFile]:
-        """The case to begin with, of which designs are variations."""
+        """Return the case to begin with, of which designs are variations."""
         return [self.base]
 
     @property
@@ -158,24 +158,24 @@ class OptimiseCase(StudyCase):
         return search_space(self.options.variables, self.table, self.base)
 
     def variables(self) -> list[Variable]:
-        """Variables of the search, in the order of the values of a design."""
+        """Return variables of the search, in the order of the values of a design."""
         return self.space.variables
 
     def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
-        """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
+        """Return the values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
         return self.space.begin(clearance)
 
     def design(self, values: np.ndarray) -> Case:
-        """The case with ``values`` (variable); raises CaseError if it is impossible."""
+        """Return the case with ``values`` (variable); raises CaseError if it is impossible."""
         return case_of(self.space.table_at(values))
 
     def run(self, design: Case, amplitude: float, sample: int | None = None) -> Case:
-        """A run of a ``design`` at an ``amplitude``, recorded whole, with the scatter number ``sample`` if given."""
+        """Return a run of a ``design`` at an ``amplitude``, recorded whole, with scatter number ``sample`` if given."""
         changes = amplitude_changes(design, amplitude) | self._scatter(sample)
         return design.varied(name="design", without=("output",), output=design.output.of_points(), **changes)
 
     def responses(self, design: Case, sample: int | None = None) -> NfrcCase:
-        """The frequency responses of a ``design``, with the scatter number ``sample`` if given; raises CaseError."""
+        """Return frequency responses of a ``design``, with the scatter number ``sample`` if given; raises CaseError."""
         scatter = self._scatter(sample)
         # To vary a case is to resolve it again, which a design without scatter does not need.
         if scatter:
@@ -183,13 +183,13 @@ class OptimiseCase(StudyCase):
         return responses_of(design, self.table["nfrc"])
 
     def text_of(self, design: Case) -> str:
-        """The ``design`` as TOML, with ``[nfrc]`` if frequency responses are measured."""
+        """Return the ``design`` as TOML, with ``[nfrc]`` if frequency responses are measured."""
         if self.options.measures_responses:
             return self.responses(design).to_toml()
         return design.to_toml()
 
     def _scatter(self, sample: int | None) -> dict[str, Table]:
-        """The changes of a design that bring in the scatter number ``sample``, if any."""
+        """Return the changes of a design that bring in the scatter number ``sample``, if any."""
         disorder = self.table.get("disorder")
         if sample is None or disorder is None:
             return {}
@@ -198,13 +198,13 @@ class OptimiseCase(StudyCase):
 
 
 def responses_of(design: Case, nfrc: Any) -> NfrcCase:
-    """The frequency responses of a ``design`` by the section ``nfrc``; raises CaseError."""
+    """Return the frequency responses of a ``design`` by the section ``nfrc``; raises CaseError."""
     table = design.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
     return NfrcCase.from_table(table | {"nfrc": nfrc})
 
 
 def _problems(options: OptimiseTable, base: Case, given: Table, responses: NfrcCase | None) -> Iterator[Problem]:
-    """Problems between the keys of the section and the case to begin with."""
+    """Yield problems between the keys of the section and the case to begin with."""
     bounds = options.variables
     sites = base.model().chain.sites
     if not sites and (bounds.clearance or bounds.profile or bounds.sites):
@@ -231,7 +231,7 @@ def _problems(options: OptimiseTable, base: Case, given: Table, responses: NfrcC
 
 
 def _amplitude_problems(options: OptimiseTable) -> Iterator[Problem]:
-    """Problems with amplitudes that are given where the amplitude itself varies."""
+    """Yield problems with amplitudes that are given where the amplitude itself varies."""
     varying = [key for key in options.variables.keys_of_case() if key in AMPLITUDES]
     for at, table in options.measured_at:
         if varying and table.amplitudes:
@@ -240,7 +240,7 @@ def _amplitude_problems(options: OptimiseTable) -> Iterator[Problem]:
 
 
 def _matched_problems(table: Table) -> Iterator[Problem]:
-    """Problems with clearances that are to be matched by a scattering law: of a case that has none, or has several."""
+    """Yield problems with clearances to be matched by a scattering law: of a case that has none, or several."""
     without_scatter = {key: section for key, section in table.items() if key != "disorder"}
     try:
         law = LawCase.from_table(without_scatter | {"name": "law"})

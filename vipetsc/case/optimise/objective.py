@@ -78,7 +78,7 @@ class MeasuredTable(Section):
         return str(self.measure).startswith(RESPONSE)
 
     def at_amplitudes(self, unit: str) -> str:
-        """Words that name the amplitudes, in their ``unit``, after the name of the measure; "" without any."""
+        """Return words that name the amplitudes, in their ``unit``, after the name of the measure; "" without any."""
         if not self.amplitudes:
             return ""
         amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
@@ -91,7 +91,7 @@ class ObjectiveTable(MeasuredTable):
     goal: Literal["maximise", "minimise"] = described("whether the measure is maximised or minimised", "maximise")
 
     def describe(self, unit: str) -> str:
-        """The objective in words; amplitudes have a ``unit``."""
+        """Return the objective in words; amplitudes have a ``unit``."""
         return f"{self.goal} {self.name}{self.at_amplitudes(unit)}"
 
 
@@ -102,7 +102,7 @@ class ConstraintTable(MeasuredTable):
     at_most: Finite | None = described("upper bound, in the unit of the measure", None)
 
     def describe(self, unit: str) -> str:
-        """The constraint in words; amplitudes have a ``unit``."""
+        """Return the constraint in words; amplitudes have a ``unit``."""
         bounds = []
         if self.at_least is not None:
             bounds.append(f"at least {self.at_least:g}")
@@ -111,7 +111,7 @@ class ConstraintTable(MeasuredTable):
         return f"{self.name} {' and '.join(bounds)}{self.at_amplitudes(unit)}"
 
     def excess(self, value: float) -> float:
-        """Distance of a ``value`` beyond the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
+        """Return distance of a ``value`` beyond the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
         # Relative, so that the excesses of different constraints can be added.
         below = above = 0.0
         if self.at_least is not None:
@@ -124,7 +124,7 @@ class ConstraintTable(MeasuredTable):
 def measured_problems(
     objective: MeasuredTable, at: str, base: Case, varied: bool, responses: NfrcCase | None
 ) -> Iterator[Problem]:
-    """Problems with an ``objective`` or a constraint at the path ``at``, for designs like the case ``base``.
+    """Yield problems with an ``objective`` or a constraint at the path ``at``, for designs like the case ``base``.
 
     ``varied`` says that their cell is not that of ``base``. ``responses`` is the case of the frequency responses, None
     for a case without ``[nfrc]``, or with an invalid one.
@@ -187,7 +187,7 @@ def measured_problems(
 
 
 def _is_of_bands(objective: MeasuredTable, base: Case) -> bool:
-    """Whether an ``objective`` of runs of ``base`` is an energy of pass bands, or another number of one."""
+    """Return whether an ``objective`` of runs of ``base`` is an energy of pass bands, or another number of one."""
     if objective.band or objective.measure in (*ABOVE_DRIVEN, "band_share"):
         return True
     measure = measures_of_runs(base).get(str(objective.measure))
@@ -195,7 +195,7 @@ def _is_of_bands(objective: MeasuredTable, base: Case) -> bool:
 
 
 def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | None) -> Iterator[Problem]:
-    """Problems with a measure of frequency responses."""
+    """Yield problems with a measure of frequency responses."""
     name = str(objective.measure)
     if case is None:
         remedy = "is one of frequency responses; give their [nfrc], with its range and what is fixed"
@@ -219,7 +219,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
 
 def _nearest(name: str, valid: Sequence[str]) -> str:
-    """A remedy for a ``name`` that is not valid: the nearest of the ``valid`` names if one is near, and all of them."""
+    """Return a remedy for an invalid ``name``: the nearest of the ``valid`` names, if near, and all of them."""
     # 0.6 is difflib's own bound: below it proposals are guesses.
     near = nearest(name, valid, cutoff=0.6)
     hint = ""
@@ -229,14 +229,14 @@ def _nearest(name: str, valid: Sequence[str]) -> str:
 
 
 def measures_of_runs(base: Case) -> dict[str, RunMeasure]:
-    """The measures, by name, that every run of a case like ``base`` has, and that may be an objective."""
+    """Return the measures, by name, that every run of a case like ``base`` has, and that may be an objective."""
     points = [point.name for point in base.output.points or []]
     measures = measures_of(points, base.output.transmission or [])
     return {name: m for name, m in measures.items() if name not in NO_GOAL and m.dimension in ("", PART)}
 
 
 def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator[Problem]:
-    """Problems with a measure of every run."""
+    """Yield problems with a measure of every run."""
     bands = len(pass_bands(base.lattice.unit_cell()))
     measures = measures_of_runs(base)
     name = str(objective.measure)

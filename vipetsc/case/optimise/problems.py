@@ -19,7 +19,7 @@ CLEARANCES = ("contacts.clearance", "contacts.clearance_minus", "contacts.each.c
 
 
 def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Iterator[Problem]:
-    """Problems with the variables of a case ``base``, which was read from the ``table``."""
+    """Yield problems with the variables of a case ``base``, which was read from the ``table``."""
     if bounds.is_empty:
         valid = ", ".join(VariablesTable.model_fields)
         yield Problem(AT, None, f"contains no quantity that varies; give [low, high] for any of {valid}")
@@ -56,7 +56,7 @@ def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Itera
 
 
 def variable_warnings(bounds: VariablesTable, base: Case) -> Iterator[str]:
-    """The warning of clearances that vary at sites of the case ``base`` with a precompression."""
+    """Yield the warning of clearances that vary at sites of the case ``base`` with a precompression."""
     varying = [name for name in ("clearance", "profile") if getattr(bounds, name)]
     varying += [key for key in bounds.keys_of_case() if is_within(key, CLEARANCES)]
     pressed = values_of_sites(base.contacts, "precompression", len(base.model().chain.sites))
@@ -75,7 +75,7 @@ def variable_warnings(bounds: VariablesTable, base: Case) -> Iterator[str]:
 
 
 def _twice(key: str, given: Any, paths: Iterable[str]) -> Iterator[Problem]:
-    """The problem of a ``key`` that varies, whole or in part, by one of the ``paths`` already."""
+    """Yield the problem of a ``key`` that varies, whole or in part, by one of the ``paths`` already."""
     for path in paths:
         if is_within(path, [key]) or is_within(key, [path]):
             yield Problem(f"{AT}.{key}", given, "varies by another variable already; omit one of them")
@@ -83,7 +83,7 @@ def _twice(key: str, given: Any, paths: Iterable[str]) -> Iterator[Problem]:
 
 
 def _of_each_site(name: str, key: str, given: Any, base: Case) -> Iterator[Problem]:
-    """The problem of the ``key`` of all sites in a case in which each site has a value of its own."""
+    """Yield the problem of the ``key`` of all sites in a case in which each site has a value of its own."""
     quantity = key.removeprefix("contacts.")
     if quantity != key and quantity in lists_of(base.contacts):
         remedy = f"each site has a value of its own, contacts.each.{quantity}, which can vary instead"
@@ -91,7 +91,7 @@ def _of_each_site(name: str, key: str, given: Any, base: Case) -> Iterator[Probl
 
 
 def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
-    """The problem of a ``key`` that is invalid at a bound, or with one of the choices, of its first variable.
+    """Yield the problem of a ``key`` that is invalid at a bound, or with one of the choices, of its first variable.
 
     All other keys stay as they are. Only problems with the key itself count: others may vanish where other keys vary.
     """
@@ -114,7 +114,7 @@ def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
 
 
 def _is_about(key: str, path: str, is_entry: bool) -> bool:
-    """Whether the problem of a ``key`` is one of the value at ``path``.
+    """Return whether the problem of a ``key`` is one of the value at ``path``.
 
     It is if it names a key around that one, as for an unknown key. For an entry of a list (``is_entry``) it is not: a
     problem of the whole list is that entries exclude each other, which may vanish where they all vary.
@@ -125,7 +125,7 @@ def _is_about(key: str, path: str, is_entry: bool) -> bool:
 
 
 def _bounds_problems(bounds: VariablesTable, base: Case) -> Iterator[Problem]:
-    """Problems with the bounds of variables that have names of their own."""
+    """Yield problems with the bounds of variables that have names of their own."""
     if bounds.clearance and bounds.profile:
         yield Problem(f"{AT}.profile", bounds.profile, "give clearance or profile, not both")
 

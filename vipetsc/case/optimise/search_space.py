@@ -29,7 +29,7 @@ class SearchSpace:
     variables: list[Variable]
 
     def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
-        """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
+        """Return the values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
         values = [variable.start for variable in self.variables]
         if clearance:
             # Clearances vary one by one, or as the two ends of a profile: their paths differ.
@@ -40,11 +40,11 @@ class SearchSpace:
         return np.clip(values, [v.low for v in self.variables], [v.high for v in self.variables])
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
-        """The point (variable,) in the unit cube that stands for ``values`` (variable,)."""
+        """Return the point (variable,) in the unit cube that stands for ``values`` (variable,)."""
         return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables, strict=True)])
 
     def from_unit(self, point: np.ndarray) -> np.ndarray:
-        """The values (variable,) at a ``point`` (variable,) of the unit cube; sites rise, no two in one cell."""
+        """Return the values (variable,) at a ``point`` (variable,) of the unit cube; sites rise, no two in one cell."""
         inside = np.clip(point, 0.0, 1.0)
         values = np.array([variable.from_unit(x) for x, variable in zip(inside, self.variables, strict=True)])
 
@@ -59,7 +59,7 @@ class SearchSpace:
         return values
 
     def table_at(self, values: Iterable[float]) -> Table:
-        """The table of the case with ``values`` (variable)."""
+        """Return the table of the case with ``values`` (variable)."""
         # A copy, since all designs are built from the table of the case to begin with.
         table = copy.deepcopy(self.table)
         for variable, value in zip(self.variables, values, strict=True):
@@ -79,7 +79,7 @@ class VariableRow(NamedTuple):
 
 
 def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpace:
-    """The search space of a case ``base``, which was read from the ``table``; keys with an invalid range are left out.
+    """Return the search space of a case ``base``, read from the ``table``; keys with an invalid range are left out.
 
     A variable of which the case has no number begins with NaN.
     """
@@ -124,7 +124,7 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
 
 
 def _named_rows(bounds: VariablesTable, count: int) -> list[VariableRow]:
-    """The variables that have names of their own, of a case with ``count`` sites."""
+    """Return the variables that have names of their own, of a case with ``count`` sites."""
     numbers = range(1, count + 1)
     rows: list[VariableRow] = []
 
@@ -146,7 +146,7 @@ def _named_rows(bounds: VariablesTable, count: int) -> list[VariableRow]:
 
 
 def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
-    """The ``table`` with the cell, and with the lists over sites, to whose entries the ``paths`` lead."""
+    """Return the ``table`` with the cell, and with the lists over sites, to whose entries the ``paths`` lead."""
     table = copy.deepcopy(table)
     if any(path.startswith("lattice.cell.") for path in paths) and "cell" not in table.get("lattice", {}):
         table = with_preset(table)
@@ -170,7 +170,7 @@ def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
 
 
 def row_of(key: str, given: Any, table: Table) -> VariableRow:
-    """The variables of the ``key`` of a case, from its range or list of values; raises ValueError with the remedy."""
+    """Return the variables of the ``key`` of a case, from its range or list; raises ValueError with the remedy."""
     if isinstance(given, list):
         if len(given) < 2:
             raise ValueError("give two values or more")
@@ -189,7 +189,7 @@ def row_of(key: str, given: Any, table: Table) -> VariableRow:
 
 
 def _range_of(given: Any) -> tuple[Kind, float, float]:
-    """The kind and the bounds of a range; raises ValueError with the remedy."""
+    """Return the kind and the bounds of a range; raises ValueError with the remedy."""
     if not isinstance(given, dict) or len(given) != 1:
         raise ValueError(FORMS)
     ((kind, pair),) = given.items()
@@ -213,7 +213,7 @@ def _range_of(given: Any) -> tuple[Kind, float, float]:
 
 
 def _start(row: VariableRow, path: str, tables: Iterable[Table]) -> float:
-    """The value of the variable at ``path`` in the first of the ``tables`` that has one; NaN without a number."""
+    """Return value of the variable at ``path`` in the first of the ``tables`` that has one; NaN without a number."""
     values = [value_at(table, path) for table in tables]
     if row.kind == "choice":
         for value in values:
@@ -230,7 +230,7 @@ def _start(row: VariableRow, path: str, tables: Iterable[Table]) -> float:
 
 
 def case_of(table: Table, disorder: Any = None) -> Case:
-    """The run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
+    """Return the run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
     run = {key: value for key, value in table.items() if key in Case.model_fields} | {"name": "design"}
     if disorder is not None:
         run["disorder"] = disorder

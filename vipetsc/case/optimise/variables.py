@@ -49,7 +49,7 @@ class VariablesTable(Section):
     )
 
     def keys_of_case(self) -> dict[str, Any]:
-        """The ranges and the lists of values of keys of the case, by the keys' paths."""
+        """Return the ranges and the lists of values of keys of the case, by the keys' paths."""
         return dict(leaves({section: getattr(self, section) or {} for section in SECTIONS}))
 
     @property
@@ -83,7 +83,7 @@ class Variable(NamedTuple):
     choices: tuple[Any, ...] = ()
 
     def to_unit(self, value: float) -> float:
-        """The position between the bounds, 0 to 1, of a ``value``."""
+        """Return the position between the bounds, 0 to 1, of a ``value``."""
         if self.kind == "log":
             return float(np.log(value / self.low) / np.log(self.high / self.low))
         if self.kind == "choice":
@@ -92,7 +92,7 @@ class Variable(NamedTuple):
         return (value - self.low) / (self.high - self.low)
 
     def from_unit(self, position: float) -> float:
-        """The value at a ``position`` between the bounds, 0 to 1; of a site before it is rounded."""
+        """Return the value at a ``position`` between the bounds, 0 to 1; of a site before it is rounded."""
         if self.kind == "log":
             return float(self.low * (self.high / self.low) ** position)
         if self.kind == "choice":
@@ -104,7 +104,7 @@ class Variable(NamedTuple):
         return value
 
     def in_case(self, value: float) -> Any:
-        """A ``value`` as the case has it."""
+        """Return a ``value`` as the case has it."""
         if self.kind == "choice":
             # A copy: a choice may be a list, which two designs must not have in common.
             return copy.deepcopy(self.choices[int(value) - 1])

@@ -68,7 +68,7 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
 
 
 def without_bands(cell: UnitCell) -> str:
-    """The sentence on a cell that contacts alone join to others, with the modes that its springs give it."""
+    """Return the sentence on a cell that contacts alone join to others, with the modes that its springs give it."""
     if not cell.springs:
         return "no pass bands: only contacts join the masses, so that there are no linear waves"
     modes = ", ".join(f"{frequency:.2f}" for frequency in modes_of_a_cell(cell))
@@ -79,7 +79,7 @@ def without_bands(cell: UnitCell) -> str:
 
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
-    """The bands of a cell, each with its edges and its fastest wave, and the gaps, as for JSON; with their ``units``.
+    """Return the bands of a cell, with edges and fastest waves, and the gaps, as for JSON; with their ``units``.
 
     A cell that contacts alone join to others has neither bands nor gaps. If there are springs in it, the frequencies of
     the cell alone are its ``cell_modes``.
@@ -104,7 +104,7 @@ def bands_table(cell: UnitCell) -> dict[str, Any]:
 
 
 def bands_report(numbers: dict[str, Any]) -> str:
-    """``bands_table`` as text."""
+    """Return ``bands_table`` as text."""
     lines = ["band       low      high  rad/s    fastest: kappa/pi   rad/s   cells/s"]
     for row in numbers["bands"]:
         fastest = row["max_group_velocity"]
@@ -117,7 +117,7 @@ def bands_report(numbers: dict[str, Any]) -> str:
 
 
 def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
-    """Damping of a cell as for JSON: of the fastest wave of each band, and the decay length at ``frequency`` in rad/s.
+    """Return damping of a cell as for JSON: of each band's fastest wave, and decay lengths at ``frequency`` in rad/s.
 
     ``damping`` has the damping ratio, the damped frequency in rad/s and the time in s to decay to 1/e of each wave,
     ``decay_length`` the number of ``cells`` to 1/e of the wave that goes farthest. A time or a length without end is
@@ -150,7 +150,7 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
 
 
 def damping_report(numbers: dict[str, Any]) -> str:
-    """``damping_table`` as text; empty for a cell without dashpots."""
+    """Return ``damping_table`` as text; empty for a cell without dashpots."""
     if "damping" not in numbers:
         return ""
 

@@ -88,7 +88,7 @@ def follow_branches(
 
 
 def nnm_rows(case: NnmCase, ranks: int) -> Rows:
-    """Rows of ``validate`` on nonlinear modes: system, modes, range of energy and contact law of the branches."""
+    """Return the rows of ``validate`` on nonlinear modes: system, modes, energies and contact law of the branches."""
     low, high = case.nnm.energy
     laws = dict.fromkeys(f"{law.law}, {law.stiffness:.6g} N/m^{law.onset_exponent:g}" for law in case.laws())
     return [
@@ -98,7 +98,7 @@ def nnm_rows(case: NnmCase, ranks: int) -> Rows:
 
 
 def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
-    """Rows of ``validate`` on steady states: the lattice, the number of curves, their parameter, the fixed values."""
+    """Return the rows of ``validate`` on steady states: lattice, number of curves, their parameter, fixed values."""
     options = case.nfrc
     if options.source == "wave":
         excitation = f"an incident wave of band {options.band}, {options.direction}"
@@ -146,7 +146,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
 
 def _isola_rows(case: NfrcCase) -> Rows:
-    """A row on where and how isolated curves are looked for; none if they are not."""
+    """Return a row on where and how isolated curves are looked for; none if they are not."""
     options = case.nfrc
     if not options.isolas:
         return []
@@ -155,7 +155,7 @@ def _isola_rows(case: NfrcCase) -> Rows:
 
 
 def _family_rows(case: NfrcCase) -> Rows:
-    """A row for each key that varies in the family of curves, with its values."""
+    """Return a row for each key that varies in the family of curves, with its values."""
     rows = []
     for key, values in (case.nfrc.family or {}).items():
         unit = unit_of(key, case.table or {})
@@ -164,7 +164,7 @@ def _family_rows(case: NfrcCase) -> Rows:
 
 
 def branch_log() -> Callable[["Branch", "Point"], None]:
-    """A function that prints growing branches as a table, a line for a point, at most two lines per second."""
+    """Return a function that prints growing branches as a table, a line for a point, at most two lines per second."""
     # Points of reduced models follow each other in milliseconds: a line for each would scroll all else away.
     title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
     last = -math.inf
@@ -186,7 +186,7 @@ def branch_log() -> Callable[["Branch", "Point"], None]:
 
 
 def branch_table(branch: "Branch") -> str:
-    """Summary of a branch as text: its length and range, its special points, tongues, power laws of the slope."""
+    """Return the summary of a branch as text: length and range, special points, tongues, power laws of the slope."""
     from vipetsc.modes.branches.regions import slope_laws, tongues
 
     regular = branch.regular()
@@ -218,7 +218,7 @@ def branch_table(branch: "Branch") -> str:
 
 
 def parameter_unit(case: NfrcCase, curve: "Branch") -> str:
-    """Unit of the parameter over which a ``curve`` of the case runs."""
+    """Return the unit of the parameter over which a ``curve`` of the case runs."""
     options = case.nfrc
     if options.varies_key:
         return str(curve.about["unit"])
@@ -231,7 +231,7 @@ def parameter_unit(case: NfrcCase, curve: "Branch") -> str:
 
 
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
-    """Summary of a curve as rows: its length, special points, jumps of slow sweeps, stable points, energy balance."""
+    """Return summary of a curve as rows: length, special points, jumps of slow sweeps, stability, energy balance."""
     from vipetsc.modes.branches.sweeps import measure, parameter_values, sweep_down, sweep_up
 
     options = case.nfrc
@@ -277,7 +277,7 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
 
 
 def hold_branches(folders: Sequence[Path]) -> bool:
-    """Whether all folders hold branches; those of one name share a page."""
+    """Return whether all folders hold branches; those of one name share a page."""
     return all(any(folder.glob("branch-*.h5")) and not (folder / "run.h5").exists() for folder in folders)
 
 

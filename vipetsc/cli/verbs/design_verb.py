@@ -8,7 +8,7 @@ from vipetsc.io.kinds import SEARCH
 
 
 def design_rows(case: DesignCase, ranks: int) -> Rows:
-    """A row of ``validate`` with the size of the grid, and the readings in which it is searched."""
+    """Return a row of ``validate`` with the size of the grid, and the readings in which it is searched."""
     search = case.design
     cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
     return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]

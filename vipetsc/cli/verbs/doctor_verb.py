@@ -38,7 +38,7 @@ def compile_now(comm: "MPI.Comm") -> None:
 
 
 def doctor_table(comm: "MPI.Comm") -> tuple[str, bool]:
-    """The versions and checks as a table, and whether the program can work here; all ranks must call it."""
+    """Return the versions and checks as a table, and whether the program can work here; all ranks must call it."""
     results = checks(comm)
     names = {check.name for check in results}
     about = {name.replace("_version", ""): str(value) for name, value in provenance(comm).items()}

@@ -53,7 +53,7 @@ def examples(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -
 
 
 def shipped_examples() -> dict[str, Example]:
-    """The case files of the package by their names."""
+    """Return the case files of the package by their names."""
     # Imported here: the classes of cases take a second to load, and the parser, which loads this module, needs none.
     from vipetsc.case.verb_cases import verbs_of
 
@@ -67,7 +67,7 @@ def shipped_examples() -> dict[str, Example]:
 
 
 def _listed(shipped: Iterable[Example]) -> str:
-    """The ``shipped`` case files as lines of name, verbs and sentence."""
+    """Return the ``shipped`` case files as lines of name, verbs and sentence."""
     rows = [(one.name, ", ".join(one.verbs), one.sentence) for one in shipped]
     name_width = max(len(name) for name, _, _ in rows)
     verb_width = max(len(verbs) for _, verbs, _ in rows)
@@ -75,7 +75,7 @@ def _listed(shipped: Iterable[Example]) -> str:
 
 
 def _chosen(shipped: dict[str, Example], names: list[str]) -> list[Example]:
-    """The examples with these ``names``, with or without ``.toml``; raises CaseError for others."""
+    """Return the examples with these ``names``, with or without ``.toml``; raises CaseError for others."""
     problems = []
     if not names:
         problems.append(Problem("NAME", None, "name the case files to copy, or take --all"))
@@ -125,7 +125,7 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
 
 
 def _holds(path: Path, content: bytes) -> bool:
-    """Whether ``path`` is a file with this ``content``."""
+    """Return whether ``path`` is a file with this ``content``."""
     return path.is_file() and path.read_bytes() == content
 
 

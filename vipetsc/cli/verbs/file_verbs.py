@@ -34,13 +34,13 @@ def export(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> 
 
 
 def existing_folders(paths: list[Path], comm: "MPI.Comm") -> list[Path]:
-    """The folders to lock for ``paths``: each path itself, or the folder of a file."""
+    """Return the folders to lock for ``paths``: each path itself, or the folder of a file."""
     # A missing path has no folder to lock; the verb refuses it with a reason.
     return on_root(comm, lambda: [_folder_of(path) for path in paths if path.exists()])
 
 
 def _folder_of(path: Path) -> Path:
-    """The ``path`` itself if it is a folder, else the folder of the file."""
+    """Return the ``path`` itself if it is a folder, else the folder of the file."""
     if path.is_dir():
         return path
     return path.parent

@@ -9,7 +9,7 @@ from vipetsc.io.kinds import IDENTIFIED
 
 
 def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
-    """Rows of ``validate``: the parameters and the number of starts, and each record with its sensors."""
+    """Return rows of ``validate``: the parameters and the number of starts, and each record with its sensors."""
     parameters = first_few([parameter.name for parameter in plan.parameters])
     rows = [("identify", f"{parameters}; starts: {plan.options.starts}")]
     for record in plan.options.records:

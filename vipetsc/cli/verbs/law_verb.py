@@ -9,7 +9,7 @@ from vipetsc.io.kinds import LAW
 
 
 def law_rows(case: LawCase, ranks: int) -> Rows:
-    """A row of ``validate`` with the range of the law, and the site, the ring and the samples of its runs."""
+    """Return a row of ``validate`` with the range of the law, and the site, the ring and the samples of its runs."""
     site = case.one_site()
     where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
     return [("law", f"z to {case.law.largest:g}, {where}; ring of {site.cells} cells, {site.samples} samples")]

@@ -10,7 +10,7 @@ from vipetsc.wording import counted
 
 
 def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
-    """Rows of ``validate``: number of designs, variables, frequency responses that are measured, objectives."""
+    """Return rows of ``validate``: number of designs, variables, frequency responses that are measured, objectives."""
     responses: Rows = []
     if plan.options.measures_responses:
         case = plan.responses(plan.base)

@@ -30,7 +30,7 @@ PAGE_WIDTHS = 1.0, 40.0  # of a picture, in inches
 
 
 def positive(text: str) -> float:
-    """The positive number in ``text``; raises ArgumentTypeError for one that is not positive, ValueError for none."""
+    """Return the positive number in ``text``; raises ArgumentTypeError for another one, ValueError for none."""
     value = float(text)
     if not 0 < value < float("inf"):
         # argparse prints the text of this exception; in place of that of a ValueError it prints its own.
@@ -39,7 +39,7 @@ def positive(text: str) -> float:
 
 
 def window(text: str) -> tuple[int, int]:
-    """First and last cell of ``A:B``, from 1; raises ArgumentTypeError for another text."""
+    """Return the first and last cell of ``A:B``, from 1; raises ArgumentTypeError for another text."""
     first, separator, last = text.partition(":")
     if not (separator and first.isdigit() and last.isdigit()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form A:B, the first and the last cell, from 1")
@@ -72,7 +72,7 @@ def width(text: str) -> Width:
 
 
 def label(text: str) -> tuple[str, str]:
-    """The key and the text of ``KEY=TEXT``; raises ArgumentTypeError for another text."""
+    """Return the key and the text of ``KEY=TEXT``; raises ArgumentTypeError for another text."""
     key, separator, value = text.partition("=")
     if not (key and separator):
         raise argparse.ArgumentTypeError(f'{text} is not of the form KEY=TEXT, as in drive.amplitude="Force"')
@@ -178,7 +178,7 @@ def look_of(options: argparse.Namespace, inches: float | None) -> "Look":
 
 
 def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
-    """The pictures of the results in ``paths``, and their folders, also where files of results are named; on one rank.
+    """Return the pictures of the results in ``paths``, which may be files, and their folders; on one rank.
 
     A folder in which no results are recognised counts as that of a run, whose pictures say what is missing. Raises
     FolderError for folders whose results cannot share a page.

@@ -26,7 +26,7 @@ SUMMARY = {
 
 
 def predict_rows(case: PredictCase, ranks: int) -> Rows:
-    """Rows of ``validate``: the lattice, the amplitudes, the runs that predictions are composed of, the comparison."""
+    """Return the rows of ``validate``: lattice, amplitudes, runs that predictions are composed of, comparison."""
     options = case.predict
     if options.amplitudes:
         low = min(options.amplitudes)
@@ -51,7 +51,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
 
 
 def prediction_table(data: xr.Dataset) -> str:
-    """Predicted and simulated fractions of the energy at every amplitude, and their differences."""
+    """Return predicted and simulated fractions of the energy at every amplitude, and their differences."""
     # Simulated columns need ``predict.simulate``, and the columns of dashpots need a lattice that has some.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     quantities = [name for name in ("upper", "other", "dissipated", "dashpots") if f"predicted/{name}" in data]

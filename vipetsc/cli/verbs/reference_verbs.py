@@ -43,7 +43,7 @@ def schema(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> 
 
 
 def schema_of(path: str | None) -> dict[str, Any]:
-    """The JSON schema of case files that name the same modules as the file ``path``, or none; raises CaseError."""
+    """Return JSON schema of case files that name the same modules as the file ``path``, or none; raises CaseError."""
     from vipetsc.case.keys import json_schema
     from vipetsc.case.parts import module_names, with_parts
     from vipetsc.case.reading import read_toml

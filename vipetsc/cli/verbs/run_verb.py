@@ -49,7 +49,7 @@ EXTEND = argument(
 
 
 def load(options: argparse.Namespace) -> Case:
-    """The case of the file, or of one member if ``--member`` names it and CASE is a sweep; raises CaseError."""
+    """Return the case of the file, or of one member if ``--member`` names it and CASE is a sweep; raises CaseError."""
     if options.member is None:
         return Case.load(options.case, options.set)
 
@@ -67,7 +67,7 @@ def load(options: argparse.Namespace) -> Case:
 
 
 def _sweep_of(options: argparse.Namespace) -> Sweep:
-    """The sweep whose file or folder is given as CASE; raises CaseError."""
+    """Return the sweep whose file or folder is given as CASE; raises CaseError."""
     # Without CASE the path is a text that names no file: the message about that file then says what is missing.
     path = Path(options.case or "the case of a sweep")
     if path.is_dir():
@@ -129,7 +129,7 @@ def measure_unless_measured(case: Case, work: Work) -> None:
 
 
 def run_rows(case: Case, ranks: int) -> Rows:
-    """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
+    """Return the rows of ``validate`` on a run: lattice, drive, times, samples, files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_size, memory_available, memory_needed
     from vipetsc.dynamics.plan import RunPlan
@@ -188,7 +188,7 @@ def _closing(model: Model) -> str:
 
 
 def _drive_rows(case: Case) -> Rows:
-    """Rows on the drives, the waves at their frequency, and the times at which the drives and the run end."""
+    """Return rows on the drives, the waves at their frequency, and the times at which the drives and the run end."""
     model = case.model()
     rows: Rows = []
     # A beam has a drive at each of its places.
@@ -280,7 +280,7 @@ def run_table(result: "Result", faster: str = "", drives: Sequence[str] = ()) ->
 
 
 def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
-    """A table of the measures of the run's named points, and sentences about steady amplitudes that are none.
+    """Return a table of the measures of the run's named points, and sentences about steady amplitudes that are none.
 
     The table is empty if the case names no points.
     """
@@ -343,7 +343,7 @@ def _measure_where_missing(folder: Path) -> None:
 
 
 def hold_runs(folders: Sequence[Path]) -> bool:
-    """Whether each of ``folders`` holds a finished run."""
+    """Return whether each of ``folders`` holds a finished run."""
     return all((folder / RUN.file).exists() for folder in folders)
 
 

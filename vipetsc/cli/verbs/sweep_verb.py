@@ -61,7 +61,7 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
 
 
 def sweep_table(result: "SweepResult") -> str:
-    """Ending of a sweep as a table: how its members ended, times, the first failures."""
+    """Return ending of a sweep as a table: how its members ended, times, the first failures."""
     # A sweep of the command line always has a folder.
     assert result.folder
     complete, scaled, failed, missing = (result.count(status) for status in range(4))
@@ -96,7 +96,7 @@ def relate_to_branches(folders: Sequence[Path]) -> None:
 
 
 def begin_with_a_sweep(folders: Sequence[Path]) -> bool:
-    """Whether the first of ``folders`` holds a sweep; the others may hold branches, or sweeps for the same pages."""
+    """Return whether the first of ``folders`` holds a sweep; others may hold branches, or sweeps for its pages."""
     return (folders[0] / "ensemble.h5").exists()
 
 

@@ -27,7 +27,7 @@ def validate(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -
 
 
 def report_of(options: argparse.Namespace, ranks: int) -> str:
-    """The rows of all verbs that read the case, and its warnings; raises CaseError. Called on one rank."""
+    """Return the rows of all verbs that read the case, and its warnings; raises CaseError. Called on one rank."""
     from vipetsc.cli.verbs.verb_list import verb_of
     from vipetsc.dynamics.plan import check_petsc_options
 
@@ -50,7 +50,7 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
 
 
 def part_rows(case: CaseFile) -> Rows:
-    """A row for each part, such as a contact law, that a module has registered and the case uses."""
+    """Return a row for each part, such as a contact law, that a module has registered and the case uses."""
     rows = []
     for plugin, part in parts_in_use(tomllib.loads(case.to_toml())):
         version = ""
@@ -61,7 +61,7 @@ def part_rows(case: CaseFile) -> Rows:
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
-    """A row for each quantity with ``disorder``: its deviation, and the first values of the case that was ``drawn``.
+    """Return a row for each quantity with ``disorder``: its deviation, and the first values that were ``drawn``.
 
     The values are ratios to those of the ``nominal`` case; those of sites are cells.
     """

@@ -10,7 +10,7 @@ from vipetsc.cli.verb import StudyVerb, Verb
 
 
 def _declared() -> Iterator[Verb]:
-    """All verbs that the modules of this folder declare, module by module."""
+    """Yield all verbs that the modules of this folder declare, module by module."""
     # Modules are found, not listed: a verb that is there cannot be missing from the help, completion or tests.
     for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         name = f"{__package__}.{module.name}"
@@ -24,10 +24,10 @@ VERBS: dict[str, Verb] = {verb.name: verb for verb in sorted(_declared(), key=la
 
 
 def study_verbs() -> list[StudyVerb]:
-    """The verbs that compute results of a case."""
+    """Return the verbs that compute results of a case."""
     return [verb for verb in VERBS.values() if isinstance(verb, StudyVerb)]
 
 
 def verb_of(case: CaseFile) -> StudyVerb:
-    """The verb that reads ``case``."""
+    """Return the verb that reads ``case``."""
     return next(verb for verb in study_verbs() if verb.case is type(case))

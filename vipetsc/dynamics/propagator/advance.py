@@ -89,7 +89,7 @@ LANDING_GOAL = 0.05
 
 @kernel
 def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
-    """Whether a ``site`` has stayed within the tolerance of a landing in a substep of that ``length``."""
+    """Return whether a ``site`` has stayed within the tolerance of a landing in a substep of that ``length``."""
     # Without a length nothing was tried: the site is where it was.
     end = cluster.site_motion[site]
     if length > 0.0:
@@ -129,7 +129,7 @@ def _advance_freely(cluster: Cluster) -> tuple[int, int]:
 
 @inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
-    """The next substep: as long as its error allows, and not beyond a point where a drive is not smooth.
+    """Return the next substep: as long as its error allows, and not beyond a point where a drive is not smooth.
 
     While a contact is young its force is a root of time: nodes of the kind ``ONSET`` follow it from the onset on, plain
     ones over ``MOST_AGES`` of its age.
@@ -179,7 +179,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 
 @kernel
 def _first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
-    """Position, as a fraction of a substep tried, of the first kink; 2 if none or another change comes first."""
+    """Return position, as a fraction of a substep tried, of the first kink; 2 if none or another change comes first."""
     has_permanent = False
     for i in trial.closed:
         has_permanent |= abs(cluster.contacts[i].mode) == PERMANENT

@@ -91,7 +91,7 @@ class DofTables(NamedTuple):
 
 
 def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
-    """The ``groups`` of which a DoF lies within ``reach`` cells of the rank's.
+    """Return the ``groups`` of which a DoF lies within ``reach`` cells of the rank's.
 
     ``dofs`` (dof,) are the records of ``contact_dofs`` of ``groups.numbers``, in that order.
     """
@@ -156,13 +156,13 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
 
 
 def _owned_cells(leftmost: np.ndarray, count: int, layout: Layout) -> np.ndarray:
-    """Local numbers (dof, count) of the ``count`` cells from ``leftmost`` (dof,) on, -1 for a cell of another rank."""
+    """Return local numbers (dof, count) of ``count`` cells from ``leftmost`` (dof,) on, -1 for another rank's cell."""
     cells = layout.topology.neighbour(leftmost[:, None], np.arange(count))
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
 def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.ndarray:
-    """Rows c (-A)^m as in ``DofTables`` of the ``forms`` c (table, k, mass), k = 0, 1 the first and the next cell.
+    """Return the rows c (-A)^m as in ``DofTables`` of ``forms`` c (table, k, mass), k = 0, 1 this and the next cell.
 
     ``cells`` (table, k) are these cells, or representatives of them.
     """
@@ -302,7 +302,7 @@ def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: 
 
 @kernel
 def is_zero(row: np.ndarray) -> bool:
-    """Whether all numbers of a ``row`` (number,) are zero."""
+    """Return whether all numbers of a ``row`` (number,) are zero."""
     zero = True
     for value in row:
         zero &= value == 0.0

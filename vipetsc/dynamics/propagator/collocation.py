@@ -90,7 +90,7 @@ BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
 @kernel
 def _force_on_site(contacts: np.ndarray, i: int, w: float, rate: float) -> float:
-    """Force in N that moves the relative displacement w of site ``i``.
+    """Return the force in N that moves the relative displacement w of site ``i``.
 
     ``contact_force`` is that on the host. It pushes the other mass the opposite way, and w is the other mass's
     displacement less the host's: so the sign. The load of a contact that is pressed at rest, ``preload``, is balanced
@@ -102,7 +102,7 @@ def _force_on_site(contacts: np.ndarray, i: int, w: float, rate: float) -> float
 
 @kernel
 def _force_of_spring(cluster: Cluster, i: int, z: float) -> float:
-    """Force in N on the elongation z in m of the spring that DoF ``i`` is, beyond its linear part."""
+    """Return the force in N on the elongation z in m of the spring that DoF ``i`` is, beyond its linear part."""
     return -nonlinear_force(cluster.springs[i - cluster.contacts.size].law, z)
 
 
@@ -222,7 +222,7 @@ def _put_reactions(cluster: Cluster, taylor: np.ndarray, forces: np.ndarray, out
 
 @inlined
 def _stride(cluster: Cluster) -> int:
-    """The distance between powers of time in a response: 2, since they are odd, or with dashpots 1.
+    """Return the distance between powers of time in a response: 2, since they are odd, or with dashpots 1.
 
     A series has 2 n coefficients, a response its n odd ones, or with dashpots the 2 n - 1 after the zeroth: the sizes
     of the two arrays tell them apart.
@@ -553,7 +553,7 @@ def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 
 @kernel
 def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
-    """Estimated error of a substep of ``length`` over the allowed one, by the forces' last two Legendre coefficients.
+    """Return estimated error of a substep of ``length`` over the allowed one, by the last two Legendre coefficients.
 
     ``advance`` accepts a ratio up to 1, and the next length follows from it. Both coefficients count, for in a force
     that is symmetric about the substep's middle every other one vanishes. The error of a force becomes one of velocity
@@ -576,7 +576,7 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
 
 @kernel
 def _error_of_force(cluster: Cluster, trial: Trial, i: int, length: float) -> float:
-    """Estimated error in m/s of the rate of DoF ``i`` by its own force in a substep of ``length``."""
+    """Return estimated error in m/s of the rate of DoF ``i`` by its own force in a substep of ``length``."""
     last = 0.0
     for row in range(2):
         coefficient = 0.0

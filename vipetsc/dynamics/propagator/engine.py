@@ -76,7 +76,7 @@ def _complete(state: np.ndarray, states: States, ledger: np.ndarray, energies: n
 
 @kernel
 def _is_driven(dofs: DofTables, c: int, drives: Drives, begin: float) -> bool:
-    """Whether a drive of cluster ``c`` is on in the step from ``begin`` in s on."""
+    """Return whether a drive of cluster ``c`` is on in the step from ``begin`` in s on."""
     driven = False
     # Behind its sites and springs a cluster has its driven masses.
     for i in range(dofs.first[c] + dofs.sites[c] + dofs.springs[c], dofs.first[c + 1]):
@@ -261,7 +261,7 @@ class Propagator(Engine):
         forces.tracker.tracks = tracks._replace(log=log)
 
     def _first_reason(self) -> str:
-        """The reason of the first failure; all ranks must call it."""
+        """Return the reason of the first failure; all ranks must call it."""
         progress = self._record.progress[0]
         cluster = int(progress["cluster"])
         reason = "the state is not finite"
@@ -288,7 +288,7 @@ class Propagator(Engine):
             self._record.progress["steps"] = steps
 
     def _time_after(self, steps: int) -> float:
-        """Time in s after so many ``steps``, summed as in ``take_steps``."""
+        """Return time in s after so many ``steps``, summed as in ``take_steps``."""
         record = self._record
         return steps // record.parts * record.sample_interval + steps % record.parts * self.series.interval
 
@@ -298,7 +298,7 @@ class Propagator(Engine):
         return self._forces.take_episodes(unfinished)
 
     def statistics(self) -> dict[str, Any]:
-        """Linear steps and what the clusters did, the step and its band."""
+        """Return linear steps and what the clusters did, the step and its band."""
         series = self.series
         band = {
             "method": f"P({series.interval:.6g} s)",

@@ -204,7 +204,7 @@ class Forces:
         self._logs_number[groups.numbers[self._is_logged]] = True
 
     def _each_cluster(self) -> PartRecords:
-        """The record of each cluster, by its number."""
+        """Return the record of each cluster, by its number."""
         first = self.dofs.first[:-1]
         stop = self.dofs.first[1:]
         last_site = first + self.dofs.sites
@@ -236,20 +236,20 @@ class Forces:
             clusters.state["length"][c] = min(clusters.state["length"][c], first)
 
     def sites(self, c: int) -> list[int]:
-        """The sites, counted from 1, of cluster ``c``; none of -1."""
+        """Return the sites, counted from 1, of cluster ``c``; none of -1."""
         if c < 0:
             return []
         numbers = self._numbers[self.dofs.first[c] :][: self.dofs.sites[c]]
         return (numbers + 1).tolist()
 
     def first_cell(self, c: int) -> int:
-        """The first cell, from 0, in which cluster ``c`` has a DoF; -1 of -1. It grows with ``c``."""
+        """Return the first cell, from 0, in which cluster ``c`` has a DoF; -1 of -1. It grows with ``c``."""
         if c < 0:
             return -1
         return int(self._cells[self.dofs.first[c] : self.dofs.first[c + 1]].min())
 
     def describe(self, c: int) -> str:
-        """The contacts and the nonlinear springs of cluster ``c`` in words; empty of -1, or if there are none."""
+        """Return contacts and the nonlinear springs of cluster ``c`` in words; empty of -1, or if there are none."""
         if c < 0:
             return ""
         sites = self.sites(c)
@@ -263,7 +263,7 @@ class Forces:
         return " and ".join(acting)
 
     def take_episodes(self, unfinished: bool) -> np.ndarray:
-        """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
+        """Return episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
         if unfinished:
             _update_open_episodes(self.clusters.contacts, self.clusters.history, self.tracker.tracks)
         losses = self.clusters.energy - self.tracker.clipped_energies(self.clusters.site_motion)
@@ -271,7 +271,7 @@ class Forces:
         return episodes[self._logs_number[episodes["site"]]]
 
     def statistics(self) -> dict[str, Any]:
-        """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
+        """Return substeps, landings and limits of the contact law, over all ranks; all must call it."""
         state = self.clusters.state[self.logs]
         sites = self.tracker.counts[self._is_logged]
         counts = [state[name].sum() for name in COUNTS] + [sites[name].sum() for name in LIMITS]
@@ -280,7 +280,7 @@ class Forces:
         return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """``forces`` and ``sites`` of the clusters that this rank logs."""
+        """Return ``forces`` and ``sites`` of the clusters that this rank logs."""
         forces = np.zeros(len(self._numbers), FORCE)
         forces["number"] = self._numbers
         forces["energy"] = self.clusters.energy
@@ -303,7 +303,7 @@ class Forces:
 
 
 def _site_numbers(groups: Groups, model: Model) -> np.ndarray:
-    """The numbers (dof,) of the sites in ``groups``, -1 for springs and drives."""
+    """Return the numbers (dof,) of the sites in ``groups``, -1 for springs and drives."""
     return np.where(groups.numbers < len(model.chain.sites), np.maximum(groups.numbers, -1), -1)
 
 

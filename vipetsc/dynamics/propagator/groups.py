@@ -28,7 +28,7 @@ class Groups(NamedTuple):
     first: np.ndarray
 
     def counts(self, marked: np.ndarray) -> np.ndarray:
-        """How many DoFs of each group (group,) are ``marked`` (dof,)."""
+        """Return how many DoFs of each group (group,) are ``marked`` (dof,)."""
         before = np.append(0, np.cumsum(marked))
         return before[self.first[1:]] - before[self.first[:-1]]
 
@@ -45,7 +45,7 @@ class Groups(NamedTuple):
 
 
 def spans_cells(chain: Chain) -> bool:
-    """Whether forces act between masses of two cells: by contacts, or by nonlinear springs."""
+    """Return whether forces act between masses of two cells: by contacts, or by nonlinear springs."""
     springs = nonlinear_springs(chain)
     # Springs to a wall act on one mass.
     joins = (springs.start >= 0) & (springs.end >= 0)
@@ -55,7 +55,7 @@ def spans_cells(chain: Chain) -> bool:
 
 @lru_cache(maxsize=2)  # each table of an engine asks for those of its model
 def contact_dofs(model: Model) -> np.ndarray:
-    """The DoFs on which forces act: relative displacements of the sites, elongations, displacements of driven masses.
+    """Return the DoFs on which forces act: relative displacements of sites, elongations, driven masses.
 
     The array (dof,) can be indexed by a site's number, after the sites by that of a spring, or, from the end, by -n
     for the n-th drive: drives come last, in reverse. ``cell`` is a DoF's first cell and ``last`` its last one, the same

@@ -35,7 +35,7 @@ class Collocation(NamedTuple):
 
 
 def _lay_out(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position s in the substep (3, ...) at ``z`` in [0, 1] for each kind of nodes, and its slope ds/dz."""
+    """Return the position s in the substep (3, ...) at ``z`` in [0, 1] for each kind of nodes, and its slope ds/dz."""
     position = np.stack([z, z * z, z * (2 - z)])
     slope = np.stack([np.ones_like(z), 2 * z, 2 - 2 * z])
     return position, slope
@@ -43,20 +43,20 @@ def _lay_out(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache
 def at_end() -> np.ndarray:
-    """Weights (node,) that extrapolate what is smooth in z from its values at the nodes to a substep's end, z = 1."""
+    """Return weights (node,) that extrapolate what is smooth in z from the nodes to a substep's end, z = 1."""
     z, _ = gauss(NODES)
     return np.array([np.prod([(1 - a) / (b - a) for a in z if a != b]) for b in z])
 
 
 def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss's nodes (node,) and weights (node,) on [0, 1]; ``count`` is their number."""
+    """Return Gauss's nodes (node,) and weights (node,) on [0, 1]; ``count`` is their number."""
     nodes, weights = leggauss(count)
     return (1 + nodes) / 2, weights / 2
 
 
 @lru_cache
 def collocation(powers: int) -> Collocation:
-    """Tables for the powers 0 to ``powers`` - 1."""
+    """Return tables for the powers 0 to ``powers`` - 1."""
     z, weight = gauss(NODES)
     position, slope = _lay_out(z)
 

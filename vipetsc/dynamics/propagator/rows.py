@@ -34,7 +34,7 @@ class PowerRecursion(NamedTuple):
 
 
 def power_rows(first: np.ndarray, terms: int, recursion: PowerRecursion) -> np.ndarray:
-    """The rows (..., term, dof, cell) of ``terms`` powers from the zeroth, ``first`` (..., dof, cell), on.
+    """Return the rows (..., term, dof, cell) of ``terms`` powers from the zeroth, ``first`` (..., dof, cell), on.
 
     With dashpots (..., 2 term, 2 dof, cell): of each power of time, from displacements and from H times velocities.
     """
@@ -71,7 +71,7 @@ class _Neighbourhoods(NamedTuple):
 
 
 def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
-    """The recursion for rows of the masses of ``cells``, each with the coefficients of the cells on either side of it.
+    """Return the recursion for rows of the masses of ``cells``, with the coefficients of cells on either side.
 
     ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has; there must be more
     neighbours on either side than powers. Neighbours further away than ``near`` are taken to be as the reference cell,
@@ -96,7 +96,7 @@ def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np
 
 
 def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int) -> Coefficients:
-    """Coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on either side of each of ``cells``.
+    """Return coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on both sides of ``cells``.
 
     They are those of the reference cell beyond the ``near`` ones. Grounding is that of dashpots to the ground. They
     have extended precision: the entries of P(H) are sums of high powers of them, must be good to double precision, and
@@ -117,7 +117,7 @@ def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int) -
 def _multiply(
     neighbours: _Neighbourhoods, springs: np.ndarray, ground: np.ndarray | None, rows: np.ndarray
 ) -> np.ndarray:
-    """The ``rows`` (cell, row, dof, neighbour) times - M^-1 V, V the matrix of ``springs`` (cell, spring, neighbour).
+    """Return ``rows`` (cell, row, dof, neighbour) times - M^-1 V, V of ``springs`` (cell, spring, neighbour).
 
     ``ground`` (cell, 1, dof, neighbour) is added to V's diagonal. V is symmetric: -x V is the force of the springs on
     masses that are displaced by the row x.
@@ -166,7 +166,7 @@ class Bounds(NamedTuple):
         return (self.damping + np.hypot(self.damping, 2 * self.frequency)) / 2
 
     def recursion(self, interval: float) -> PowerRecursion:
-        """The recursion, for steps of ``interval`` in s, of rows that are no smaller than any cell's in magnitude."""
+        """Return the recursion, for steps of ``interval`` in s, of rows at least as large as any cell's."""
         by_damping = None
         if self.damping:
             by_damping = partial(_multiply_magnitudes, interval * self.by_damping)
@@ -174,7 +174,7 @@ class Bounds(NamedTuple):
 
 
 def _multiply_magnitudes(entries: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """A matrix with ``entries`` (3, dof, dof) as in ``Bounds`` in every cell, times ``rows`` (..., dof, cell)."""
+    """Return a matrix with ``entries`` (3, dof, dof) of ``Bounds`` in every cell, times ``rows`` (..., dof, cell)."""
     total = np.zeros_like(rows)
     for offset in (-1, 0, 1):
         total = total + entries[1 + offset] @ np.roll(rows, -offset, axis=-1)
@@ -182,7 +182,7 @@ def _multiply_magnitudes(entries: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def bounds_of(chain: Chain) -> Bounds:
-    """The bounds of all cells of ``chain``."""
+    """Return the bounds of all cells of ``chain``."""
     # Without variation one cell has the bounds of all; at a free or fixed end a mass has no more springs than inside.
     if chain.variation is None:
         chain = Chain(chain.cell, 1)
@@ -207,7 +207,7 @@ def bounds_of(chain: Chain) -> Bounds:
 def _matrix_bounds(
     chain: Chain, masses: np.ndarray, springs: np.ndarray, ground: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Largest circle of M^-1/2 V M^-1/2, and largest entries (3, dof, dof) of V M^-1 in magnitude.
+    """Return the largest circle of M^-1/2 V M^-1/2, and largest entries (3, dof, dof) of V M^-1 in magnitude.
 
     V is the matrix of ``springs`` (cell, spring), ``ground`` (cell, dof) on its diagonal; all arrays have one cell more
     on either side than are looked at.

@@ -83,7 +83,7 @@ class StepSeries:
         return next((m for m in range(2, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
-        """Bound on what ``terms`` terms leave out of a state of unit amplitude: see the module's docstring."""
+        """Return bound on what ``terms`` terms leave out of a state of unit amplitude: see the module's docstring."""
         # The first power of time that the velocity's series leaves out.
         k = 2 * terms - 1
         # Of a step that is far too long the power overflows: no number of terms is enough.
@@ -116,7 +116,7 @@ class StepSeries:
         return power_rows(self._zeroth, self.terms, recursion)[0]
 
     def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
-        """Magnitudes of P's entries (2 dof, 2 dof, cell) for ``rows``; a velocity counts as omega times u."""
+        """Return magnitudes of P's entries (2 dof, 2 dof, cell) for ``rows``; a velocity counts as omega times u."""
         n = self.chain.cell.dofs
         # A lattice without springs has no omega; any rate serves.
         omega = (self.omega_max_h or 1.0) / self.interval
@@ -138,7 +138,7 @@ class StepSeries:
         return self._magnitudes(power_rows(self._zeroth, self.terms, self.bounds.recursion(self.interval))[0])
 
     def _sum_beyond(self, distance: int) -> float:
-        """Largest sum of P's magnitudes over the cells further away than ``distance``."""
+        """Return the largest sum of P's magnitudes over the cells further away than ``distance``."""
         is_beyond = np.abs(np.arange(-self._outermost, self._outermost + 1)) > distance
         left_out = float(self._largest_magnitudes.sum(axis=1)[:, is_beyond].sum(axis=1).max())
         if self.chain.variation is None:
@@ -166,7 +166,7 @@ class StepSeries:
         return self._sum_beyond(self.reach) + small + self._remainder(self.terms)
 
     def power_rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
-        """Rows (dof, term, dof, cell) of the masses of each of ``cells``, over all cells within ``_outermost`` of it.
+        """Yield rows (dof, term, dof, cell) of the masses of ``cells``, over all cells within ``_outermost`` of each.
 
         Near an end, cells beyond it get zeros. A cell whose reach ends before the end gets the rows that it would have
         in an endless chain, as all of a periodic chain do: its neighbours are numbered on beyond the last cell, and
@@ -192,7 +192,7 @@ class StepSeries:
         return lru_cache(maxsize=KEPT)(compute)
 
     def _compute_rows(self, cells: np.ndarray) -> Iterator[np.ndarray]:
-        """The rows of each of ``cells``, see ``rows``."""
+        """Yield the rows of each of ``cells``, see ``rows``."""
         distances = np.arange(-self._outermost, self._outermost + 1)
         for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
             is_inside = self.chain.topology.neighbour(batch[:, None], distances) >= 0
@@ -202,7 +202,7 @@ class StepSeries:
             yield from power_rows(np.repeat(self._zeroth, len(batch), axis=0), self.terms, recursion)
 
     def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:
-        """The columns of ``count`` cells of ``rows`` (dof, term, dof, cell), from ``first`` after the row's own on.
+        """Return columns of ``count`` cells of ``rows`` (dof, term, dof, cell), from ``first`` after the row's own on.
 
         A ``first`` below 0 lies before it. Columns that ``rows`` do not have are zero.
         """
@@ -211,7 +211,7 @@ class StepSeries:
         return np.pad(rows, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
 
     def factors(self) -> np.ndarray:
-        """Factors of the powers of s, H^(k mod 2)/k!; with dashpots 1/k! of displacements, then H/k! of velocities."""
+        """Return the factors of powers of s, H^(k mod 2)/k!; with dashpots 1/k!, then H/k! of velocities."""
         h = self.interval
         powers = range(2 * self.terms)
         if self.is_damped:
@@ -219,7 +219,7 @@ class StepSeries:
         return np.array([h ** (k % 2) / factorial(k) for k in powers])
 
     def is_near_end(self, cells: ArrayLike) -> np.ndarray:
-        """Whether an end lies within the reach of each of ``cells``."""
+        """Return whether an end lies within the reach of each of ``cells``."""
         topology = self.chain.topology
         return np.asarray((topology.neighbour(cells, -self.reach) < 0) | (topology.neighbour(cells, self.reach) < 0))
 
@@ -235,7 +235,7 @@ class StepSeries:
         return np.append(0, np.cumsum(differs))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:
-        """Whether each of ``cells`` (cell,) is far from all that differs, (cell,): it has the interior's rows.
+        """Return whether each of ``cells`` (cell,) is far from all that differs, (cell,): it has the interior's rows.
 
         No end of the lattice lies within its reach, and no cell that differs there or one further.
         """
@@ -247,7 +247,7 @@ class StepSeries:
         return is_far & (self._differing_before[cells + window] == self._differing_before[cells])
 
     def representatives(self, cells: ArrayLike) -> np.ndarray:
-        """The first of ``cells`` (cell,), counted from 0, that has the same rows as each of them, (cell,)."""
+        """Return the first of ``cells`` (cell,), counted from 0, that has the same rows as each of them, (cell,)."""
         cells = np.array(cells, np.int64)
         interior = self.is_interior(cells)
         cells[interior] = cells[interior][:1]
@@ -262,7 +262,7 @@ class StepSeries:
         return cells
 
     def own_rows(self) -> tuple[int, int]:
-        """How many cells do not share the interior's rows, those near an end too, and how many tables they need.
+        """Return how many cells do not share the interior's rows, those near an end too, and how many tables they need.
 
         (0, 0) in a lattice in which no cell differs.
         """
@@ -273,7 +273,7 @@ class StepSeries:
         return len(differing), len(np.unique(self.representatives(differing)))
 
     def stencil(self, rows: np.ndarray) -> np.ndarray:
-        """P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.
+        """Return P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.
 
         ``rows`` are (dof, term, dof, cell).
         """
@@ -298,7 +298,7 @@ class StepSeries:
         return p.astype(float)
 
     def interior(self) -> np.ndarray:
-        """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
+        """Return P's rows (2 dof, 2 dof, 2 reach + 1) of a cell ``reach`` or more from both ends."""
         is_large = self._interior_magnitudes > SMALL_ENTRY * self.tolerance
         entries = np.where(is_large, self.stencil(self._interior_rows), 0.0)
         return entries[:, :, self._outermost - self.reach : self._outermost + self.reach + 1]

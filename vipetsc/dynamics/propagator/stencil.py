@@ -50,7 +50,7 @@ class HaloRegions:
         return columns
 
     def bind_columns(self, states: Sequence[PETSc.Vec]) -> Record:
-        """The columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
+        """Return the columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
         layout = self._layout
         wanted = np.concatenate(self._ranges)
         cells = layout.topology.neighbour(wanted)
@@ -195,7 +195,7 @@ class SparseRows(NamedTuple):
 
 
 def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
-    """Rows in blocks of four, from ``entries`` (2 dof, 2 dof, cell) of an interior cell, counted from ``-reach`` on."""
+    """Return rows in blocks of four, of ``entries`` (2 dof, 2 dof, cell) of an interior cell, from ``-reach`` on."""
     # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Where the
     # number of masses is odd, the last one is there twice, and its second copy has no place.
     dofs = layout.dofs
@@ -219,14 +219,14 @@ def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
 
 
 def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
-    """Ranges (range, 2), half open, of the numbers from ``first`` on that are in."""
+    """Return ranges (range, 2), half open, of the numbers from ``first`` on that are in."""
     return np.flatnonzero(np.diff(np.concatenate([[False], is_in, [False]]))).reshape(-1, 2) + first
 
 
 def _dense_rows(
     series: StepSeries, cells: np.ndarray, ends: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
+    """Return tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
 
     ``cells`` read as many cells on either side, ``ends`` are (first cell that is read, cell) near the lattice's ends.
     """
@@ -246,14 +246,14 @@ def _dense_rows(
 
 
 def in_fours(tables: np.ndarray) -> np.ndarray:
-    """The ``tables`` (..., output) with outputs of zeros behind the others, up to a multiple of four."""
+    """Return the ``tables`` (..., output) with outputs of zeros behind the others, up to a multiple of four."""
     extra = -tables.shape[-1] % 4
     return np.pad(tables, [(0, 0)] * (tables.ndim - 1) + [(0, extra)])
 
 
 @lru_cache(maxsize=4)  # members of a sweep have the same ends
 def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """The tables of ``_dense_rows`` of the ``ends``, in their order."""
+    """Return the tables of ``_dense_rows`` of the ``ends``, in their order."""
     reach = series.reach
     dofs = series.chain.cell.dofs
     tables = np.zeros((len(ends), 2 * dofs, 2 * reach + 1, 2 * dofs))

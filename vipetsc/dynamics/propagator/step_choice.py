@@ -49,7 +49,7 @@ LEAST_TOLERANCE = 1e-15
 
 @lru_cache(maxsize=4)
 def step_series(model: Model) -> StepSeries | None:
-    """The step that divides the sample interval and fits the lattice at the least cost; None if there is none.
+    """Return the step that divides the sample interval and fits the lattice at the least cost; None if there is none.
 
     Long steps are few, but sites that feel one another within a step must be followed together.
     """
@@ -78,12 +78,12 @@ def step_series(model: Model) -> StepSeries | None:
 
 
 def _fastest_burst(model: Model) -> float:
-    """The highest frequency in rad/s of the tone bursts of ``model``; 0 without one."""
+    """Return the highest frequency in rad/s of the tone bursts of ``model``; 0 without one."""
     return max((drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)), default=0.0)
 
 
 def _series(model: Model, parts: int) -> StepSeries:
-    """The series over a step of a sample interval over ``parts``, in which springs are linear."""
+    """Return the series over a step of a sample interval over ``parts``, in which springs are linear."""
     # Free motion knows no contacts: members of a sweep that differ in these have one series, and compute it once.
     chain = replace(model.chain.linearised(), sites=(), clearances=(), pairs=())
     return _kept_series(
@@ -96,12 +96,12 @@ def _series(model: Model, parts: int) -> StepSeries:
 
 @lru_cache(maxsize=8)
 def _kept_series(chain: Chain, interval: float, tolerance: float, spans_cells: bool) -> StepSeries:
-    """The series with these values; a series keeps what it computes."""
+    """Return the series with these values; a series keeps what it computes."""
     return StepSeries(chain=chain, interval=interval, tolerance=tolerance, spans_cells=spans_cells)
 
 
 def _no_step(model: Model) -> str:
-    """Why not even the shortest step suits ``model``: too few cells for its band, or waves too fast for its series."""
+    """Return why not even the shortest step suits ``model``: too few cells for its band, or too fast waves."""
     series = _series(model, MOST_PARTS)
     step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
     fastest = max(series.omega_max_h / series.interval, _fastest_burst(model))
@@ -112,7 +112,7 @@ def _no_step(model: Model) -> str:
 
 
 def refusal(model: Model) -> str | None:
-    """Why linear steps do not suit ``model``: too few cells, too many sites close by, too many nonlinear springs."""
+    """Return why linear steps do not suit ``model``: too few cells, too many close sites or nonlinear springs."""
     # The cheapest springs in the longest step: where all springs are nonlinear, no step need be looked for.
     crowd = _too_many_springs(model, 1, LARGEST_OMEGA_H)
     if crowd is not None:
@@ -139,19 +139,19 @@ def refusal(model: Model) -> str | None:
 
 
 def spring_cost(chain: Chain, reach: int) -> float:
-    """Cost in us of the nonlinear springs of ``chain`` in a step in which forces reach so many cells."""
+    """Return the cost in us of the nonlinear springs of ``chain`` in a step in which forces reach so many cells."""
     cells = np.sort(nonlinear_springs(chain).cell)
     near = np.searchsorted(cells, cells + reach, "right") - np.searchsorted(cells, cells - reach, "left")
     return SPRING_COST * len(cells) + PAIR_COST * float(near.sum())
 
 
 def step_seconds(masses: int) -> float:
-    """CPU time in s of a step of ``ts`` in which so many ``masses`` move."""
+    """Return CPU time in s of a step of ``ts`` in which so many ``masses`` move."""
     return TS_STEP + TS_MASS * masses
 
 
 def _too_many_springs(model: Model, reach: int, radians: float) -> str | None:
-    """Why the nonlinear springs of ``model`` make steps of so many ``radians`` dearer than ``ts``; None if not."""
+    """Return why the nonlinear springs of ``model`` make steps of so many ``radians`` dearer than ``ts``, or None."""
     chain = model.chain
     count = len(nonlinear_springs(chain).cell)
     if not count:

@@ -134,7 +134,7 @@ class Cluster(NamedTuple):
 
 
 def create_trial(dofs: int, terms: int, any_rigid: bool = False) -> Trial:
-    """Workspace for a substep of ``dofs`` DoFs, all of which are active; as it is here, all are sites.
+    """Return workspace for a substep of ``dofs`` DoFs, all of which are active; as it is here, all are sites.
 
     Only where sites may stick, with ``any_rigid``, is there room for what their accelerations take.
     """
@@ -177,7 +177,7 @@ def create_trial(dofs: int, terms: int, any_rigid: bool = False) -> Trial:
 
 @kernel
 def has_stuck_sites(cluster: Cluster) -> bool:
-    """Whether a rigid site of a cluster is stuck."""
+    """Return whether a rigid site of a cluster is stuck."""
     any_stuck = False
     for i in range(cluster.contacts.size):
         any_stuck |= abs(cluster.contacts[i].mode) == STUCK
@@ -186,13 +186,13 @@ def has_stuck_sites(cluster: Cluster) -> bool:
 
 @kernel
 def first_drive(cluster: Cluster) -> int:
-    """The first of a cluster's DoFs that is a driven mass."""
+    """Return the first of a cluster's DoFs that is a driven mass."""
     return cluster.contacts.size + cluster.springs.size
 
 
 @kernel
 def select_active(cluster: Cluster) -> Trial:
-    """The workspace for a substep of a cluster, of those DoFs on which forces act."""
+    """Return the workspace for a substep of a cluster, of those DoFs on which forces act."""
     state = cluster.state[0]
     sites = cluster.contacts
     room = cluster.trial

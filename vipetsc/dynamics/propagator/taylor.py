@@ -41,7 +41,7 @@ def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
 
 @kernel
 def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
-    """Value and slope at ``s`` of a ``series`` (coefficient,) by rising powers of s, by Horner's scheme."""
+    """Return the value and slope at ``s`` of a ``series`` (coefficient,) by rising powers of s, by Horner's scheme."""
     value = 0.0
     slope = 0.0
     for k in range(series.size - 1, -1, -1):
@@ -52,7 +52,7 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
 
 @kernel
 def curvature(series: np.ndarray, s: float) -> float:
-    """Second derivative at ``s`` of a ``series`` (coefficient,) by rising powers of s."""
+    """Return second derivative at ``s`` of a ``series`` (coefficient,) by rising powers of s."""
     value = 0.0
     for k in range(series.size - 1, 1, -1):
         value = value * s + k * (k - 1) * series[k]
@@ -61,7 +61,7 @@ def curvature(series: np.ndarray, s: float) -> float:
 
 @kernel
 def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, length: float) -> float:
-    """First s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
+    """Return the first s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
 
     ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
     meets the clearance nothing can have happened.
@@ -99,7 +99,7 @@ def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, l
 
 @kernel
 def first_onset(series: np.ndarray, site: Any, length: float) -> float:
-    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows; 2 if none does.
+    """Return the first s in [0, length] at which w comes to a clearance of the ``site``, to rounding; 2 for none.
 
     ``series`` (coefficient,) in m is w by powers of s in units of the step, whose length is 1: 2 is beyond any s.
     """

@@ -262,7 +262,7 @@ class Integrator(Engine):
         return stop == 0.0
 
     def _longest_step(self) -> float:
-        """The longest step in s from here that the controller and the beginning of the drive allow."""
+        """Return the longest step in s from here that the controller and the beginning of the drive allow."""
         stretch = FIXED_STRETCH if self._fixed_step else STRETCH
         return min(stretch * self.step, self._first_step + STEP_PER_TIME * self.time)
 
@@ -281,7 +281,7 @@ class Integrator(Engine):
         return True
 
     def _first_change(self, h: float) -> ModeChange:
-        """The first change of this rank's sites in the step of ``h`` s that was just tried."""
+        """Return the first change of this rank's sites in the step of ``h`` s that was just tried."""
         position = find_change(self._stepper.context_address, self.tracker.start, self.tracker.end, h, self._place)
         return ModeChange(position, *self._place.tolist())
 
@@ -332,7 +332,7 @@ class Integrator(Engine):
             self.counts["missed"] += 1
 
     def _judge(self, attempt: Landing, change: ModeChange) -> tuple[Landing, int]:
-        """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it.
+        """Return the next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it.
 
         Where it has landed without having moved since it last did, its site is to rest.
         """
@@ -439,13 +439,13 @@ class Integrator(Engine):
         self.ts.restartStep()
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
-        """Episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
+        """Return episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
         losses = self.layout.losses(self.state.array_r) - self.tracker.clipped_energies(self.tracker.start)
         episodes = self.tracker.take_episodes(losses, unfinished)
         return episodes[np.isin(episodes["site"], self.layout.sites)]
 
     def statistics(self) -> dict[str, Any]:
-        """Steps, and what landings and limits of the contact law there were."""
+        """Return steps, and what landings and limits of the contact law there were."""
         limits = self.tracker.counts[self._logged]
         totals = np.array([self.counts["switches"], *(limits[name].sum() for name in LIMITS)])
         self.comm.Allreduce(MPI.IN_PLACE, totals, MPI.SUM)

@@ -26,7 +26,7 @@ _LONGEST = 0.1
 
 
 def onset_fraction(laws: Sequence[Contact], rtol: float) -> float:
-    """The step after an onset over the contact's duration, for contacts of these ``laws`` at a tolerance ``rtol``."""
+    """Return the step after an onset over the contact's duration, for contacts of ``laws`` at tolerance ``rtol``."""
     step = _OTHER
     if all(law.onset_exponent == 1 for law in laws):
         step = _LINEAR

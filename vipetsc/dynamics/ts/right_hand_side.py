@@ -169,7 +169,7 @@ def observe_at(t: float, y: np.ndarray, address: int, motion: np.ndarray) -> Non
 
 @kernel
 def find_change(address: int, start: np.ndarray, end: np.ndarray, h: float, place: np.ndarray) -> float:
-    """The position of ``first_change`` in a step of the sites of the ``CONTEXT`` at an ``address``.
+    """Return the position of ``first_change`` in a step of the sites of the ``CONTEXT`` at an ``address``.
 
     Kinks count. ``place`` (2,) gets the site and the function: to make a ``ModeChange`` takes longer than the search.
     """
@@ -204,7 +204,7 @@ def _hold(f: int, address: int, state: int, lattice: LatticeRecord) -> int:
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
-    """The function that ``compile_callback`` compiles: puts the rates of the state ``u`` at PETSc's time t into ``f``.
+    """Return the function to be compiled: it puts the rates of the state ``u`` at PETSc's time t into ``f``.
 
     ``ts``, ``u`` and ``f`` are handles, ``address`` is that of a ``CONTEXT``. Returns PETSc's error code.
     """
@@ -251,7 +251,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
 
 @cache
 def compile_callback() -> Any:
-    """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
+    """Return ``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
     ``context`` is the address of a ``CONTEXT`` record. All runs of a process have the same one, which lives on: to load
     it takes longer than a short run does. Raises AttributeError where PETSc hides its symbols.

@@ -68,7 +68,7 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
 
 
 def _callback(y: int, count: int, factors: int, vectors: int) -> int:
-    """The function that ``_compile`` compiles: adds ``count`` vectors, each times its factor, to the vector ``y``.
+    """Return function that ``_compile`` compiles: adds ``count`` vectors, each times its factor, to the vector ``y``.
 
     ``y`` is a handle; ``factors`` and ``vectors`` are the addresses of numbers and of handles. Returns PETSc's error
     code.
@@ -94,7 +94,7 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
 
 @cache
 def _compile() -> Any:
-    """``PetscErrorCode f(Vec y, PetscInt count, const PetscScalar *factors, Vec *vectors)``; it lives on."""
+    """Return ``PetscErrorCode f(Vec y, PetscInt count, const PetscScalar *factors, Vec *vectors)``; it lives on."""
     native.bind_symbols()
     return cfunc(f"i4(i8, i{np.dtype(PETSc.IntType).itemsize}, i8, i8)")(_callback)
 
@@ -115,7 +115,7 @@ def _set_operation(vector: PETSc.Vec) -> None:
 
 @cache
 def _is_maxpy() -> bool:
-    """Whether the operation set is the one that VecMAXPY calls: ours alone leaves out NaN times zero."""
+    """Return whether the operation set is the one that VecMAXPY calls: ours alone leaves out NaN times zero."""
     y, x, zero = (PETSc.Vec().createSeq(1) for _ in range(3))
     _set_operation(y)
     x.set(np.nan)

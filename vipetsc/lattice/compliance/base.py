@@ -29,13 +29,13 @@ class ChainCompliance(ABC):
 
     @abstractmethod
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
+        """Return relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
 
         Frequencies lie on or below the real axis. At real ones it is real for a finite lattice without dashpots.
         """
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
-        """Compliance (omega, pair, pair) in m/N, see ``response``."""
+        """Return the compliance (omega, pair, pair) in m/N, see ``response``."""
         return self.response(omegas)[:, :, : self.pairs]
 
     @property

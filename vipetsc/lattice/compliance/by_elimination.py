@@ -30,7 +30,7 @@ class DirectCompliance(ChainCompliance):
         return self.motion(omegas, self.loads[:, : self.pairs])
 
     def motion(self, omegas: ArrayLike, rows: np.ndarray) -> np.ndarray:
-        """Motions (omega, row, pair and point) in m/N, picked by ``rows`` (dofs, row) as by ``loads``."""
+        """Return motions (omega, row, pair and point) in m/N, picked by ``rows`` (dofs, row) as by ``loads``."""
         chain = self.chain
         stiffness = chain.stiffness_matrix()
         damping = chain.damping_rows(0, chain.cells).tocsc()

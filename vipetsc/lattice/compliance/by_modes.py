@@ -112,7 +112,7 @@ class ModalCompliance(ChainCompliance):
         return np.asarray(out)
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` in N, as of ``signed``."""
+        """Return the displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` in N, as of ``signed``."""
         signed = self.signed(forces)
         force = self.loads[:, : len(signed)] @ signed
 
@@ -130,7 +130,7 @@ class ModalCompliance(ChainCompliance):
         return np.asarray(u.reshape(-1, dofs))
 
     def _gain(self, omega: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        """The factor 1/(i omega - p) (omega, pole) at ``omega`` in rad/s.
+        """Return the factor 1/(i omega - p) (omega, pole) at ``omega`` in rad/s.
 
         It is unbounded for p = 0 at omega = 0, where a body that nothing holds may be anywhere. It is set to 0 there
         unless the pole is ``moved`` (pole,).
@@ -244,7 +244,7 @@ class ModalCompliance(ChainCompliance):
 
 
 def _sum_over_poles(squared: np.ndarray, damping: np.ndarray, vectors: np.ndarray, rigid: np.ndarray) -> Poles:
-    """The poles of q'' + ``damping`` q' + ``squared`` q = ``vectors``^T f, and of the ``rigid`` motions."""
+    """Return the poles of q'' + ``damping`` q' + ``squared`` q = ``vectors``^T f, and of the ``rigid`` motions."""
     count = len(squared)
     if not damping.any():
         # Pairs of poles +-i Omega of residues 1/(2 i Omega).
@@ -272,5 +272,5 @@ def _sum_over_poles(squared: np.ndarray, damping: np.ndarray, vectors: np.ndarra
 
 
 def _without_rounding(motions: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The ``motions``, with 0 for those below the fraction ``UNMOVED`` of the largest of ``sizes``."""
+    """Return the ``motions``, with 0 for those below the fraction ``UNMOVED`` of the largest of ``sizes``."""
     return np.where(np.abs(motions) < UNMOVED * sizes.max(initial=0.0), 0, motions)

@@ -47,7 +47,7 @@ class IncidentWave(NamedTuple):
     channel: int
 
     def field(self, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0)."""
+        """Return the displacement (cells, dofs) in m at ``cells`` (from 0)."""
         return np.asarray(self.factor ** (np.asarray(cells)[:, None] - self.origin) * self.shape)
 
 
@@ -59,7 +59,7 @@ class Stretch(NamedTuple):
     length: int
 
     def unknowns(self, half: int) -> int:
-        """Number of amplitudes of the stretch, with ``half`` waves in each direction; 0 between neighbouring cells."""
+        """Return amplitudes of the stretch, with ``half`` waves each way, by number; 0 between neighbouring cells."""
         if self.left is None or self.right is None:
             return half
         return 2 * half if self.length else 0
@@ -126,7 +126,7 @@ class WaveCompliance(ChainCompliance):
         return np.where(mirrored[:, None, None], motions.conj(), motions)
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0); an infinite lattice has any cell, negative ones too.
+        """Return displacements (cells, dofs) in m at ``cells`` (from 0); an infinite lattice has negative ones too.
 
         ``forces`` in N are as of ``signed``. Raises ValueError for a cell that the lattice does not have.
         """
@@ -140,7 +140,7 @@ class WaveCompliance(ChainCompliance):
         return u.conj() if mirrored[0] else u
 
     def incident(self, omega: float, band: int, direction: int = 1) -> IncidentWave:
-        """The wave of ``band`` (from 1) at ``omega`` in rad/s that carries energy to higher (+1) or lower (-1) cells.
+        """Return the wave of ``band`` (from 1) at ``omega`` in rad/s with energy to higher (+1) or lower (-1) cells.
 
         Raises ComplianceError if there is none, or if the contact pair does not move relatively in it.
         """
@@ -180,7 +180,7 @@ class WaveCompliance(ChainCompliance):
     def outgoing(
         self, omega: float, forces: ArrayLike, wave: IncidentWave | None = None, amplitude: complex = 0.0
     ) -> np.ndarray:
-        """Energy (direction, wave) in W, to higher cells and to lower ones, that leaves an infinite lattice.
+        """Return the energy (direction, wave) in W, to higher cells and to lower ones, that leaves an infinite lattice.
 
         ``forces`` are as for ``field``, at ``omega`` in rad/s, positive. A ``wave`` that comes in with an ``amplitude``
         in m goes on in its direction, where it interferes with the waves of the forces.
@@ -206,7 +206,7 @@ class WaveCompliance(ChainCompliance):
         return np.where(travels, np.abs(unit_flux), 0) * np.abs(amplitudes) ** 2
 
     def _transmitted(self, wave: IncidentWave, amplitude: complex, waves: BlochWaves) -> complex:
-        """Amplitude beyond the last loaded cell, scaled as ``waves``, of an incident ``wave`` of ``amplitude`` in m."""
+        """Return amplitude beyond the last loaded cell, scaled as ``waves``, of a ``wave`` of ``amplitude`` in m."""
         channel = wave.channel
         steps = self.cells[-1] + 1 - wave.origin
         if wave.direction < 0:
@@ -219,7 +219,7 @@ class WaveCompliance(ChainCompliance):
         return complex(amplitude * scale * wave.factor**steps)
 
     def _stretches(self) -> list[Stretch]:
-        """The stretches without loads, from lower cells to higher ones; a ring's last one leads back to the first."""
+        """Return the stretches without loads, from lower to higher cells; a ring's last one leads back to the first."""
         cells = self.cells
         last = len(cells) - 1
         stretches = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
@@ -230,11 +230,11 @@ class WaveCompliance(ChainCompliance):
         return stretches
 
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
-        """The load (cells and dofs, 1) that ``forces``, as of ``signed``, amount to."""
+        """Return the load (cells and dofs, 1) that ``forces``, as of ``signed``, amount to."""
         return np.asarray(self.loads[:, : len(forces)] @ self.signed(forces))[:, None]
 
     def _solve(self, omega: np.ndarray, loads: np.ndarray) -> _Solution:
-        """The lattice under ``loads`` (cells and dofs, load) at ``omega`` in rad/s, of ``_right_half``."""
+        """Return the lattice under ``loads`` (cells and dofs, load) at ``omega`` in rad/s, of ``_right_half``."""
         waves = bloch_waves(self.chain.cell, omega)
         matrix = self._matrix(omega, waves)
         padded = np.zeros((1, matrix.shape[1], loads.shape[1]), complex)
@@ -242,7 +242,7 @@ class WaveCompliance(ChainCompliance):
         return _Solution(unknowns=np.linalg.solve(matrix, padded), waves=waves)
 
     def _matrix(self, omega: np.ndarray, waves: BlochWaves) -> np.ndarray:
-        """The equations (omega, unknown, unknown): balance of each loaded cell, then the states at stretches' ends."""
+        """Return the equations (omega, unknown, unknown): balance of loaded cells, then states at stretches' ends."""
         chain = self.chain
         d = chain.cell.dofs
         blocks = coupling_blocks(chain.cell)
@@ -293,7 +293,7 @@ class WaveCompliance(ChainCompliance):
         return matrix
 
     def _displacement(self, cell: int, solution: _Solution) -> np.ndarray:
-        """Displacement (dofs,) of a ``cell`` under the first load, at the first frequency."""
+        """Return the displacement (dofs,) of a ``cell`` under the first load, at the first frequency."""
         cells = self.cells
         d = self.chain.cell.dofs
         unknowns = solution.unknowns[0, :, 0]
@@ -314,7 +314,7 @@ class WaveCompliance(ChainCompliance):
         raise ValueError(f"cell {cell + 1} is not one of the lattice's {self.chain.cells}")
 
     def _place(self, cell: int, stretch: Stretch) -> int | None:
-        """Position of a ``cell`` in a ``stretch``, from 1; None outside.
+        """Return the position of a ``cell`` in a ``stretch``, from 1; None outside.
 
         In a stretch without a beginning the last cell has 0, those before it negative numbers.
         """
@@ -333,7 +333,7 @@ class WaveCompliance(ChainCompliance):
 
 
 def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
-    """Relative displacement in m of a ``pair`` in the cell of a wave of the ``shape`` (dofs,) in m there.
+    """Return relative displacement in m of a ``pair`` in the cell of a wave of the ``shape`` (dofs,) in m there.
 
     The next cell has ``factor`` times that shape; the ground does not move.
     """
@@ -343,7 +343,7 @@ def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
 
 
 def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """The ``omegas`` (w,), or -conj(omega) where the real part is negative, and the mask (w,) of the latter.
+    """Return the ``omegas`` (w,), or -conj(omega) where the real part is negative, and the mask (w,) of the latter.
 
     The response at omega is there the complex conjugate of that at -conj(omega).
     """
@@ -354,7 +354,7 @@ def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) -> int:
-    """Number of the wave of ``factor`` (2r,) in a ``direction`` that does not decay, with ``wavenumber`` in (0, pi)."""
+    """Return the number of the wave of ``factor`` (2r,) in a ``direction`` with a real ``wavenumber`` in (0, pi)."""
     half = len(factor) // 2
     channels = range(half)
     if direction < 0:
@@ -367,7 +367,7 @@ def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) 
 
 
 def _states(waves: BlochWaves, stretch: Stretch, place: int) -> np.ndarray:
-    """States (omega, 2r, wave) of a stretch's waves after its cell number ``place`` (0: before the first one).
+    """Return states (omega, 2r, wave) of a stretch's waves after its cell number ``place`` (0: before the first one).
 
     Waves to higher cells are counted from its beginning, waves to lower ones from its end.
     """

@@ -40,12 +40,12 @@ class DenseCompliance:
         return float(np.sqrt(self.squared.max(initial=0.0)))
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, real or complex."""
+        """Return relative displacements (omega, pair, pair) in m/N at ``omegas`` in rad/s, real or complex."""
         gain = self._gain(np.atleast_1d(omegas))
         return np.asarray((self.parts * gain[:, None, :]) @ self.parts.T)
 
     def with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """The compliance (omega, pair, pair) in m/N with a spring of ``stiffness`` (omega,) in N/m added at each pair.
+        """Return the compliance (omega, pair, pair) in m/N with a spring of ``stiffness`` (omega,) in N/m at each pair.
 
         It is Z (diag(Om_n^2 - omega^2) + k Z^T Z)^-1 Z^T, with the columns z_n in Z and the stiffness k.
         """
@@ -53,23 +53,23 @@ class DenseCompliance:
         return np.asarray(self.parts @ self._motions(omegas, stiffness))
 
     def rate(self, omegas: np.ndarray) -> np.ndarray:
-        """The derivative (omega, pair, pair) by the frequency of the compliance at ``omegas`` (omega,) in rad/s."""
+        """Return derivative (omega, pair, pair) by the frequency of the compliance at ``omegas`` (omega,) in rad/s."""
         gain = 2 * omegas[:, None] * self._gain(omegas) ** 2
         return np.asarray((self.parts * gain[:, None, :]) @ self.parts.T)
 
     def rate_with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """The derivative (omega, pair, pair) by the frequency of the compliance ``with_springs``."""
+        """Return the derivative (omega, pair, pair) by the frequency of the compliance ``with_springs``."""
         motions = self._motions(omegas, stiffness)
         return np.asarray(2 * omegas[:, None, None] * (motions.swapaxes(1, 2) @ motions))
 
     def _motions(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
-        """Amplitudes of the modes (omega, mode, pair) under a unit load at each pair, ``with_springs``."""
+        """Return amplitudes of the modes (omega, mode, pair) under a unit load at each pair, ``with_springs``."""
         dynamic = self.dynamic_stiffness(omegas, stiffness)
         loads = np.broadcast_to(self.parts.T, (len(dynamic), *self.parts.T.shape))
         return np.asarray(np.linalg.solve(dynamic, loads))
 
     def dynamic_stiffness(self, omegas: ArrayLike, stiffness: ArrayLike) -> np.ndarray:
-        """diag(Om_n^2 - omega^2) + k Z^T Z (omega, mode, mode) in (rad/s)^2, of the modes' amplitudes.
+        """Return diag(Om_n^2 - omega^2) + k Z^T Z (omega, mode, mode) in (rad/s)^2, of the modes' amplitudes.
 
         ``omegas`` (omega,) in rad/s; a spring of ``stiffness`` (omega,) in N/m is added at each pair. A mode at rest
         that no pair moves has 1 on the diagonal in place of 0: its amplitude is then 0, as no force acts on it.
@@ -80,12 +80,12 @@ class DenseCompliance:
         return np.asarray(dynamic + np.asarray(stiffness)[:, None, None] * (self.parts.T @ self.parts))
 
     def field(self, omega: complex, forces: np.ndarray) -> np.ndarray:
-        """Displacement (dofs,) in m that ``forces`` (pairs,) in N, which pull pairs together, make."""
+        """Return the displacement (dofs,) in m that ``forces`` (pairs,) in N, which pull pairs together, make."""
         gain = self._gain(np.array([omega]))[0]
         return np.asarray(-self.vectors @ (gain * (forces @ self.parts)))
 
     def _gain(self, omega: np.ndarray) -> np.ndarray:
-        """The factor 1/(Om_n^2 - omega^2) (omega, mode); 0 of a mode at rest that no pair moves."""
+        """Return the factor 1/(Om_n^2 - omega^2) (omega, mode); 0 of a mode at rest that no pair moves."""
         gap = self.squared - omega[:, None] ** 2
         return np.divide(1, gap, out=np.zeros_like(gap), where=self._moved | (gap != 0))
 

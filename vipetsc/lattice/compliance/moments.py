@@ -28,7 +28,7 @@ class SeriesCompliance(WaveCompliance):
     """
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
-        """Compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
+        """Return the compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
         omega = np.atleast_1d(omegas)
         high = np.abs(omega) > FAST_FROM * self.highest
         compliance = np.zeros((len(omega), self.pairs, self.pairs), omega.dtype if np.iscomplexobj(omega) else float)
@@ -63,7 +63,7 @@ class SeriesCompliance(WaveCompliance):
         return moments
 
     def _piece(self, group: np.ndarray) -> tuple[int, Chain]:
-        """The first cell, and the chain, of what the series of a ``group`` of sites reaches: a cell each term."""
+        """Return first cell, and the chain, of what the series of a ``group`` of sites reaches: a cell each term."""
         chain = self.chain
         first = chain.sites[group[0]] - TERMS
         last = chain.sites[group[-1]] + TERMS
@@ -76,7 +76,7 @@ class SeriesCompliance(WaveCompliance):
         return first, Chain(chain.cell, last - first + 1, chain.ends)
 
     def _groups(self) -> list[np.ndarray]:
-        """Numbers of the sites in the chain's list, together where their pieces overlap; a ring's all together."""
+        """Return the sites' numbers in the chain's list, together where their pieces overlap; a ring's all together."""
         sites = np.array(self.chain.sites)
         order = np.argsort(sites, kind="stable")
         if self.chain.topology.is_ring:

@@ -63,7 +63,7 @@ class OpenCompliance(ModalCompliance):
         return np.asarray(whole[:, :pairs, :count] - correction)
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` as of ``ModalCompliance``."""
+        """Return the displacement (cells, dofs) in m at ``cells`` (from 0) by ``forces`` as of ``ModalCompliance``."""
         signed = self.signed(forces)
         force = self.loads[:, : len(signed)] @ signed
 
@@ -79,7 +79,7 @@ class OpenCompliance(ModalCompliance):
         return np.asarray(u.reshape(-1, dofs))
 
     def _shifted(self, omegas: ArrayLike) -> np.ndarray:
-        """The frequencies (omega,) with an imaginary part below zero."""
+        """Return the frequencies (omega,) with an imaginary part below zero."""
         omega = np.atleast_1d(np.asarray(omegas, complex))
         # At omega = 0 its own size would give no decay: a thousandth of the highest frequency stands for it there.
         scale = np.maximum(np.abs(omega), 1e-3 * self._fastest)
@@ -99,7 +99,7 @@ class OpenCompliance(ModalCompliance):
         return np.hstack([one[:, first[end] : first[end] + d] for end in self.open_ends])
 
     def _between(self, omega: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Displacements ``rows`` (dofs, i) by loads ``columns`` (dofs, j) of the finite part alone: (omega, i, j)."""
+        """Return displacements ``rows`` (dofs, i) by loads ``columns`` (dofs, j) of the finite part: (omega, i, j)."""
         poles = self._poles
         gain = 1 / (1j * omega[:, None] - poles.poles)
         out = ((rows.T @ poles.output) * gain[:, None, :]) @ (poles.input @ columns)
@@ -108,7 +108,7 @@ class OpenCompliance(ModalCompliance):
         return np.asarray(out)
 
     def _inner(self, omega: np.ndarray, between_ends: np.ndarray) -> np.ndarray:
-        """S (1 + G_ee S)^-1 (omega, end and mass, end and mass) in N/m."""
+        """Return S (1 + G_ee S)^-1 (omega, end and mass, end and mass) in N/m."""
         d = self.chain.cell.dofs
         count = d * len(self.open_ends)
         beyond = np.zeros((len(omega), count, count), complex)
@@ -119,7 +119,7 @@ class OpenCompliance(ModalCompliance):
 
 
 def beyond_end(chain: Chain, end: str, omega: np.ndarray) -> np.ndarray:
-    """S (omega, dofs, dofs) in N/m of the half lattice beyond an ``end``, at ``omega`` with negative imaginary parts.
+    """Return S (omega, dofs, dofs) in N/m of the half lattice beyond an ``end``, at ``omega`` below the real axis.
 
     It adds to the dynamic stiffness of the last cell of ``chain``, which has a spring to a wall there unless the ends
     are free.

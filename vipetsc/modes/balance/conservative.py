@@ -85,7 +85,7 @@ ROUNDING = 1e-9 / (2 * np.pi)
 
 
 def episodes_in_arc(forces: SiteForces, episodes: Iterable[Episode]) -> int:
-    """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+    """Return how often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
 
     That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
     shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed for
@@ -110,7 +110,7 @@ def episodes_in_arc(forces: SiteForces, episodes: Iterable[Episode]) -> int:
 
 
 def fraction_closed(series: ForceSeries) -> float:
-    """The fraction of the period in which one contact or more is closed, as shooting counts it."""
+    """Return the fraction of the period in which one contact or more is closed, as shooting counts it."""
     # The episodes of one contact do not overlap.
     if np.count_nonzero(series.closed) < 2:
         return float(series.closed.max(initial=0.0))
@@ -129,7 +129,7 @@ def fraction_closed(series: ForceSeries) -> float:
 
 
 def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The intervals of phase between ``spans``, which are sorted and do not overlap.
+    """Return the intervals of phase between ``spans``, which are sorted and do not overlap.
 
     The last interval ends where the first span begins, one turn later.
     """
@@ -168,7 +168,7 @@ class DescribedMotion(NamedTuple):
 
 
 def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: float) -> DescribedMotion:
-    """The motion z = b + a cos(Om t) of a ``pair`` with one of the ``forces``, of which two harmonics balance.
+    """Return the motion z = b + a cos(Om t) of a ``pair`` with one of the ``forces``, of which two harmonics balance.
 
     ``pair`` is its number, ``g`` are the compliances of the pair at 0 and at ``omega`` (rad/s). The equations are those
     of the module. Raises ContinuationError where they have no solution.
@@ -183,12 +183,12 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
     z = np.zeros((forces.pairs, 2), complex)
 
     def force(mean: float, amplitude: float) -> np.ndarray:
-        """F_0, F_1 and F_2 in N: the motion is even in time, so that they are real."""
+        """Return F_0, F_1 and F_2 in N: the motion is even in time, so that they are real."""
         z[pair] = mean, amplitude
         return forces.series(z, omega).forces[pair].real
 
     def mean_of(amplitude: float) -> float:
-        """The mean b in m for an amplitude a in m."""
+        """Return the mean b in m for an amplitude a in m."""
 
         def static_balance(mean: float) -> float:
             return mean + g.static * float(force(mean, amplitude)[0])
@@ -208,7 +208,7 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
         return float(brentq(static_balance, furthest, 0.0))
 
     def balance(amplitude: float) -> float:
-        """a + G(Om) F_1 in m."""
+        """Return a + G(Om) F_1 in m."""
         return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
 
     size = forces.amplitude_scale(pair, g.dynamic)
@@ -251,22 +251,22 @@ class HarmonicFrame(BalanceFrame):
         self.xi = np.append(x / size, 1.0)
 
     def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
+        """Return harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
         return xi[:-1] * self.size, float(xi[-1] * self.omega)
 
     def encode(self, point: Point) -> np.ndarray:
-        """The unknowns (n + 1,) of another motion, which may have another number of harmonics."""
+        """Return the unknowns (n + 1,) of another motion, which may have another number of harmonics."""
         x = self.balance.resized(point.x)
         return np.append(x / self.size, 2 * np.pi / point.period / self.omega)
 
     def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction (n + 1,) at another motion, of any length."""
+        """Return the branch's direction (n + 1,) at another motion, of any length."""
         # dOm = -2 pi/period^2 dperiod.
         harmonics = self.balance.resized(point.tangent[:-1]) / self.size
         return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
+        """Return the residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
 
         Raises FlowError where the frequency has changed by a factor of ``LARGE_FACTOR`` or more.
         """
@@ -275,14 +275,14 @@ class HarmonicFrame(BalanceFrame):
         return self.balance.residual(*self.motion(xi), self.shift) / self.size
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
+        """Return the derivative (n, n + 1) of the residual."""
         x, omega = self.motion(xi)
         jacobian = self.balance.jacobian(x, omega, self.shift)
         by_omega = self.balance.rate(x, omega, self.shift)
         return np.column_stack([jacobian, by_omega * (self.omega / self.size)])
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The point of the branch that an attempt has converged to.
+        """Return the point of the branch that an attempt has converged to.
 
         ``direction`` (n + 1,) is the branch's unit tangent there; without one, None, the point has no slope. Its
         ``energy_tangent`` is dE in J for a unit step along the tangent in this frame's unknowns: from frame to frame
@@ -382,7 +382,7 @@ class ConservativeMotions(OrbitProblem):
         self._newtons: dict[int, DenseNewton] = {}
 
     def balance(self, order: int) -> HarmonicBalance:
-        """The equations of motions with harmonics up to ``order``."""
+        """Return the equations of motions with harmonics up to ``order``."""
         if order not in self._balances:
             self._balances[order] = HarmonicBalance(
                 self.compliance, self.forces, order=order, odd=self.forces.odd, cosines=True
@@ -390,13 +390,13 @@ class ConservativeMotions(OrbitProblem):
         return self._balances[order]
 
     def newton(self, balance: HarmonicBalance) -> DenseNewton:
-        """Newton's method for equations of that size."""
+        """Return Newton's method for equations of that size."""
         if balance.size not in self._newtons:
             self._newtons[balance.size] = DenseNewton(balance.size + 1, self.control.max_newton)
         return self._newtons[balance.size]
 
     def acceleration(self, point: Point) -> float:
-        """The largest acceleration where a motion rests, over that of a harmonic motion of the same size.
+        """Return the largest acceleration where a motion rests, over that of a harmonic motion of the same size.
 
         A motion rests at the phases 0 and pi, of which the smaller value counts.
         """
@@ -412,7 +412,7 @@ class ConservativeMotions(OrbitProblem):
         return (self.control.harmonics - 1) // 2 * 2 + 1
 
     def order_near(self, point: Point) -> int:
-        """The order of the highest harmonic for motions near ``point``."""
+        """Return the order of the highest harmonic for motions near ``point``."""
         allowed = self.control.truncation
         order = point.order
         # The highest order is odd in any case: symmetric motions have no other.
@@ -434,7 +434,7 @@ class ConservativeMotions(OrbitProblem):
         return min(order, self.highest_order)
 
     def frame(self, point: Point, chart: str = "auto") -> HarmonicFrame:
-        """The frame at a motion, with the harmonics that motions near it need.
+        """Return the frame at a motion, with the harmonics that motions near it need.
 
         There is one chart: the name of a ``chart``, which other problems need, is not looked at.
         """
@@ -452,11 +452,11 @@ class ConservativeMotions(OrbitProblem):
         return frame
 
     def _frame_at(self, balance: HarmonicBalance, x: np.ndarray, omega: float, size: float) -> HarmonicFrame:
-        """The frame of the equations ``balance`` at harmonics ``x`` (n,) in m, which are scaled by ``size`` in m."""
+        """Return frame of the equations ``balance`` at harmonics ``x`` (n,) in m, which are scaled by ``size`` in m."""
         return HarmonicFrame(balance, self.newton(balance), self.tolerance, x, omega, size)
 
     def first_tangent(self, start: Point, direction: int) -> np.ndarray:
-        """Tangent d(x, period) at a corrected motion, towards growing (+1) or falling (-1) energy."""
+        """Return the tangent d(x, period) at a corrected motion, towards growing (+1) or falling (-1) energy."""
         frame = self.frame(start)
         # The frame may have other harmonics than the start, which then solves its equations up to the truncation. That
         # is exact enough for a tangent, which predicts the first step and gets corrected.
@@ -469,7 +469,7 @@ class ConservativeMotions(OrbitProblem):
         return np.append(harmonics, point.tangent[-1]) * (sign * direction)
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency, between two motions that are not linear."""
+        """Yield folds of the energy and of the frequency, between two motions that are not linear."""
         # Linear motions have one frequency at all energies: the test of a fold of the frequency would be rounding. A
         # step into contact or out of it has a linear motion at one end; folds are then not sought, as in shooting.
         if not self.forces.is_linear_at_rest or (left.episodes and right.episodes):
@@ -477,7 +477,7 @@ class ConservativeMotions(OrbitProblem):
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
     def refined(self, point: Point, keep_frequency: bool) -> Point:
-        """The motion of the frequency, or else of the amplitude, of ``point``, with as many harmonics as are needed.
+        """Return motion of the frequency, or else of the amplitude, of ``point``, with as many harmonics as are needed.
 
         If the order ``nnm.harmonics`` is not enough, it has all of these. Raises ContinuationError where Newton's
         method fails or ends at the state of rest.
@@ -506,11 +506,11 @@ class ConservativeMotions(OrbitProblem):
                 return point
 
     def from_mode(self, z: np.ndarray, omega: float) -> Point:
-        """The motion near a linear mode of frequency ``omega`` (rad/s) with the elongations ``z`` (pairs,) in m."""
+        """Return motion near a linear mode of frequency ``omega`` (rad/s) with the elongations ``z`` (pairs,) in m."""
         return self.refined(self._guess(self.one_harmonic(z), omega), keep_frequency=False)
 
     def in_gap(self, omega: float, signs: np.ndarray) -> Point:
-        """The motion of ``omega`` (rad/s) in a gap, with contact at the pairs whose ``signs`` (pairs,) are +1 or -1.
+        """Return motion of ``omega`` (rad/s) in a gap, with contact at the pairs whose ``signs`` (pairs,) are +1 or -1.
 
         A pair of the sign -1 moves half a period later than one of +1: its cosine has the other sign, its mean the
         same. Raises ContinuationError where a pair has no motion with one harmonic, or where no motion is reached by
@@ -523,7 +523,7 @@ class ConservativeMotions(OrbitProblem):
         return self.refined(self._guess(x, omega), keep_frequency=True)
 
     def _pairs_alone(self, omega: float, signs: np.ndarray) -> np.ndarray:
-        """The first stage: unknowns (n,) of a mean and one harmonic, by each pair's describing function."""
+        """Return the first stage: unknowns (n,) of a mean and one harmonic, by each pair's describing function."""
         # A harmonic motion of forces that are odd has no mean, and the static compliance need not be there.
         static_at = 0.0
         if self.forces.odd:
@@ -542,7 +542,7 @@ class ConservativeMotions(OrbitProblem):
         return self.one_harmonic(z, mean)
 
     def _pairs_together(self, x: np.ndarray, omega: float, signs: np.ndarray) -> np.ndarray:
-        """The second stage: the unknowns ``x`` (n,) corrected to the solution with a mean and one harmonic.
+        """Return the second stage: the unknowns ``x`` (n,) corrected to the solution with a mean and one harmonic.
 
         They are returned as they are where they solve the equations, or where Newton's method finds no motion with the
         ``signs`` (pairs,): the third stage then tries from them.
@@ -560,7 +560,7 @@ class ConservativeMotions(OrbitProblem):
         return x
 
     def _bring_in_harmonics(self, x: np.ndarray, omega: float) -> np.ndarray:
-        """The third stage: the solution (n,) with ``FEWEST`` harmonics, from that with a mean and one harmonic, ``x``.
+        """Return the third stage: the solution (n,) with ``FEWEST`` harmonics, from ``x`` with a mean and one harmonic.
 
         Raises ContinuationError where Newton's method fails, or the motion changes too much, however small the step.
         """
@@ -593,28 +593,28 @@ class ConservativeMotions(OrbitProblem):
         return x
 
     def one_harmonic(self, z: np.ndarray, mean: np.ndarray | float = 0.0) -> np.ndarray:
-        """Unknowns with the fewest harmonics of a motion ``mean`` + z cos(theta), ``z`` (pairs,) and mean in m."""
+        """Return unknowns with the fewest harmonics of a motion ``mean`` + z cos(theta), ``z`` (pairs,) in m."""
         balance = self.balance(FEWEST)
         harmonics = z[:, None] * (np.arange(balance.order + 1) == 1)
         harmonics[:, 0] = mean
         return balance.pack(harmonics)
 
     def _guess(self, x: np.ndarray, omega: float) -> Point:
-        """A point to be corrected, of unknowns with the fewest harmonics."""
+        """Return a point to be corrected, of unknowns with the fewest harmonics."""
         frame = self._frame_at(self.balance(FEWEST), x, omega, size=1.0)
         return frame.measures(_solution(frame.xi))
 
 
 def _solution(xi: np.ndarray) -> Attempt:
-    """Unknowns ``xi`` as if Newton's method had found them, for ``HarmonicFrame.measures``."""
+    """Return unknowns ``xi`` as if Newton's method had found them, for ``HarmonicFrame.measures``."""
     return Attempt(converged=True, reason="", history=[], xi=xi)
 
 
 def _is_at_rest(attempt: Attempt) -> bool:
-    """Whether Newton's method, from a motion whose largest harmonic is 1 in its unknowns, has ended at rest."""
+    """Return whether Newton's method, from a motion whose largest harmonic is 1 in its unknowns, has ended at rest."""
     return bool(np.abs(attempt.xi[:-1]).max() < AT_REST)
 
 
 def _frequency_row(frame: HarmonicFrame) -> np.ndarray:
-    """The row (n + 1,) whose product with the unknowns is the frequency, over that of the ``frame``."""
+    """Return the row (n + 1,) whose product with the unknowns is the frequency, over that of the ``frame``."""
     return np.append(np.zeros(len(frame.xi) - 1), 1.0)

@@ -83,7 +83,7 @@ class Compliance(Protocol):
         """The highest frequency of a linear mode or wave in rad/s."""
 
     def at(self, omegas: np.ndarray) -> np.ndarray:
-        """G (frequency, pair, pair) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
+        """Return G (frequency, pair, pair) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
 
 
 class Shifted(NamedTuple):
@@ -119,11 +119,11 @@ class ShiftedCompliance:
         self._rates = BoundedCache[tuple[float, bytes], np.ndarray](KEPT)
 
     def values(self, omega: float) -> np.ndarray:
-        """G (orders, pairs, pairs) in m/N at the multiples of ``omega``."""
+        """Return G (orders, pairs, pairs) in m/N at the multiples of ``omega``."""
         return self._values.get(omega, partial(self._evaluate, self.orders, omega))
 
     def shift(self, omega: float) -> np.ndarray:
-        """The stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
+        """Return the stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
         g = self.values(omega)
         one = np.eye(self.pairs)
         squared = np.maximum(self.orders, 1) ** 2
@@ -137,12 +137,12 @@ class ShiftedCompliance:
         return np.where((plus >= minus)[:, None, None], size, -size)
 
     def at(self, omega: float, shift: np.ndarray) -> Shifted:
-        """G_s and A at the multiples of ``omega`` in rad/s, of a ``shift`` (orders, 1, 1) in N/m."""
+        """Return G_s and A at the multiples of ``omega`` in rad/s, of a ``shift`` (orders, 1, 1) in N/m."""
         key = omega, shift.tobytes()
         return self._shifted.get(key, lambda: self._shift(self.orders, omega, self.values(omega), shift))
 
     def factor(self, order: int, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The factor A (pairs, pairs) of one of the orders alone."""
+        """Return the factor A (pairs, pairs) of one of the orders alone."""
         (place,) = np.nonzero(self.orders == order)
         orders = self.orders[place]
 
@@ -152,12 +152,12 @@ class ShiftedCompliance:
         return self._factors.get((order, omega, shift.tobytes()), compute)
 
     def rate(self, omega: float, shift: np.ndarray) -> np.ndarray:
-        """Derivative (orders, pairs, pairs) of G_s by its own frequency, at the multiples of ``omega``."""
+        """Return the derivative (orders, pairs, pairs) of G_s by its own frequency, at the multiples of ``omega``."""
         key = omega, shift.tobytes()
         return self._rates.get(key, partial(self._differentiate, omega, shift))
 
     def _evaluate(self, orders: np.ndarray, omega: float) -> np.ndarray:
-        """G (orders, pairs, pairs) at some of the orders."""
+        """Return G (orders, pairs, pairs) at some of the orders."""
         with np.errstate(divide="ignore", invalid="ignore"):
             values = self.compliance.at(orders * omega)
         # On a linear mode the compliance is infinite, and the motion finite.
@@ -166,13 +166,13 @@ class ShiftedCompliance:
         return self._weighted(values, orders)
 
     def _weighted(self, values: np.ndarray, orders: np.ndarray) -> np.ndarray:
-        """G (..., orders, pairs, pairs) with the weight of the orders above the first."""
+        """Return G (..., orders, pairs, pairs) with the weight of the orders above the first."""
         if self.weight == 1.0:
             return values
         return values * np.where(orders > 1, self.weight, 1.0)[:, None, None]
 
     def _shift(self, orders: np.ndarray, omega: float, values: np.ndarray, shift: np.ndarray) -> Shifted:
-        """G_s and A of the ``values`` (orders, pairs, pairs) of G at some of the orders."""
+        """Return G_s and A of the ``values`` (orders, pairs, pairs) of G at some of the orders."""
         factor = np.linalg.inv(np.eye(self.pairs) + shift * values)
         shifted = factor @ values
         if self.pairs < 2 or not isinstance(self.compliance, DenseCompliance):
@@ -186,7 +186,7 @@ class ShiftedCompliance:
         return Shifted(shifted, factor)
 
     def _near_poles(self, values: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The numbers (n,) of the ``values`` that are so near to a pole of G that (1 + s G)^-1 has lost digits."""
+        """Return numbers (n,) of the ``values`` that are so near to a pole of G that (1 + s G)^-1 has lost digits."""
         # Near the pole of a mode the compliance of several pairs is that of the mode alone, to rounding, and the
         # inverse has lost the rest; of one pair nothing is lost.
         sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
@@ -194,7 +194,7 @@ class ShiftedCompliance:
         return np.flatnonzero(is_near)
 
     def _differentiate(self, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The derivative of G_s: from all modes, by Cauchy's formula, or by a central difference where G is complex."""
+        """Return the derivative of G_s: from all modes, by Cauchy's formula, or by a difference where G is complex."""
         if isinstance(self.compliance, DenseCompliance):
             return self._differentiate_modes(self.compliance, omega, shift)
 
@@ -205,7 +205,7 @@ class ShiftedCompliance:
         return self._expand(self.orders, omega, shift, circle).slopes
 
     def _differentiate_real(self, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The derivative of a real G_s by Cauchy's formula, of each order on a circle without poles."""
+        """Return the derivative of a real G_s by Cauchy's formula, of each order on a circle without poles."""
         # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
         expansion = self._expand(self.orders, omega, shift, RADII[0] * NODES)
         mean = expansion.mean.real
@@ -228,7 +228,7 @@ class ShiftedCompliance:
         return np.asarray(slopes)
 
     def _expand(self, orders: np.ndarray, omega: float, shift: np.ndarray, circle: np.ndarray) -> Expansion:
-        """The mean of G_s over a ``circle`` around the frequency of each of some ``orders``, and its derivative there.
+        """Return mean of G_s over a ``circle`` around the frequency of each of ``orders``, and its derivative there.
 
         ``circle`` (node,) are the distances of the nodes over the frequency.
         """
@@ -242,7 +242,7 @@ class ShiftedCompliance:
         return Expansion(shifted.mean(axis=0), slopes)
 
     def _differentiate_modes(self, compliance: DenseCompliance, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The derivative of G_s by A G' A, with the derivative G' of the compliance from its modes."""
+        """Return the derivative of G_s by A G' A, with the derivative G' of the compliance from its modes."""
         rates = self.orders * omega
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes = compliance.rate(rates)
@@ -290,11 +290,11 @@ class RealUnknowns:
         self._same = np.concatenate([one, 1j * one[:, self.skipped :]], axis=1)
 
     def pack(self, z: np.ndarray) -> np.ndarray:
-        """Unknowns (size,) of harmonics (rows, K + 1) complex."""
+        """Return unknowns (size,) of harmonics (rows, K + 1) complex."""
         return np.hstack([z[:, self._places].real, z[:, self._sine_places].imag]).ravel()
 
     def unpack(self, x: np.ndarray) -> np.ndarray:
-        """Harmonics (rows, K + 1) complex of unknowns."""
+        """Return harmonics (rows, K + 1) complex of unknowns."""
         z = np.zeros((self.rows, self.order + 1), complex)
         parts = x.reshape(self.rows, -1)
         z.real[:, self._places] = parts[:, : len(self.orders)]
@@ -302,7 +302,7 @@ class RealUnknowns:
         return z
 
     def by_unknowns(self, series: ForceSeries) -> np.ndarray:
-        """The derivative (pair, orders, unknowns of a row) of forces by the unknowns of their own elongations."""
+        """Return derivative (pair, orders, unknowns of a row) of forces by the unknowns of their own elongations."""
         # Forces by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k they change by 1 and
         # 1, by Im Z_k by i and -i. The mean would be counted for k and for -k.
         count = len(self.orders)
@@ -314,7 +314,7 @@ class RealUnknowns:
         return np.concatenate([plus + minus, 1j * (plus - minus)[:, :, self.skipped :]], axis=2)
 
     def real_rows(self, matrix: np.ndarray) -> np.ndarray:
-        """The rows (size, ...) of the unknowns, of a complex ``matrix`` (rows, orders, ...)."""
+        """Return the rows (size, ...) of the unknowns, of a complex ``matrix`` (rows, orders, ...)."""
         parts = [matrix.real, matrix[:, self.skipped :].imag]
         return np.concatenate(parts, axis=1).reshape(self.size, *matrix.shape[2:])
 
@@ -356,13 +356,13 @@ class HarmonicBalance(RealUnknowns):
         self._changes = BoundedCache[tuple[bytes, float, bytes], np.ndarray](1)
 
     def weighted(self, weight: float) -> "HarmonicBalance":
-        """The equations with another ``weight``."""
+        """Return the equations with another ``weight``."""
         return HarmonicBalance(
             self.compliance, self.forces, order=self.order, odd=self.odd, cosines=self.cosines, weight=weight
         )
 
     def resized(self, x: np.ndarray) -> np.ndarray:
-        """Unknowns (size,) from those of equations with another ``order``, ``x`` (n,); 0 for orders that are new.
+        """Return unknowns (size,) from those of equations with another ``order``, ``x`` (n,); 0 for new orders.
 
         Both must have cosines alone, and both have odd orders alone or all.
         """
@@ -373,22 +373,22 @@ class HarmonicBalance(RealUnknowns):
         return out.ravel()
 
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
-        """The forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
+        """Return the forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
         key = x.tobytes(), omega
         return self._series.get(key, lambda: self.forces.series(self.unpack(x), omega))
 
     def shift(self, omega: float) -> np.ndarray:
-        """The stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
+        """Return the stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
         return self.shifted.shift(omega)
 
     def shifted_force(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
-        """F - s Z (orders, pairs, 1) complex in N."""
+        """Return F - s Z (orders, pairs, 1) complex in N."""
         force = self.series(x, omega).forces[:, : self.order + 1].T[self._places, :, None]
         elongation = self.unpack(x).T[self._places, :, None]
         return force - shift * elongation
 
     def residual(self, x: np.ndarray, omega: float, shift: np.ndarray, linear: np.ndarray | float = 0.0) -> np.ndarray:
-        """Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m, which vanishes at a solution.
+        """Return Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m, which vanishes at a solution.
 
         ``x`` (size,) are the unknowns in m, ``omega`` is in rad/s, ``shift`` (orders, 1, 1) in N/m, and ``linear``
         (pairs, K + 1) complex in m are the harmonics Z^linear.
@@ -403,7 +403,7 @@ class HarmonicBalance(RealUnknowns):
         return self.pack(out)
 
     def drive_term(self, omega: float, shift: np.ndarray, linear: np.ndarray) -> np.ndarray:
-        """-A Z^linear, what a ``linear`` motion (pairs, K + 1) adds to the ``residual``, as unknowns (size,) in m.
+        """Return -A Z^linear, what a ``linear`` motion (pairs, K + 1) adds to the ``residual``, (size,) in m.
 
         Only the orders that the motion has are computed, and no forces.
         """
@@ -413,7 +413,7 @@ class HarmonicBalance(RealUnknowns):
         return self.pack(out)
 
     def jacobian(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
-        """dR/dx (size, size) of the ``residual``."""
+        """Return dR/dx (size, size) of the ``residual``."""
         shifted = self.shifted.at(omega, shift)
         pairs = self.forces.pairs
         changes = self._force_changes(x, omega, shift)
@@ -425,7 +425,7 @@ class HarmonicBalance(RealUnknowns):
         return self.real_rows(matrix.reshape(pairs, len(self.orders), -1))
 
     def _force_changes(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
-        """The derivative (pair, orders, unknowns of the pair) of F - s Z by the unknowns of the same pair."""
+        """Return the derivative (pair, orders, unknowns of the pair) of F - s Z by the unknowns of the same pair."""
 
         def compute() -> np.ndarray:
             return self.by_unknowns(self.series(x, omega)) - shift[:, 0] * self._same
@@ -433,7 +433,7 @@ class HarmonicBalance(RealUnknowns):
         return self._changes.get((x.tobytes(), omega, shift.tobytes()), compute)
 
     def rate(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
-        """dR/domega (size,) in m s/rad of the ``residual`` with no linear motion given: dG_s/domega (F - s Z).
+        """Return dR/domega (size,) in m s/rad of the ``residual`` with no linear motion given: dG_s/domega (F - s Z).
 
         G_s of the order k is taken at k omega, which gives its derivative the factor k. F depends on omega only through
         the floor of the approach velocity and through ``Stops.drag``; both are left out.
@@ -444,7 +444,7 @@ class HarmonicBalance(RealUnknowns):
         return self.pack(out)
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
-        """Estimated size of the harmonics left out of the motion ``x`` (n,), over the largest sum of those kept.
+        """Return estimated size of the harmonics left out of the motion ``x`` (n,), over the largest sum of those kept.
 
         The harmonics from K + 1 to 2K are -G F_k, where G falls as k^-2 from its value at K omega, as inertia does. For
         each pair the sum of |G| over its row stands for G. Those beyond 2K are taken to be 1/3 of those from K to 2K,
@@ -462,7 +462,7 @@ class HarmonicBalance(RealUnknowns):
         return float(left_out.max() / size)
 
     def energy(self, x: np.ndarray, omega: float, shift: np.ndarray) -> float:
-        """Energy in J of a conservative motion at ``omega`` in rad/s.
+        """Return the energy in J of a conservative motion at ``omega`` in rad/s.
 
         ``x`` (size,) are its unknown harmonics in m, ``shift`` (orders, 1, 1) in N/m the stiffnesses of ``shift``.
         """
@@ -476,7 +476,7 @@ class HarmonicBalance(RealUnknowns):
     def energy_change(
         self, x: np.ndarray, omega: float, shift: np.ndarray, along: np.ndarray, by_omega: float
     ) -> float:
-        """The change of the ``energy`` in J with the unknowns by ``along`` (size,) in m and omega by ``by_omega``.
+        """Return change of the ``energy`` in J with the unknowns by ``along`` (size,) in m and omega by ``by_omega``.
 
         The forces' derivative is exact, also next to a touch, where a difference along the branch would be wrong.
         """
@@ -501,7 +501,7 @@ class HarmonicBalance(RealUnknowns):
         return float(self._means @ (changes + by_frequency / (4 * step) * by_omega))
 
     def _stored_by_forces(self, omega: float, shift: np.ndarray) -> np.ndarray:
-        """G_s + omega dG_s/domega (orders, pairs, pairs), by which forces give the energy of the linear system."""
+        """Return G_s + omega dG_s/domega (orders, pairs, pairs), which gives the linear system's energy from forces."""
         compliance = self.shifted.at(omega, shift).compliance
         return compliance + (self.orders * omega)[:, None, None] * self.shifted.rate(omega, shift)
 
@@ -525,28 +525,28 @@ class BalanceFrame(ABC):
 
     @abstractmethod
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution."""
+        """Return the residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution."""
 
     @abstractmethod
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
+        """Return the derivative (n, n + 1) of the residual."""
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the motion at an ``arclength`` along the tangent."""
+        """Solve for the motion at an ``arclength`` along the tangent, from ``guess`` (n + 1,)."""
         # The plane goes through the predictor as it is rounded, so that the row's first residual is exactly zero where
         # the predictor is the guess.
         predicted = self.xi + arclength * self.tangent
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the motion with row . xi = value, (n + 1,); not converged after a NoMotionError."""
+        """Solve for the motion with row . xi = value, (n + 1,); not converged after a NoMotionError."""
         try:
             return self.newton.solve(self, guess, row, value, self.tolerance)
         except NoMotionError as error:
             return Attempt(converged=False, reason=str(error), history=[], xi=guess, left_domain=True)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own.
+        """Return the unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own.
 
         Of the null vectors of the derivative the row ``tangent`` chooses the one with tangent . direction = 1.
         """

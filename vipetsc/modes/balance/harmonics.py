@@ -101,7 +101,7 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
 
 
 def intervals_above(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
-    """Intervals of phase (begin, end), begin < end, on which a periodic motion is above ``offset``.
+    """Return intervals of phase (begin, end), begin < end, on which a periodic motion is above ``offset``.
 
     ``motion`` (samples, 3) holds (z, z', z'') over a period. A motion that is always above has the interval (0, 2 pi).
     An interval that contains phase 0 is not split there: it begins at a negative phase.
@@ -128,7 +128,7 @@ def intervals_above(motion: np.ndarray, offset: float) -> list[tuple[float, floa
 
 
 def minima(slope: np.ndarray) -> np.ndarray:
-    """Phases (minimum,) in rad of the minima of a periodic motion, near enough to cut episodes there.
+    """Return phases (minimum,) in rad of the minima of a periodic motion, near enough to cut episodes there.
 
     ``slope`` (sample,) is its derivative at equal phases of one period. A minimum is where the straight line between
     two samples passes zero upwards.
@@ -141,7 +141,7 @@ def minima(slope: np.ndarray) -> np.ndarray:
 
 
 def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:
-    """The interval from ``a`` to ``b``, phases in rad, cut at ``places`` (place,) of period 2 pi.
+    """Yield the interval from ``a`` to ``b``, phases in rad, cut at ``places`` (place,) of period 2 pi.
 
     A whole period stays whole.
     """
@@ -157,7 +157,7 @@ def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]
 def common(
     pieces: Sequence[tuple[float, float]], others: Sequence[tuple[float, float]]
 ) -> Iterator[tuple[float, float]]:
-    """The parts of ``pieces`` that lie in one of ``others``, both of period 2 pi."""
+    """Yield the parts of ``pieces`` that lie in one of ``others``, both of period 2 pi."""
     for (a, b), (c, d), turn in itertools.product(pieces, others, (-2 * np.pi, 0.0, 2 * np.pi)):
         low = max(a, c + turn)
         high = min(b, d + turn)
@@ -234,7 +234,7 @@ def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None
 
 @lru_cache(maxsize=256)
 def _factors(order: int) -> np.ndarray:
-    """Factors (4, K + 1) by which harmonics up to an ``order`` become the transforms of z and three derivatives.
+    """Return factors (4, K + 1) by which harmonics up to an ``order`` become the transforms of z and three derivatives.
 
     They are those of ``irfft`` over half the number of samples: the mean, which has no conjugate, counts twice.
     """
@@ -244,7 +244,7 @@ def _factors(order: int) -> np.ndarray:
 
 
 def _sampled(z: np.ndarray, derivatives: int) -> np.ndarray:
-    """An elongation of harmonics ``z`` (K + 1,) and its first ``derivatives`` by phase (1 + derivatives, samples)."""
+    """Return an elongation of harmonics ``z`` (K + 1,) and its ``derivatives`` by phase (1 + derivatives, samples)."""
     order = len(z) - 1
     # A power of two, which transforms fast; 8 are left for a motion that is constant (K = 0).
     samples = 1 << int(np.ceil(np.log2(DENSITY * order + 8)))
@@ -253,14 +253,14 @@ def _sampled(z: np.ndarray, derivatives: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _panels(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes sin^2 phi in [0, 1] and their weights: ``count`` panels of Gauss's rule in phi from 0 to pi/2."""
+    """Return nodes sin^2 phi in [0, 1] and their weights: ``count`` panels of Gauss's rule in phi from 0 to pi/2."""
     x, weight = np.polynomial.legendre.leggauss(NODES)
     phi = (np.pi / 4 / count) * (x + 1 + 2 * np.arange(count)[:, None]).ravel()
     return np.sin(phi) ** 2, np.sin(2 * phi) * np.tile(weight, count) * (np.pi / 4 / count)
 
 
 def nodes(pieces: Sequence[tuple[float, float]], orders: int) -> tuple[np.ndarray, np.ndarray]:
-    """Phases and weights of a quadrature over ``pieces`` for a smooth force times exp(-i k theta), k <= ``orders``.
+    """Return phases and weights of a quadrature over ``pieces`` for forces times exp(-i k theta), k <= ``orders``.
 
     A whole period has uniform nodes, exact for trigonometric polynomials below the order 4 ``orders``.
     """
@@ -384,7 +384,7 @@ class ForceSeries:
     def jacobian(
         self, exponent: complex = 0.0, orders: np.ndarray | None = None, rows: np.ndarray | None = None
     ) -> np.ndarray:
-        """How f exp(-mu theta) depends on d_k (pairs, rows, orders), if z changes by sum_k d_k exp((i k + mu) theta).
+        """Return how f exp(-mu theta) depends on d_k (pairs, rows, orders), z by sum_k d_k exp((i k + mu) theta).
 
         Columns are the orders k of d_k, within -K..K, all unless given, ``rows`` those of the force, the same unless
         given; ``exponent`` is mu = lambda/Om of Hill's method. If nothing dissipates, an entry is the Fourier
@@ -395,7 +395,7 @@ class ForceSeries:
         return self.jacobians(np.array([exponent]), orders, rows)[0]
 
     def jacobians(self, exponents: np.ndarray, orders: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """The ``jacobian`` at each of the ``exponents``: (exponents, pairs, rows, orders)."""
+        """Return the ``jacobian`` at each of the ``exponents``: (exponents, pairs, rows, orders)."""
         if rows is None:
             rows = orders
         lag = rows[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
@@ -445,7 +445,7 @@ class SiteForces:
         return not self.springs and all(stops.is_linear_at_rest for stops in self.contacts)
 
     def amplitude_scale(self, pair: int, g: float) -> float:
-        """Amplitude in m at which the ``pair`` with the compliance ``g`` in m/N begins to feel its force.
+        """Return the amplitude in m at which the ``pair`` with the compliance ``g`` in m/N begins to feel its force.
 
         That of a contact is the clearance, or the depth by which it is pressed. For a spring |g c| a^2 = 1, with its
         cubic coefficient c, which is not 0: of its force at z = a cos theta only the cubic part has a first harmonic.
@@ -456,7 +456,7 @@ class SiteForces:
         return float(1 / np.sqrt(np.abs(g * cubic)))
 
     def series(self, z: np.ndarray, omega: float) -> ForceSeries:
-        """The forces of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
+        """Return the forces of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
 
         Raises NoMotionError where a dissipative contact never separates: it has no onset.
         """
@@ -479,7 +479,7 @@ class SiteForces:
         return series
 
     def losses(self, z: np.ndarray, omega: float) -> np.ndarray:
-        """The energies (contacts,) in J that the contacts take in a period, as the ``loss`` of ``series``.
+        """Return the energies (contacts,) in J that the contacts take in a period, as the ``loss`` of ``series``.
 
         Raises NoMotionError where a dissipative contact never separates.
         """
@@ -487,7 +487,7 @@ class SiteForces:
         return np.array([sum(force.loss for force in of_pair) for of_pair in taken])
 
     def _contact_forces(self, pair: int, z: np.ndarray, omega: float, orders: int) -> Iterator[_EpisodeForce]:
-        """The force of a contact, number ``pair``, in each contact episode, with nodes for so many ``orders``.
+        """Yield the force of a contact, number ``pair``, in each contact episode, with nodes for so many ``orders``.
 
         ``z`` (K + 1,) are the harmonics of its elongation.
         """
@@ -501,7 +501,7 @@ class SiteForces:
                 yield self._force(Episode(pair, side, begin, end - begin, approach=0.0), motion, z, omega, orders)
 
     def _force(self, episode: Episode, motion: np.ndarray, z: np.ndarray, omega: float, orders: int) -> _EpisodeForce:
-        """The force in one contact ``episode``, whose approach velocity is found here.
+        """Return the force in one contact ``episode``, whose approach velocity is found here.
 
         ``motion`` (samples, 4) is that of the pair and its derivatives, ``z`` (K + 1,) are its harmonics.
         """

@@ -32,7 +32,7 @@ class Stops(NamedTuple):
 
     @classmethod
     def both(cls, law: Contact, clearance: float) -> Self:
-        """Stops at the same ``clearance`` in m on both sides."""
+        """Return stops at the same ``clearance`` in m on both sides."""
         return cls(law, clearance, clearance)
 
     @property
@@ -41,18 +41,18 @@ class Stops(NamedTuple):
         return min(self.plus, self.minus)
 
     def clearance_on(self, side: int) -> float:
-        """The clearance in m on a ``side``, 1 or -1; inf where there is no stop."""
+        """Return the clearance in m on a ``side``, 1 or -1; inf where there is no stop."""
         if side > 0:
             return self.plus
         return self.minus
 
     def force(self, w: float) -> float:
-        """Elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
+        """Return elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
         elastic = self.law.elastic_force(w - self.plus) - self.law.elastic_force(-w - self.minus)
         return float(elastic) - self.load
 
     def energy(self, w: float) -> float:
-        """Energy in J of the contact and of the load at the relative displacement ``w`` in m, 0 at rest."""
+        """Return the energy in J of the contact and of the load at the relative displacement ``w`` in m, 0 at rest."""
         elastic = float(self.law.elastic_energy(w - self.plus) + self.law.elastic_energy(-w - self.minus))
         return elastic - self.energy_at_rest - self.load * w
 

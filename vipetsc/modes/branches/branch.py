@@ -49,32 +49,32 @@ class Branch(Generic[S]):
         return self.ended.ending.is_final
 
     def regular(self) -> list[S]:
-        """The points of the continuation itself."""
+        """Return the points of the continuation itself."""
         return [p for p in self.points if p.kind == "regular"]
 
     def is_kind(self, kind: str) -> np.ndarray:
-        """Whether each point is of that kind (points,)."""
+        """Return whether each point is of that kind (points,)."""
         return np.array([p.kind == kind for p in self.points], bool)
 
     def column(self, name: str) -> np.ndarray:
-        """One quantity of every point (points, ...)."""
+        """Return one quantity of every point (points, ...)."""
         return np.array([getattr(p, name) for p in self.points])
 
 
 def kinds_of(branch_kind: str) -> tuple[str, ...]:
-    """Kinds of points on a branch of that kind, in the order of their codes."""
+    """Return kinds of points on a branch of that kind, in the order of their codes."""
     if branch_kind == RESPONSES:
         return RESPONSE_KINDS
     return KINDS
 
 
 def kinds_in(branch: Branch[Any]) -> list[str]:
-    """Kinds of points on a branch, in the order of their codes: those of its method, then chosen values."""
+    """Return kinds of points on a branch, in the order of their codes: those of its method, then chosen values."""
     names = dict.fromkeys([*kinds_of(branch.kind), *(point.kind for point in branch.points)])
     return list(names)
 
 
 def stored_kinds(data: xr.Dataset) -> list[str]:
-    """The kind of every point in a branch file."""
+    """Return the kind of every point in a branch file."""
     names = np.array(data["kind"].attrs["flag_meanings"].split())
     return [str(name) for name in names[data["kind"].values]]

@@ -117,7 +117,7 @@ class BranchMonitor:
 
 
 def sampled(problem: Shooting, points: list[Point]) -> Variables:
-    """The orbits of ``points`` as variables of the branch's file."""
+    """Return the orbits of ``points`` as variables of the branch's file."""
     displacement, velocity = zip(*(sample_orbit(problem, p) for p in points), strict=True)
     samples = len(displacement[0])
     axes = "orbit", "phase", "dof"

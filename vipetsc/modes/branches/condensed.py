@@ -56,7 +56,7 @@ class Condensed(NamedTuple):
 
     @classmethod
     def from_case(cls, case: NnmCase) -> "Condensed":
-        """The lattice of a case between its sites, or its system between its contacts and springs."""
+        """Return the lattice of a case between its sites, or its system between its contacts and springs."""
         options = case.nnm
         if options.system != "condensed":
             system = System.from_case(case)
@@ -76,7 +76,7 @@ class Condensed(NamedTuple):
 
 
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
-    """The motions of a ``system`` condensed onto its contacts and springs.
+    """Return the motions of a ``system`` condensed onto its contacts and springs.
 
     A contact that is pressed at rest is a spring of the linear system: without it a chain of grains would have no
     stiffness.
@@ -101,17 +101,17 @@ class CondensedMethod(NnmMethod):
         self.dissipation = dissipation_of(case)
 
     def name(self, job: int) -> str:
-        """The name of the branch of a mode, or of a start frequency."""
+        """Return the name of the branch of a mode, or of a start frequency."""
         if self.system is None or self.options.start_frequency:
             return f"breather-{distinct(self.options.start_frequency)[job]}"
         return super().name(job)
 
     def problem(self, job: int) -> ConservativeMotions:
-        """The equations of the case."""
+        """Return the equations of the case."""
         return self.motions
 
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
-        """The motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
+        """Return motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
         if self.system is not None and not self.options.start_frequency:
             system = self.system
             elongations = system.moves(job)
@@ -130,7 +130,7 @@ class CondensedMethod(NnmMethod):
         return self.motions.in_gap(self.options.start_frequency[job], signs)
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
-        """Guarded steps; a branch that begins in a gap ends where it leaves it."""
+        """Return guarded steps; a branch that begins in a gap ends where it leaves it."""
         options = self.options
         if self.chain is not None:
             omega = 2 * np.pi / start.period
@@ -143,14 +143,14 @@ class CondensedMethod(NnmMethod):
         return guarded_steps(problem, options, done)
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
-        """The point with its largest multiplier, and its loss if anything dissipates."""
+        """Return the point with its largest multiplier, and its loss if anything dissipates."""
         largest = self._largest_multiplier(point)
         if self.dissipation.acts:
             point = self._with_loss(point)
         return replace(point, multiplier=largest)
 
     def _with_loss(self, point: Point) -> Point:
-        """The point with its loss and the force that makes up for it."""
+        """Return the point with its loss and the force that makes up for it."""
         motions = self.motions
         dissipation = self.dissipation
         balance = motions.balance(point.order)
@@ -160,7 +160,7 @@ class CondensedMethod(NnmMethod):
         return with_loss(point, dissipation, contacts, balance.unpack(point.x)[: len(contacts)], masses)
 
     def _largest_multiplier(self, point: Point) -> float:
-        """The largest multiplier by Hill's method, or by the orbit's sensitivities; NaN where it is not found."""
+        """Return largest multiplier by Hill's method, or by the orbit's sensitivities; NaN where it is not found."""
         motions = self.motions
         omega = 2 * np.pi / point.period
         has_all_modes = isinstance(motions.compliance, DenseCompliance)
@@ -195,7 +195,7 @@ class CondensedMethod(NnmMethod):
 
 
 def states(motions: ConservativeMotions, points: list[Point], dofs: int) -> Variables:
-    """Displacements at phase 0, where all is at rest, as variables of the branch's file.
+    """Return displacements at phase 0, where all is at rest, as variables of the branch's file.
 
     They are those of the cells in which one of the ``points`` has displacements that are not negligible.
     """
@@ -210,7 +210,7 @@ def states(motions: ConservativeMotions, points: list[Point], dofs: int) -> Vari
 
 
 def state_of(motions: ConservativeMotions, point: Point, dofs: int) -> dict[int, np.ndarray]:
-    """Displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
+    """Return the displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
     if isinstance(motions.compliance, DenseCompliance):
         u = np.sum(_system_harmonics(motions, motions.compliance, point), axis=0)
         return dict(enumerate(u.reshape(-1, dofs)))
@@ -223,7 +223,7 @@ def state_of(motions: ConservativeMotions, point: Point, dofs: int) -> dict[int,
 
 
 def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np.ndarray]]:
-    """Displacements of the cells near the sites, for each harmonic of a motion in turn."""
+    """Yield displacements of the cells near the sites, for each harmonic of a motion in turn."""
     assert isinstance(motions.compliance, SeriesCompliance)
     omega = 2 * np.pi / point.period
     balance = motions.balance(point.order)
@@ -233,7 +233,7 @@ def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np
 
 
 def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: int) -> Iterator[np.ndarray]:
-    """Displacement (masses,) in m of the first ``count`` masses at least, for each harmonic of a motion in turn."""
+    """Yield the displacement (masses,) in m of at least the first ``count`` masses, for each harmonic of a motion."""
     if isinstance(motions.compliance, DenseCompliance):
         yield from _system_harmonics(motions, motions.compliance, point)
         return
@@ -246,7 +246,7 @@ def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: in
 
 
 def _system_harmonics(motions: ConservativeMotions, compliance: DenseCompliance, point: Point) -> np.ndarray:
-    """Harmonics (order, dofs) in m of a system's displacements, by its linear modes with the added springs."""
+    """Return harmonics (order, dofs) in m of a system's displacements, by its linear modes with the added springs."""
     omega = 2 * np.pi / point.period
     balance = motions.balance(point.order)
     shift = balance.shift(omega)
@@ -257,7 +257,7 @@ def _system_harmonics(motions: ConservativeMotions, compliance: DenseCompliance,
 
 
 def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict[int, np.ndarray]:
-    """Displacement of the cells near the sites that ``forces`` (pairs,) move, as far as it is not negligible."""
+    """Return displacement of the cells near the sites that ``forces`` (pairs,) move, as far as it is not negligible."""
     chain = compliance.chain
     reach = FIRST_REACH
     while True:
@@ -272,7 +272,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
 
 
 def _cells_near(chain: Chain, reach: int) -> np.ndarray:
-    """Numbers of the cells within ``reach`` cells of a site."""
+    """Return numbers of the cells within ``reach`` cells of a site."""
     near = np.unique(np.add.outer(chain.sites, np.arange(-reach, reach + 1)))
     # On a ring the cells on both sides of a site may meet, and are then counted once.
     if chain.ends == "periodic":

@@ -28,7 +28,7 @@ class DampedMethod(NnmMethod):
         self.unknowns = self.problem(0).size + 1
 
     def problem(self, job: int) -> DampedModes:
-        """The equations of the case, for the mode of a branch."""
+        """Return the equations of the case, for the mode of a branch."""
         dissipation = dissipation_of(self.case)
         damping = np.zeros((self.system.dofs, self.system.dofs))
         if dissipation.damping.nnz:
@@ -42,7 +42,7 @@ class DampedMethod(NnmMethod):
         )
 
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
-        """The motion of a linear mode at a small energy."""
+        """Return the motion of a linear mode at a small energy."""
         if not self.system.moves(job).any():
             raise StartError(
                 f"mode {job + 1} has a node at every contact and nonlinear spring: its frequency and damping are those "

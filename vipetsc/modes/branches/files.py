@@ -74,7 +74,7 @@ def restore_table(branch: Branch[Any], folder: Path) -> None:
 
 
 def to_dataset(branch: Branch[Any]) -> xr.Dataset:
-    """The branch as the dataset of its file."""
+    """Return the branch as the dataset of its file."""
     # Codes are stored with their meanings, by which they are read: lists of kinds may grow.
     names = kinds_in(branch)
     kinds = np.array([names.index(p.kind) for p in branch.points], np.int8)
@@ -106,7 +106,7 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
 
 
 def read_branch(path: Path) -> Branch[Any]:
-    """The branch in an HDF5 file, without its ``extra``; raises OSError or ValueError if it holds none."""
+    """Return the branch in an HDF5 file, without its ``extra``; raises OSError or ValueError if it holds none."""
     # The kind comes first: what a file must have depends on it, and a message about what it lacks should be right.
     kind = kind_of_file(path, ("tangent",))
     form = FORMATS[kind]
@@ -134,7 +134,7 @@ def read_branch(path: Path) -> Branch[Any]:
 
 
 def table(data: xr.Dataset, kind: str) -> str:
-    """The table of a branch for CSV, with numbers in full precision; without the harmonics of steady states."""
+    """Return the table of a branch for CSV, with numbers in full precision; without the harmonics of steady states."""
     columns: dict[str, list[Any]] = {}
     if kind == RESPONSES:
         names = [name for name in LAYOUT | OUTPUTS if name in data and "order" not in data[name].dims]
@@ -164,7 +164,7 @@ def table(data: xr.Dataset, kind: str) -> str:
 
 
 def _padded(rows: Sequence[np.ndarray], fill: float = np.nan) -> np.ndarray:
-    """Arrays (..., length) with all dimensions but the last in common, filled up to the longest: (row, ..., length)."""
+    """Return arrays (..., length) with all dimensions but the last in common, padded to the longest, as one array."""
     if not rows:
         return np.empty((0, 0))
     longest = max(row.shape[-1] for row in rows)
@@ -175,7 +175,7 @@ def _padded(rows: Sequence[np.ndarray], fill: float = np.nan) -> np.ndarray:
 
 
 def _nnm_variables(branch: Branch[Point]) -> Variables:
-    """Variables of all branches of normal modes: the quantities, the regions and losses."""
+    """Return variables of all branches of normal modes: the quantities, the regions and losses."""
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
     for name, (stored, _, units, text) in QUANTITIES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
@@ -192,7 +192,7 @@ def _nnm_variables(branch: Branch[Point]) -> Variables:
 
 
 def _nnm_fields(data: xr.Dataset) -> list[dict[str, Any]]:
-    """Fields of ``Point`` that all normal modes have, of every point in a file, by their names."""
+    """Return fields of ``Point`` that all normal modes have, of every point in a file, by their names."""
     columns: dict[str, Any] = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
     columns |= {name: data[name].values.tolist() for name in OF_LOSSES if name in data}
     columns["kind"] = stored_kinds(data)
@@ -203,7 +203,7 @@ def _nnm_fields(data: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _orbit_variables(branch: Branch[Point]) -> Variables:
-    """Initial values, tangents and half-traces of shot orbits; orbits of whole lattices have no half-traces."""
+    """Return initial values, tangents and half-traces of shot orbits; orbits of whole lattices have no half-traces."""
     n = branch.dofs
     pairs = n - 1
     if branch.points:
@@ -222,7 +222,7 @@ def _orbit_variables(branch: Branch[Point]) -> Variables:
 
 
 def _orbits(data: xr.Dataset) -> list[Point]:
-    """The shot orbits of a file."""
+    """Return the shot orbits of a file."""
     tangents = np.column_stack([data["tangent"].values, data["tangent_period"].values])
     traces = data["half_trace"].values + 1j * data["half_trace_imaginary"].values
     points = []
@@ -235,7 +235,7 @@ def _orbits(data: xr.Dataset) -> list[Point]:
 
 
 def _condensed_variables(branch: Branch[Point]) -> Variables:
-    """Harmonics of the elongations at contacts and springs, the *places*, and their tangents."""
+    """Return harmonics of the elongations at contacts and springs, the *places*, and their tangents."""
     points = branch.points
     places = branch.dofs
     harmonics = _padded([p.x.reshape(places, -1) for p in points], fill=0.0)
@@ -266,7 +266,7 @@ def _condensed_variables(branch: Branch[Point]) -> Variables:
 
 
 def _damped_variables(branch: Branch[Point]) -> Variables:
-    """Harmonics of all masses and the damping ratio of damped modes, as unknowns, and their tangents."""
+    """Return harmonics of all masses and the damping ratio of damped modes, as unknowns, and their tangents."""
     count = branch.dofs
     x = branch.column("x").reshape(len(branch.points), count)
     # The first point of a branch that has gone no further has no tangent.
@@ -285,7 +285,7 @@ def _damped_variables(branch: Branch[Point]) -> Variables:
 
 
 def _damped_modes(data: xr.Dataset) -> list[Point]:
-    """The damped modes of a file."""
+    """Return the damped modes of a file."""
     points = []
     for i, fields in enumerate(_nnm_fields(data)):
         tangent = np.append(data["tangent"].values[i], data["tangent_period"].values[i])
@@ -303,7 +303,7 @@ def _damped_modes(data: xr.Dataset) -> list[Point]:
 
 
 def _condensed_motions(data: xr.Dataset) -> list[Point]:
-    """The condensed motions of a file."""
+    """Return the condensed motions of a file."""
     points = []
     for i, fields in enumerate(_nnm_fields(data)):
         order = int(data["harmonics_kept"].values[i])
@@ -325,7 +325,7 @@ def _condensed_motions(data: xr.Dataset) -> list[Point]:
 
 
 def _response_variables(branch: Branch[Response]) -> Variables:
-    """Steady states, their measures, and the states that a slow sweep of the parameter passes."""
+    """Return steady states, their measures, and the states that a slow sweep of the parameter passes."""
     xi = branch.column("xi")
     up = np.array(sweep_up(branch), int)
     down = np.array(sweep_down(branch), int)
@@ -348,7 +348,7 @@ def _response_variables(branch: Branch[Response]) -> Variables:
 
 
 def _responses(data: xr.Dataset) -> list[Response]:
-    """The steady states of a file."""
+    """Return the steady states of a file."""
     kinds = stored_kinds(data)
     # Numbers are not stored: a special point has that of the regular point after it.
     regular = np.array([kind == "regular" for kind in kinds])
@@ -378,7 +378,7 @@ def _responses(data: xr.Dataset) -> list[Response]:
 
 
 def stored_states(points: list[Point], cells: Sequence[int], u: np.ndarray) -> Variables:
-    """Displacements ``u`` (point, cell, dof) in m of ``cells``, from 0, at phase 0: runs can begin with them."""
+    """Return displacements ``u`` (point, cell, dof) in m of ``cells``, from 0, at phase 0: runs can begin with them."""
     # Velocities of zero are stored because ``io.state`` reads any state alike, as displacement and velocity.
     axes = "orbit", "states/cell", "states/mass"
     return {

@@ -63,7 +63,7 @@ BranchCase = NnmCase | NfrcCase
 
 
 def method_of(case: BranchCase) -> type[Method[Any]]:
-    """The method that finds the branches of a ``case``."""
+    """Return the method that finds the branches of a ``case``."""
     if isinstance(case, NfrcCase):
         return ResponseMethod
     if case.nnm.method == "damped":
@@ -98,7 +98,7 @@ class Follower:
         self.growth = Growth(self.method, self.write, listener, self.stop)
 
     def follow(self, job: int) -> list[Branch[Any]]:
-        """The branches of a ``job``, one for each direction, each with those that cross it, if asked for.
+        """Return the branches of a ``job``, one for each direction, each with those that cross it, if asked for.
 
         A job is a number from ``Method.jobs``, counted from 0: that of a mode, of a start frequency, or of a curve.
         """
@@ -157,7 +157,7 @@ class Follower:
         method.finish(problem, branch)
 
     def _stored_or_new(self, name: str) -> Branch[Any]:
-        """The branch of that ``name`` as it is in its file when results are resumed, else one without points.
+        """Return the branch of that ``name`` as it is in its file when results are resumed, else one without points.
 
         The ``extra`` variables of the file are not read: those of a branch that is not complete are computed again.
         """
@@ -188,7 +188,7 @@ class Follower:
         return branch
 
     def _follow_crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
-        """The branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
+        """Return the branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
         branches: list[Branch[Any]] = []
         # ``further`` looks at ``branches`` whenever it is asked for the next one: no branch is begun twice.
         for crossing in self.method.further(branch, branches):
@@ -240,7 +240,7 @@ def follow_all(
     listener: Listener | None = None,
     stop: StopRequest | None = None,
 ) -> list[Branch[Any]]:
-    """All branches of ``case``, written into ``folder`` if there is one.
+    """Return all branches of ``case``, written into ``folder`` if there is one.
 
     Each branch is computed on one rank, so that its bits do not depend on the number of ranks: rank r of n follows the
     branches r, r + n, r + 2n and so on.

@@ -56,7 +56,7 @@ class Dissipation(NamedTuple):
 
 
 def dissipation_of(case: NnmCase) -> Dissipation:
-    """The dashpots and contacts of a case that dissipate, and its forced mass."""
+    """Return the dashpots and contacts of a case that dissipate, and its forced mass."""
     damping = csr_matrix((0, 0))
     if case.nnm.system in ("chain", "condensed"):
         chain = case.damped_chain
@@ -80,7 +80,7 @@ def with_loss(
     elongations: np.ndarray,
     masses: Iterable[tuple[int, np.ndarray]],
 ) -> Point:
-    """The ``point`` with its loss in J a period, and the force in N at the forced mass that makes up for it.
+    """Return the ``point`` with its loss in J a period, and the force in N at the forced mass that makes up for it.
 
     ``stops`` are those of the contacts, whose ``elongations`` (contacts, K + 1) in m are harmonics; ``masses`` gives
     orders and the harmonics (masses,) in m of all displacements. The loss is NaN if a contact that dissipates never
@@ -109,7 +109,7 @@ def with_loss(
 
 
 def with_orbits_loss(problem: Shooting, dissipation: Dissipation, point: Point) -> Point:
-    """The ``point``, an orbit that is shot, with its loss and force."""
+    """Return the ``point``, an orbit that is shot, with its loss and force."""
     samples = FEWEST_SAMPLES
     u, _ = sample_orbit(problem, point, samples)
     coarse = _with_sampled_loss(problem, dissipation, point, u[::2])
@@ -125,7 +125,7 @@ def with_orbits_loss(problem: Shooting, dissipation: Dissipation, point: Point) 
 
 
 def _with_sampled_loss(problem: Shooting, dissipation: Dissipation, point: Point, u: np.ndarray) -> Point:
-    """The ``point`` with loss and force of its displacements ``u`` (samples, n) in m at uniform times of a period."""
+    """Return the ``point`` with loss and force of ``u`` (samples, n) in m at uniform times of a period."""
     samples = len(u)
     harmonics = np.fft.rfft(u, axis=0).T[:, : samples // 2] * (2 / samples)
     harmonics[:, 0] /= 2

@@ -18,7 +18,7 @@ Monitor = Callable[[S], Ended | None]
 def value_kind(
     name: str, value: float, quantity: Callable[[S], float], accept: Callable[[S], bool] | None = None
 ) -> SpecialKind[S]:
-    """Points where the ``quantity`` of that ``name`` has a ``value``; their kind is ``name@value``."""
+    """Return points where the ``quantity`` of that ``name`` has a ``value``; their kind is ``name@value``."""
     size = abs(value) or 1.0
     # Names of kinds are separated by blanks in files.
     kind = f"{'_'.join(name.split())}@{value:.12g}"
@@ -61,38 +61,38 @@ class Method(ABC, Generic[S]):
 
     @staticmethod
     def jobs(case: Any) -> list[int]:
-        """Numbers of a case's branches: of modes from 0, or of start frequencies."""
+        """Return numbers of a case's branches: of modes from 0, or of start frequencies."""
         if case.nnm.start_frequency:
             return list(range(len(case.nnm.start_frequency)))
         return [mode - 1 for mode in case.nnm.modes]
 
     @abstractmethod
     def new_branch(self, name: str) -> Branch[S]:
-        """A branch without points."""
+        """Return a branch without points."""
 
     @abstractmethod
     def name(self, job: int) -> str:
-        """The name of a branch."""
+        """Return the name of a branch."""
 
     @abstractmethod
     def problem(self, job: int) -> PeriodicProblem[S]:
-        """The equations of a branch."""
+        """Return the equations of a branch."""
 
     @abstractmethod
     def start(self, problem: PeriodicProblem[S], job: int, stop: StopRequest | None = None) -> S:
-        """The first point of a branch; StoppedError is raised where that takes long and a ``stop`` is requested."""
+        """Return first point of a branch; StoppedError is raised where that takes long and a ``stop`` is requested."""
 
     def computed(self, job: int) -> list[S] | None:
-        """All points of a branch that needs no continuation; None of others, which are followed."""
+        """Return all points of a branch that needs no continuation; None of others, which are followed."""
         return None
 
     def findings(self, job: int, points: list[S]) -> list[str]:
-        """Sentences on the ``points`` of a branch that needs no continuation."""
+        """Return sentences on the ``points`` of a branch that needs no continuation."""
         return []
 
     @abstractmethod
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:
-        """Steps and end of a branch that has ``done`` regular points after its start."""
+        """Return steps and end of a branch that has ``done`` regular points after its start."""
 
     @property
     def directions(self) -> tuple[int, ...]:
@@ -100,22 +100,22 @@ class Method(ABC, Generic[S]):
         return (1,)
 
     def assess(self, problem: PeriodicProblem[S], point: S) -> S:
-        """The point with the quantities of its file that continuation does not need."""
+        """Return the point with the quantities of its file that continuation does not need."""
         return point
 
     def chosen(self, problem: PeriodicProblem[S]) -> list[SpecialKind[S]]:
-        """Kinds of points that the case asks for, beside the special ones: those where a quantity has a value."""
+        """Return the kinds of points that the case asks for, beside special ones: where a quantity has a value."""
         return []
 
     def monitor(self, problem: PeriodicProblem[S]) -> Monitor[S]:
-        """A check of every new point: an ending ends the branch, None lets it go on."""
+        """Return a check of every new point: an ending ends the branch, None lets it go on."""
         return lambda point: None
 
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:
         """Add the variables of a whole branch's file that are not of its points."""
 
     def further(self, branch: Branch[S], followed: Sequence[Branch[S]]) -> Iterator[CrossingBranch]:
-        """The branches that cross a branch, and isolated ones near it, that the case asks for.
+        """Return the branches that cross a branch, and isolated ones near it, that the case asks for.
 
         ``followed`` has those that were followed so far, when the next one is asked for.
         """

@@ -52,20 +52,20 @@ class NnmMethod(Method[Point]):
         self.locates = case.nnm.locate
 
     def new_branch(self, name: str) -> Branch[Point]:
-        """A branch without points."""
+        """Return a branch without points."""
         return Branch(name, self.case.to_toml(), self.unknowns, self.kind)
 
     def name(self, job: int) -> str:
-        """The name of the branch of a mode."""
+        """Return the name of the branch of a mode."""
         assert self.system is not None
         return self.system.branch_name(job)
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
-        """Guarded steps to the end of the ranges."""
+        """Return guarded steps to the end of the ranges."""
         return guarded_steps(problem, self.options, done)
 
     def chosen(self, problem: PeriodicProblem[Point]) -> list[SpecialKind[Point]]:
-        """The points at the values ``nnm.points_at``."""
+        """Return the points at the values ``nnm.points_at``."""
 
         def quantity(name: str, point: Point) -> float:
             # Points have their frequency in Hz, keys in rad/s.
@@ -85,7 +85,7 @@ class NnmMethod(Method[Point]):
         return {"up": (1,), "down": (-1,), "both": (1, -1)}[self.options.direction]
 
     def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
-        """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one.
+        """Yield the orbits at the energies ``nnm.orbits_at``, wherever the branch passes one.
 
         The ``branch`` says which are ``missing``.
         """
@@ -107,7 +107,7 @@ class NnmMethod(Method[Point]):
 
 
 def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:
-    """Steps by [nnm] of a branch that has ``done`` points after its start."""
+    """Return steps by [nnm] of a branch that has ``done`` points after its start."""
     # ``points`` limits the whole branch, so that one that is resumed ends where an unbroken one would.
     remaining = control.model_copy(update={"points": max(control.points - done, 0)})
     # The problems of normal modes say when contacts act, which the method's type does not tell.
@@ -115,7 +115,7 @@ def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int)
 
 
 def map_of(options: NnmTable, system: System) -> ShootingMap:
-    """The part of the period that is shot."""
+    """Return the part of the period that is shot."""
     if options.map != "auto":
         return MAPS[options.map]
     # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
@@ -125,7 +125,7 @@ def map_of(options: NnmTable, system: System) -> ShootingMap:
 
 
 def start_energy(options: NnmTable, system: System, mode: int) -> float:
-    """Energy in J of the first point of the branch of ``mode`` (from 0): well below a touch, and almost linear."""
+    """Return energy in J of the first point of the branch of ``mode`` (from 0): well below a touch, almost linear."""
     if options.start_energy != "auto":
         return options.start_energy
     energy = min(system.grazing_energy(mode) / BELOW_TOUCH, system.nonlinear_energy(mode, NONLINEAR_FORCE))
@@ -153,15 +153,15 @@ class ShootingMethod(NnmMethod):
         self.shooting = Shooting(Dop853Flow(self.system), shooting_map, options.tolerance, options.max_newton)
 
     def problem(self, job: int) -> Shooting:
-        """The shooting equations of the case."""
+        """Return the shooting equations of the case."""
         return self.shooting
 
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
-        """The orbit of a linear mode at a small energy."""
+        """Return the orbit of a linear mode at a small energy."""
         return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
-        """The point with its loss, if anything dissipates."""
+        """Return the point with its loss, if anything dissipates."""
         if not self.dissipation.acts:
             return point
         # A branch that crosses another one may have another map, and with it other initial values.
@@ -169,7 +169,7 @@ class ShootingMethod(NnmMethod):
         return with_orbits_loss(problem, self.dissipation, point)
 
     def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
-        """The check of every new point: whether the branch retraces itself, stands still or is another one."""
+        """Return the check of every new point: whether the branch retraces itself, stands still or is another one."""
         assert isinstance(problem, Shooting)
         return BranchMonitor(problem, self.options.guards).check
 
@@ -179,7 +179,7 @@ class ShootingMethod(NnmMethod):
         branch.extra = sampled(self.shooting, orbits)
 
     def _typical(self, branch: Branch[Point]) -> list[Point]:
-        """The regular points in the middle of every region."""
+        """Return the regular points in the middle of every region."""
         by_region: dict[int, list[Point]] = {}
         for point, region in zip(branch.points, regions(branch).tolist(), strict=True):
             if point.kind == "regular":
@@ -188,7 +188,7 @@ class ShootingMethod(NnmMethod):
         return [group[len(group) // 2] for group in groups]
 
     def further(self, branch: Branch[Point], followed: Sequence[Branch[Point]]) -> Iterator[CrossingBranch]:
-        """The branches that cross at the kinds of special points in ``nnm.switch``."""
+        """Yield the branches that cross at the kinds of special points in ``nnm.switch``."""
         for kind in self.options.switch:
             special = [p for p in branch.points if p.kind == kind]
             for number, point in enumerate(special, 1):
@@ -196,5 +196,5 @@ class ShootingMethod(NnmMethod):
                 yield CrossingBranch(name=f"{branch.name}-{kind}-{number}", start=start, rule=self._crossing_rule)
 
     def _crossing_rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
-        """Steps by [nnm] in the relative chart: the crossing branch has its own contacts at the start of its arc."""
+        """Return the steps by [nnm] in the relative chart: the crossing branch has its own contacts at its start."""
         return guarded_steps(problem, self.crossing_options, done)

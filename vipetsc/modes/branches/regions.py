@@ -30,12 +30,12 @@ MOST = float(np.exp(500.0))
 
 
 def quantity(branch: Branch[Point], name: str) -> np.ndarray:
-    """One of ``QUANTITIES`` of every point (points,)."""
+    """Return one of ``QUANTITIES`` of every point (points,)."""
     return branch.column(name).astype(QUANTITIES[name][1])
 
 
 def regions(branch: Branch[Point]) -> np.ndarray:
-    """Region of every point of a branch (points,), see ``assign_regions``."""
+    """Return the region of every point of a branch (points,), see ``assign_regions``."""
     return assign_regions(
         energy=quantity(branch, "energy"),
         slope=quantity(branch, "slope"),
@@ -45,7 +45,7 @@ def regions(branch: Branch[Point]) -> np.ndarray:
 
 
 def slope_laws(branch: Branch[Point]) -> dict[str, dict[str, float]]:
-    """Power laws of the slope over the energy in regions II (its falling part), III and IV, see ``fit_slope``."""
+    """Return power laws of the slope over the energy in regions II (where it falls), III and IV, see ``fit_slope``."""
     regular = branch.is_kind("regular")
     energy = quantity(branch, "energy")
     slope = quantity(branch, "slope")
@@ -53,12 +53,12 @@ def slope_laws(branch: Branch[Point]) -> dict[str, dict[str, float]]:
 
 
 def tongues(branch: Branch[Point]) -> list[int]:
-    """k of the k:1 internal resonances whose tongues a branch passes, each with an energy fold at its tip."""
+    """Return k of the k:1 internal resonances whose tongues a branch passes, each with an energy fold at its tip."""
     return sorted({p.resonance for p in branch.points} - {0, 1})
 
 
 def assign_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Region 1-4 of every point of a branch (points,), in its order; 0 for a nonlinear branch without contacts.
+    """Return region 1-4 of every point of a branch (points,), in its order; 0 for a nonlinear branch without contacts.
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
     until the local exponent d ln(df/dE)/d ln E changes by less than ``SETTLED`` per e-fold of energy and is above
@@ -96,7 +96,7 @@ def assign_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, 
 
 
 def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
-    """The point of the largest slope after the last energy fold beyond the ``first`` contact.
+    """Return the point of the largest slope after the last energy fold beyond the ``first`` contact.
 
     None where the slope changes its sign after it, or too few points follow for an exponent.
     """
@@ -115,7 +115,7 @@ def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
 
 
 def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict[str, dict[str, float]]:
-    """df/dE = factor E^exponent in regions II (its falling part), III and IV, where it is without ``doubt``.
+    """Return df/dE = factor E^exponent in regions II (its falling part), III and IV, where it is without ``doubt``.
 
     ``energy`` in J, ``slope`` df/dE in Hz/J and ``region``, 1 to 4, are arrays (point,) along the branch. A vertical
     piece of a branch has no law: its factor leaves the range of numbers, or its adjusted R^2 is NaN.
@@ -145,7 +145,7 @@ def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict
 
 
 def _last_peak(slope: np.ndarray) -> int:
-    """The place of the largest slope after the last that is not positive."""
+    """Return the place of the largest slope after the last that is not positive."""
     begin = 0
     backwards = np.nonzero(~(slope > 0))[0]
     if backwards.size:

@@ -58,11 +58,11 @@ class ResponseMethod(Method[Response]):
 
     @staticmethod
     def jobs(case: Any) -> list[int]:
-        """Numbers of a case's curves."""
+        """Return numbers of a case's curves."""
         return list(range(len(case.every_curve())))
 
     def new_branch(self, name: str) -> Branch[Response]:
-        """A curve without states, an isolated one near it, or one that crosses it."""
+        """Return a curve without states, an isolated one near it, or one that crosses it."""
         base, special_kind = _without_curve(name)
         case_of = None
         for kind in self.case.nfrc.switch:
@@ -97,22 +97,22 @@ class ResponseMethod(Method[Response]):
         )
 
     def name(self, job: int) -> str:
-        """The name of a curve."""
+        """Return the name of a curve."""
         return self.curves[job].name
 
     def problem(self, job: int) -> SteadyStates | StatesOverKey:
-        """The equations of a curve."""
+        """Return the equations of a curve."""
         return self._equations(self.curves[job], self.curves[job].case)
 
     def computed(self, job: int) -> list[Response] | None:
-        """The linear motions of a lattice without contacts and nonlinear springs."""
+        """Return the linear motions of a lattice without contacts and nonlinear springs."""
         curve = self.curves[job]
         if not curve.case.is_linear:
             return None
         return list(linear_states(curve.case, curve.fixed, self._compliance_of(curve)))
 
     def findings(self, job: int, points: list[Response]) -> list[str]:
-        """A sentence on the linear motions at frequencies of modes that nothing damps."""
+        """Return a sentence on the linear motions at frequencies of modes that nothing damps."""
         curve = self.curves[job]
         shifted = list(linear_states(curve.case, curve.fixed, self._compliance_of(curve), BESIDE))
         at = resonances(points, shifted)
@@ -134,7 +134,7 @@ class ResponseMethod(Method[Response]):
         branch.extra |= linear_variables(states, options.over)
 
     def _equations(self, curve: ResponseCurve, case: NfrcCase) -> SteadyStates | StatesOverKey:
-        """The equations of a ``curve``, with the harmonics of a ``case``."""
+        """Return the equations of a ``curve``, with the harmonics of a ``case``."""
         options = case.nfrc
         if options.varies_key:
             keyed = KeyedCase(case, curve.restitution, curve.fixed)
@@ -142,23 +142,23 @@ class ResponseMethod(Method[Response]):
         return SteadyStates(case, curve.restitution, curve.fixed, compliance=self._compliance_of(curve))
 
     def _compliance_of(self, curve: ResponseCurve) -> WaveCompliance | ModalCompliance:
-        """The compliance of the lattice of a ``curve``."""
+        """Return the compliance of the lattice of a ``curve``."""
         if self._compliance is None or self._compliance[0] != curve.member:
             self._compliance = curve.member, compliance_of(curve.case)
         return self._compliance[1]
 
     def start(self, problem: PeriodicProblem[Response], job: int, stop: StopRequest | None = None) -> Response:
-        """The state at the beginning of the range."""
+        """Return the state at the beginning of the range."""
         assert isinstance(problem, SteadyStates | StatesOverKey)
         return first_state(problem, stop)
 
     def rule(self, problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
-        """Steps to the end of the range; the start counts among ``nfrc.points``."""
+        """Return steps to the end of the range; the start counts among ``nfrc.points``."""
         assert isinstance(problem, SteadyStates | StatesOverKey)
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
     def further(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
-        """The isolated curves near a curve, and those that cross it or one of these at ``nfrc.switch``."""
+        """Yield the isolated curves near a curve, and those that cross it or one of these at ``nfrc.switch``."""
         yield from self._isolas(branch, followed)
         curve = next(curve for curve in self.curves if curve.name == branch.name)
         for kind in self.case.nfrc.curves_of:
@@ -174,7 +174,7 @@ class ResponseMethod(Method[Response]):
     def _special_curve(
         self, curve: ResponseCurve, point: Response, name: str, followed: Sequence[Branch[Response]]
     ) -> Iterator[CrossingBranch]:
-        """The curve of special points through a special ``point``, in both directions, unless followed already."""
+        """Yield curve of special points through a special ``point``, in both directions, unless followed already."""
         states = self._equations(curve, curve.case)
         assert isinstance(states, SteadyStates)
 
@@ -196,7 +196,7 @@ class ResponseMethod(Method[Response]):
     def _crossing(
         self, curve: ResponseCurve, point: Response, name: str, followed: Sequence[Branch[Response]]
     ) -> Iterator[CrossingBranch]:
-        """The curve that crosses at a special ``point``, in both directions unless they are the same motions.
+        """Yield the curve that crosses at a special ``point``, in both directions unless they are the same motions.
 
         Those are shifted by a period of the drive at a period doubling, mirror images where a symmetry is lost. A curve
         that crosses a second time is not followed again.
@@ -223,7 +223,7 @@ class ResponseMethod(Method[Response]):
             yield CrossingBranch(of_side, partial(start, side), rule)
 
     def _isolas(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
-        """The isolated curves that are found near a curve, in both directions where they are not closed."""
+        """Yield the isolated curves that are found near a curve, in both directions where they are not closed."""
         if not (self.case.nfrc.isolas and branch.complete):
             return
         states = self.problem(next(job for job in self.jobs(self.case) if self.name(job) == branch.name))
@@ -250,7 +250,7 @@ class ResponseMethod(Method[Response]):
                     yield self._isola(states, back, f"{branch.name}{ISOLA}{number}-back")
 
     def _isola(self, states: SteadyStates | StatesOverKey, first: Response, name: str) -> CrossingBranch:
-        """The isolated curve of that ``name`` through the ``first`` state, along its tangent."""
+        """Return the isolated curve of that ``name`` through the ``first`` state, along its tangent."""
 
         def rule(problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
             return TurningSteps(states, max(self.case.nfrc.points - 1 - done, 0), first)
@@ -258,7 +258,7 @@ class ResponseMethod(Method[Response]):
         return CrossingBranch(name, lambda: (states, first), rule)
 
     def chosen(self, problem: PeriodicProblem[Response]) -> list[SpecialKind[Response]]:
-        """The states at the values ``nfrc.points_at``, within the range."""
+        """Return the states at the values ``nfrc.points_at``, within the range."""
         if isinstance(problem, SpecialCurve):
             return []
         assert isinstance(problem, SteadyStates | StatesOverKey)
@@ -288,7 +288,7 @@ class ResponseMethod(Method[Response]):
         ]
 
     def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
-        """The state with its measures, which special points have already."""
+        """Return the state with its measures, which special points have already."""
         if point.measures is not None:
             return point
         assert isinstance(problem, SteadyStates | StatesOverKey | SpecialCurve)
@@ -296,7 +296,7 @@ class ResponseMethod(Method[Response]):
 
 
 def _without_curve(name: str) -> tuple[str, str]:
-    """The name of the curve on which a curve of special points begins, and their kind; "" of any other curve."""
+    """Return the name of the curve on which a curve of special points begins, and their kind; "" of any other curve."""
     base, curve, _ = name.partition(CURVE)
     if not curve:
         return name, ""
@@ -305,7 +305,7 @@ def _without_curve(name: str) -> tuple[str, str]:
 
 
 def _axes(case: NfrcCase) -> Variables:
-    """Coordinates of the variables of states: sites, harmonics, channels, points and pairs that [output] names."""
+    """Return the coordinates of variables of states: sites, harmonics, channels, points and pairs of [output]."""
     chain = case.model().chain
     last_harmonic = 1 if case.is_linear else case.nfrc.harmonics
     orders = np.arange(last_harmonic + 1)

@@ -21,7 +21,7 @@ class ParameterSweep(NamedTuple):
 
 
 def with_stable_folds(stable: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """Mask (state,) of the states that a sweep reaches: the ``stable`` ones and folds with a stable neighbour.
+    """Return mask (state,) of the states that a sweep reaches: the ``stable`` ones and folds with a stable neighbour.
 
     ``stable`` and ``fold`` (state,) mark the states of a curve, in its order.
     """
@@ -30,7 +30,7 @@ def with_stable_folds(stable: np.ndarray, fold: np.ndarray) -> np.ndarray:
 
 
 def swept(sweep: ParameterSweep, start: int | None = None) -> list[int]:
-    """Numbers of the states that a slow sweep passes from ``start``, else from the first stable state.
+    """Return numbers of the states that a slow sweep passes from ``start``, else from the first stable state.
 
     At a fold, or where a state becomes unstable, it jumps to a stable state with the parameter's value; it ends where
     there is none.
@@ -51,7 +51,7 @@ def swept(sweep: ParameterSweep, start: int | None = None) -> list[int]:
 
 
 def _neighbours_ahead(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]:
-    """Stable neighbours of state ``i`` on the curve with a larger parameter."""
+    """Return stable neighbours of state ``i`` on the curve with a larger parameter."""
     # On a branch beyond a fold the parameter grows towards the state before: both neighbours count.
     p = sweep.parameter
     ahead = []
@@ -62,7 +62,7 @@ def _neighbours_ahead(sweep: ParameterSweep, i: int, passed: set[int]) -> list[i
 
 
 def _states_across(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]:
-    """States to which a sweep may jump from state ``i``: ends of stable steps of the curve that pass its parameter."""
+    """Return the states to which a sweep may jump from state ``i``: ends of stable steps that pass its parameter."""
     # A step between a stable and an unstable state leaves open where on it stability ends.
     p = sweep.parameter
     ahead = []
@@ -75,7 +75,7 @@ def _states_across(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]
 
 
 def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
-    """The outputs that the states of a curve have."""
+    """Return the outputs that the states of a curve have."""
     if not branch.points:
         return {}
     present = branch.points[0].measured.outputs
@@ -83,7 +83,7 @@ def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
 
 
 def measure(branch: Branch[Response], stored: str) -> np.ndarray:
-    """A measure or an output (state, ...) of every state, by its name in the file."""
+    """Return a measure or an output (state, ...) of every state, by its name in the file."""
     if stored in OUTPUTS:
         return np.array([p.measured.outputs[stored] for p in branch.points])
     if stored == "harmonics":
@@ -96,7 +96,7 @@ def measure(branch: Branch[Response], stored: str) -> np.ndarray:
 
 
 def parameter_values(branch: Branch[Response]) -> np.ndarray:
-    """The value (point,) of the parameter that varies along a curve."""
+    """Return the value (point,) of the parameter that varies along a curve."""
     over = str(branch.about["over"])
     if over in LAYOUT:
         return measure(branch, over)
@@ -104,12 +104,12 @@ def parameter_values(branch: Branch[Response]) -> np.ndarray:
 
 
 def sweep_up(branch: Branch[Response]) -> list[int]:
-    """States that a slow growth of the parameter passes, from the first stable one."""
+    """Return states that a slow growth of the parameter passes, from the first stable one."""
     return swept(_sweep(branch, 1))
 
 
 def sweep_down(branch: Branch[Response]) -> list[int]:
-    """States that a slow fall of the parameter passes, from the last of the sweep up."""
+    """Return states that a slow fall of the parameter passes, from the last of the sweep up."""
     passed = sweep_up(branch)
     if not passed:
         return []
@@ -117,7 +117,7 @@ def sweep_down(branch: Branch[Response]) -> list[int]:
 
 
 def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
-    """The states of a curve for a sweep up (``sign`` 1) or down (-1)."""
+    """Return the states of a curve for a sweep up (``sign`` 1) or down (-1)."""
     # With the sign a sweep down is one up as well; -1 unstable perturbations mean that stability is undecided.
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")

@@ -75,7 +75,7 @@ class GuardedChange(NamedTuple):
 def largest_change(
     problem: OrbitProblem, control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
 ) -> GuardedChange:
-    """The largest change of a step, from ``before`` to ``after``, over its bound in ``control``.
+    """Return the largest change of a step, from ``before`` to ``after``, over its bound in ``control``.
 
     ``geometry`` has the fields of ``Geometry``: ``corrector`` and ``turn``. Which other changes are guarded
     ``problem.guards`` says.
@@ -105,7 +105,7 @@ def largest_change(
 
 
 def half_trace_change(a: Point, b: Point) -> float:
-    """Hausdorff distance between the sets of asinh(c) of two points, c their half-traces.
+    """Return Hausdorff distance between the sets of asinh(c) of two points, c their half-traces.
 
     It is the largest distance of a half-trace of one point from the nearest one of the other. Half-traces may meet and
     turn into a complex pair, so that they have no lasting order in which to compare them. 0 for one degree of freedom,
@@ -116,7 +116,7 @@ def half_trace_change(a: Point, b: Point) -> float:
 
 
 def _squashed(c: np.ndarray) -> np.ndarray:
-    """asinh(|c|) with the phase of c, for complex c (...).
+    """Return asinh(|c|) with the phase of c, for complex c (...).
 
     It grows as the logarithm of a large |c|, so that relative changes are compared. asinh(c) itself has branch cuts on
     the imaginary axis, across which it jumps.
@@ -190,19 +190,19 @@ class StepRule(Protocol[S]):
     chart: str
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """The verdict on an ``attempt`` at a ``step`` that has not converged."""
+        """Return the verdict on an ``attempt`` at a ``step`` that has not converged."""
 
     def judge(self, before: S, after: S, geometry: Geometry) -> Verdict:
-        """The verdict on a step from the point ``before`` to ``after`` that has converged."""
+        """Return the verdict on a step from the point ``before`` to ``after`` that has converged."""
 
     def end(self, before: S, point: S) -> tuple[S, Ended] | None:
-        """The last point of the branch and how it ended, if it ends at ``point``, the one after ``before``; else None.
+        """Return the last point of the branch and how it ended, if it ends at ``point``, after ``before``; else None.
 
         The last point may differ from ``point``, as where a rule moves it to the end of a range that it has passed.
         """
 
     def stuck(self, last: S, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Why no step leads on from the ``last`` point."""
+        """Return why no step leads on from the ``last`` point."""
 
 
 class GuardedSteps:
@@ -229,7 +229,7 @@ class GuardedSteps:
         self.chart: str = control.chart
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """A shorter step."""
+        """Return a shorter step."""
         return Verdict(
             accepted=False,
             step=step * FAILED_FACTOR,
@@ -259,7 +259,7 @@ class GuardedSteps:
         return Verdict(accepted=False, step=after.step * factor, why=why, remedy=remedy)
 
     def end(self, before: Point, point: Point) -> tuple[Point, Ended] | None:
-        """The point itself, where it has left the range of energies or of frequencies, or is almost an equilibrium."""
+        """Return the point itself, if it has left the range of energies or frequencies, or is almost an equilibrium."""
         if self.problem.acceleration(point) < NEAR_EQUILIBRIUM:
             return point, Ending.EQUILIBRIUM.with_numbers(energy=point.energy, frequency=point.frequency)
         low, high = self.control.energy
@@ -274,7 +274,7 @@ class GuardedSteps:
         return None
 
     def stuck(self, last: Point, attempt: Attempt | None, verdict: Verdict) -> str:
-        """A sentence that says where and why no step was short enough, and which keys of the case file may help."""
+        """Return a sentence on where and why no step was short enough, and on keys of the case that may help."""
         residuals = "none"
         if attempt is None:
             verdict = self.no_step
@@ -287,7 +287,7 @@ class GuardedSteps:
         )
 
     def _grazing_advice(self, point: Point) -> str:
-        """A sentence on contacts that graze in the orbit of a ``point``, and on keys that help; empty without any."""
+        """Return a sentence on contacts that graze in the orbit of a ``point``, and on keys that help, or ""."""
         try:
             numbers = self.problem.grazing(point)
         except FlowError:
@@ -361,7 +361,7 @@ class Continuation(Generic[S]):
         self.ended = Ending.POINTS_USED.with_numbers(points=total, key=self.rule.points_key)
 
     def _next(self) -> S:
-        """The next point; raises ContinuationError where no step is short enough."""
+        """Return the next point; raises ContinuationError where no step is short enough."""
         last = self.point
         frame = self.problem.frame(last, self.rule.chart)
         attempt = None
@@ -391,7 +391,7 @@ class Continuation(Generic[S]):
 
 
 def _corrected(frame: Frame[S], step: float) -> tuple[Attempt, np.ndarray | None]:
-    """The attempt at a point a ``step`` along the tangent of ``frame``, and the unit tangent there if it converges.
+    """Return attempt at a point a ``step`` along the tangent of ``frame``, and the unit tangent there if it converges.
 
     Newton's method may converge to a point with no unique tangent, as where two branches meet, or where a jump led to
     another branch. This counts as an attempt that has not converged: another step leads to another point.
@@ -406,7 +406,7 @@ def _corrected(frame: Frame[S], step: float) -> tuple[Attempt, np.ndarray | None
 
 
 def _rule(problem: Any, control: Any) -> Any:
-    """The step rule that ``control`` is, or ``GuardedSteps`` by a section [nnm].
+    """Return the step rule that ``control`` is, or ``GuardedSteps`` by a section [nnm].
 
     Such a section is only given with a problem whose points are orbits, which types cannot say: hence Any.
     """
@@ -467,7 +467,7 @@ class Segment(Generic[S]):
         self.knots[arclength] = Knot(xi, direction / (self.frame.tangent @ direction))
 
     def _guess(self, arclength: float) -> np.ndarray:
-        """The unknowns at an arclength of Hermite's cubic through the nearest knots before and after it."""
+        """Return the unknowns at an arclength of Hermite's cubic through the nearest knots before and after it."""
         before = max(s for s in self.knots if s <= arclength)
         after = min(s for s in self.knots if s >= arclength)
         a, slope_a = self.knots[before]
@@ -479,7 +479,7 @@ class Segment(Generic[S]):
         return np.asarray(a + s * h * slope_a + s**2 * bend)
 
     def at(self, arclength: float) -> S:
-        """The point at an arclength; raises NoMotionError if Newton's method fails there or leaves the step."""
+        """Return the point at an arclength; raises NoMotionError if Newton's method fails there or leaves the step."""
         guess = self._guess(arclength)
         attempt = self.frame.correct(guess, arclength)
         allowed = ROUNDING * self.problem.tolerance
@@ -498,7 +498,7 @@ class Segment(Generic[S]):
         return replace(point, index=self.right.index, step=arclength)
 
     def roots(self, kind: SpecialKind[S], before: S | None, bends: Sequence[float] = ()) -> list[S]:
-        """Points of a kind, where its test vanishes and that the kind accepts.
+        """Return points of a kind, where its test vanishes and that the kind accepts.
 
         There is one if the test has two signs at the ends. If it has one sign but turns back between them, as the point
         ``before`` the left one shows, there may be two, one on each side of the turn. At the arclengths ``bends``,
@@ -513,7 +513,7 @@ class Segment(Generic[S]):
         return [point for point in points if kind.accept(point)]
 
     def _zeros(self, kind: SpecialKind[S], before: S | None) -> list[S]:
-        """The points where the kind's test vanishes."""
+        """Return the points where the kind's test vanishes."""
         a = kind.test(self.left)
         b = kind.test(self.right)
         # A value within the floor of zero has no sign to go by. Where a point of the branch is that near to a special
@@ -538,7 +538,7 @@ class Segment(Generic[S]):
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
     def _further_zeros(self, kind: SpecialKind[S], points: list[S], bends: Sequence[float]) -> list[S]:
-        """The zeros of the kind's test, besides ``points``, that its values at and between the ``bends`` show."""
+        """Return zeros of the kind's test, besides ``points``, that its values at and between the ``bends`` show."""
         places = [point.step for point in points]
         ends = sorted({0.0, *bends, *places, self.length})
         middles = [(a + b) / 2 for a, b in itertools.pairwise(ends)]
@@ -561,7 +561,7 @@ class Segment(Generic[S]):
         return further
 
     def _zero_beside_left(self, kind: SpecialKind[S], before: S | None) -> list[S]:
-        """The zero next to the left point, whose value is within the floor, if those on its two sides differ in sign.
+        """Return the zero next to the left point, whose value is within the floor, if its neighbours differ in sign.
 
         It lies in this segment or in the one from the point ``before``, as the left point's own sign says.
         """
@@ -577,7 +577,7 @@ class Segment(Generic[S]):
         return [replace(point, index=self.right.index, step=0.0)]
 
     def root(self, kind: SpecialKind[S]) -> S:
-        """The point where the kind's test, of two signs at the ends, vanishes; raises NoMotionError without one."""
+        """Return point where the kind's test, of two signs at the ends, vanishes; raises NoMotionError without one."""
         # So that the command line can report what a run is doing (``cli.messages``).
         sys.audit("vipetsc.landing", kind.name)
         point = self._find(kind)
@@ -586,14 +586,14 @@ class Segment(Generic[S]):
         return replace(point, kind=kind.name, step=self.begin + point.step)
 
     def _find(self, kind: SpecialKind[S]) -> S:
-        """The point where a test of two signs at the ends vanishes, by Brent's method."""
+        """Return the point where a test of two signs at the ends vanishes, by Brent's method."""
         # The root is one of the arclengths at which a value was asked for: its point is not computed twice.
         at = cache(self.at)
         value = partial(self._value, kind.test, at)
         return at(float(brentq(value, 0.0, self.length, xtol=EXACT * self.length)))
 
     def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
-        """The value of a test at an arclength; at the ends it is that of their points, which need no correction."""
+        """Return value of a test at an arclength; at the ends it is that of their points, which need no correction."""
         if arclength == 0:
             return test(self.left)
         if arclength == self.length:
@@ -601,14 +601,14 @@ class Segment(Generic[S]):
         return test(at(arclength))
 
     def split(self, arclength: float) -> "tuple[Segment[S], Segment[S]]":
-        """The parts before and after an ``arclength``; raises NoMotionError if there is no point."""
+        """Return the parts before and after an ``arclength``; raises NoMotionError if there is no point."""
         middle = self.at(arclength)
         after = self.between(middle, self.right, self.begin + arclength)
         return self.between(self.left, middle, self.begin), after
 
 
 def _turn(*values: tuple[float, float]) -> float | None:
-    """Place between the last two of three places x0 < x1 = 0 < x2 where a value turns back, if it may cross zero there.
+    """Return the place between the last two of x0 < x1 = 0 < x2 where a value turns back, if it may cross zero there.
 
     ``values`` are pairs of a place and the value there. The parabola through them, a + slope x + bend x^2, has its
     extreme a + slope at/2 at the place at = -slope/(2 bend). None if that lies elsewhere, or the extreme is not near
@@ -640,7 +640,7 @@ def locate(
     missed: list[str] | None = None,
     chosen: Sequence[SpecialKind[S]] = (),
 ) -> list[S]:
-    """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
+    """Return special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
     Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``, and those
     ``chosen``. ``chart`` is as for ``Continuation``. With ``grazing`` every change of the number of contacts is located
@@ -676,14 +676,14 @@ def locate(
 
 
 def _is_among(point: S, kind: str, others: list[S], length: float) -> bool:
-    """Whether one of the ``others`` is the same point of that kind, on a segment of that ``length``."""
+    """Return whether one of the ``others`` is the same point of that kind, on a segment of that ``length``."""
     return any(other.kind == kind and abs(other.step - point.step) <= SAME * length for other in others)
 
 
 def at_energy(
     problem: PeriodicProblem[Point], left: Point, right: Point, energy: float, chart: str = "relative"
 ) -> Point:
-    """The orbit of an ``energy`` in J between two consecutive points with less and with more of it.
+    """Return the orbit of an ``energy`` in J between two consecutive points with less and with more of it.
 
     It is a point of the kind "regular". Raises NoMotionError if Newton's method fails.
     """

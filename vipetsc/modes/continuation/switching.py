@@ -64,7 +64,7 @@ class Crossing(NamedTuple):
 
 
 def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooting, Point]:
-    """The problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
+    """Return the problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to centre,
     whichever map has a second null direction at ``point``; over the doubled period at a period doubling. ``amplitude``
@@ -87,7 +87,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
 
 
 def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Crossing | None:
-    """The crossing seen by the map of that name, or None if it has no second null direction there.
+    """Return the crossing seen by the map of that name, or None if it has no second null direction there.
 
     A text with the smallest singular value is appended to ``singular``.
     """
@@ -117,7 +117,7 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
 
 
 def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
-    """The first orbit off the old branch, which crosses at ``point``; raises ContinuationError if none is found."""
+    """Return first orbit off the old branch, which crosses at ``point``; raises ContinuationError if none is found."""
     problem, frame, row = crossing
     step = np.nan
     attempt = Attempt(converged=False, reason="not tried", history=[], xi=frame.xi)
@@ -135,7 +135,7 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
 
 
 def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:
-    """Initial values (n,) and period in s of the orbit of a ``point`` of the ``old`` problem, for the map of ``new``.
+    """Return initial values (n,) and period in s of the orbit of a ``point`` of the ``old`` problem, for ``new``.
 
     The period is doubled at a period doubling.
     """

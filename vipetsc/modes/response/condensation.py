@@ -44,7 +44,7 @@ class DrivenPoints(NamedTuple):
 
 
 def driven_points(case: NfrcCase) -> DrivenPoints:
-    """The driven masses of a ``case``; none under an incident wave.
+    """Return the driven masses of a ``case``; none under an incident wave.
 
     A force of the drive acts on its mass. A wall that moves acts on each mass that a spring ties to it, with the
     spring's stiffness times the wall's motion: such springs are linear and have no dashpot, as the case makes sure. The
@@ -65,7 +65,7 @@ def driven_points(case: NfrcCase) -> DrivenPoints:
 
 
 def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
-    """The compliance of the lattice of a ``case`` between its contacts, nonlinear springs and driven masses.
+    """Return the compliance of the lattice of a ``case`` between its contacts, nonlinear springs and driven masses.
 
     Where ends are open, the modes of the finite lattice give it, continued beyond these ends; ``OpenCompliance`` is a
     ``ModalCompliance``. Otherwise Bloch waves do, of an infinite lattice and of a finite one of equal cells without
@@ -90,14 +90,14 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
 
 
 def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
-    """The contacts of a ``case``, with a ``restitution``, and its springs that are not linear."""
+    """Return the contacts of a ``case``, with a ``restitution``, and its springs that are not linear."""
     chain = case.model().chain
     springs = spring_laws(chain)
     return SiteForces(stops_of(case, restitution), springs)
 
 
 def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
-    """The law and the stops of each site of a ``case``, with a ``restitution``.
+    """Return the law and the stops of each site of a ``case``, with a ``restitution``.
 
     Where a pressed contact is a spring of the linear lattice, its ``Stops.spring`` is the slope of its law at rest. It
     is 0 of a contact that is not pressed.
@@ -110,7 +110,7 @@ def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
 
 
 def contact_springs(case: NfrcCase) -> tuple[float, ...]:
-    """Stiffness in N/m of the spring that the linear lattice of a ``case`` has at each contact; () without any."""
+    """Return the stiffness in N/m of the spring at each contact in the linear lattice of a ``case``; () for none."""
     if not case.are_contacts_springs:
         return ()
     # The spring is the slope of the elastic law, on which the restitution has no influence: any value serves here.

@@ -79,23 +79,23 @@ class SteadyFrame(BalanceFrame):
         self.shift = equations.shift_near(xi)
 
     def encode(self, point: Response) -> np.ndarray:
-        """The unknowns (n + 1,) of another state."""
+        """Return the unknowns (n + 1,) of another state."""
         return point.xi
 
     def direction(self, point: Response) -> np.ndarray:
-        """The curve's direction (n + 1,) at another state."""
+        """Return the curve's direction (n + 1,) at another state."""
         return point.tangent
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,), which vanishes at a steady state, over the clearance."""
+        """Return the residual (n,), which vanishes at a steady state, over the clearance."""
         return self.equations.residual(xi, self.shift)
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
+        """Return the derivative (n, n + 1) of the residual."""
         return self.equations.jacobian(xi, self.shift)
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
-        """The state that an attempt has converged to, without measures, which are computed once it is accepted.
+        """Return the state that an attempt has converged to, without measures, which are computed once it is accepted.
 
         ``direction`` (n + 1,) is the branch's unit tangent there.
         """
@@ -125,7 +125,7 @@ class SteadyEquations(StatesWithStability):
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:
-        """The motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
+        """Return motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
 
     @cached_property
     def newton(self) -> DenseNewton:
@@ -133,23 +133,23 @@ class SteadyEquations(StatesWithStability):
         return DenseNewton(self.balance.size + 1, self.max_newton)
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses (orders, 1, 1) in N/m by which the compliance is shifted for states near ``xi`` (n + 1,)."""
+        """Return the stiffnesses (orders, 1, 1) in N/m that shift the compliance for states near ``xi`` (n + 1,)."""
         return self.balance.shift(self.motion_frequency(xi))
 
     def motion_frequency(self, xi: np.ndarray) -> float:
-        """The frequency in rad/s of the motion in ``xi`` (n + 1,), of which all others are multiples."""
+        """Return the frequency in rad/s of the motion in ``xi`` (n + 1,), of which all others are multiples."""
         omega, _ = self.drive(xi[-1])
         return omega / self.periods
 
     def drive(self, p: float) -> tuple[float, float]:
-        """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
+        """Return the frequency (rad/s) and amplitude at the scaled parameter ``p``."""
         over, fixed, scale = self.parameter
         if over == "amplitude":
             return fixed, p * scale
         return p * scale, fixed
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
+        """Return the residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
 
         ``xi`` (n + 1,) are harmonics over the clearance and the scaled parameter, ``shift`` (orders, 1, 1) in N/m the
         stiffnesses by which the compliance is shifted. Raises FlowError where the frequency is not positive.
@@ -162,7 +162,7 @@ class SteadyEquations(StatesWithStability):
         return self.balance.residual(x, omega / self.periods, shift, linear) / self.clearance
 
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The derivative (n, n + 1) of the ``residual``."""
+        """Return the derivative (n, n + 1) of the ``residual``."""
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         base = omega / self.periods
@@ -178,20 +178,20 @@ class SteadyEquations(StatesWithStability):
         return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
 
     def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
-        """The part (n,) of the residual that is due to the drive, in m."""
+        """Return the part (n,) of the residual that is due to the drive, in m."""
         return self.balance.drive_term(omega / self.periods, shift, amplitude * self.linear_motion(omega).harmonics)
 
     def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
-        """The frame at a state; there is one ``chart``."""
+        """Return the frame at a state; there is one ``chart``."""
         return SteadyFrame(self, point.xi, point.tangent)
 
     def first_tangent(self, start: Response, direction: int) -> np.ndarray:
-        """Tangent (n + 1,) at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
+        """Return the tangent (n + 1,) at the first state: the parameter grows (``direction`` 1) or falls (-1)."""
         along_parameter = np.eye(len(start.xi))[-1] * direction
         return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
-        """Unknowns (n + 1,) of the state at the scaled parameter ``p`` near a ``guess``; raises ContinuationError."""
+        """Return the state (n + 1,) at the scaled parameter ``p`` near a ``guess``; raises ContinuationError."""
         along_parameter = np.eye(self.balance.size + 1)[-1]
         begin = np.append(guess[:-1], p)
         attempt = SteadyFrame(self, begin, along_parameter).solve(begin, along_parameter, p)

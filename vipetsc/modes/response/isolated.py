@@ -40,7 +40,7 @@ Curves = Sequence[Sequence[Response]]
 
 
 def places_of(states: Equations, count: int) -> np.ndarray:
-    """Scaled parameters (count,) at which unknown states are looked for: the middles of equal parts of the range."""
+    """Return the scaled parameters (count,) at which states are looked for: middles of equal parts of the range."""
     low, high = (bound / states.parameter.scale for bound in states.options.range)
     return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
 
@@ -48,7 +48,7 @@ def places_of(states: Equations, count: int) -> np.ndarray:
 def unknown_states(
     states: Equations, curves_so_far: Callable[[], Curves], candidates: Sequence[np.ndarray]
 ) -> Iterator[np.ndarray]:
-    """Unknowns (n + 1,) of those of the ``candidates`` that lie on none of the ``curves_so_far``.
+    """Yield unknowns (n + 1,) of those of the ``candidates`` that lie on none of the ``curves_so_far``.
 
     The curves are asked for before each state, since curves may be added between two states.
     """
@@ -58,7 +58,7 @@ def unknown_states(
 
 
 def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
-    """Unknowns (n + 1,) of states at the scaled parameter ``p`` to which other amplitudes lead from the ``curves``.
+    """Return states (n + 1,) at the scaled parameter ``p`` to which other amplitudes lead from the ``curves``.
 
     They have the curve's amplitude; some may lie on the ``curves`` themselves.
     """
@@ -71,7 +71,7 @@ def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndar
 
 
 def subharmonic_states(states: Equations, p: float) -> list[np.ndarray]:
-    """Unknowns (n + 1,) of subharmonic states at the scaled parameter ``p``, of which no shift in time is another one.
+    """Return subharmonic states (n + 1,) at the scaled parameter ``p``, none of them another one shifted in time.
 
     Newton's method begins at the linear motion, and a motion of 1/n of the drive's frequency with each of several sizes
     and phases, in which the places move as under forces of that frequency.
@@ -98,7 +98,7 @@ def subharmonic_states(states: Equations, p: float) -> list[np.ndarray]:
 
 
 def images(states: Equations, xi: np.ndarray) -> list[np.ndarray]:
-    """The unknowns (n + 1,) of a state, and of all others that a symmetry makes of it.
+    """Return the unknowns (n + 1,) of a state, and of all others that a symmetry makes of it.
 
     These are shifts in time by 1, 2, ... periods of the drive. Where all forces are odd a shift by half a period with
     the opposite sign gives a state, too.
@@ -114,21 +114,21 @@ def images(states: Equations, xi: np.ndarray) -> list[np.ndarray]:
 
 
 def is_on(states: Equations, curves: Curves, xi: np.ndarray) -> bool:
-    """Whether a state, or one that a symmetry makes of it, is on one of the ``curves`` with the same unknowns."""
+    """Return whether a state, or one that a symmetry makes of it, is on a curve of ``curves`` with equal unknowns."""
     of_same = [points for points in curves if points and len(points[0].xi) == len(xi)]
     on_curves = states_on(states, of_same, float(xi[-1]))
     return any(_is_among(image, on_curves) for image in images(states, xi))
 
 
 def _is_subharmonic(states: Equations, xi: np.ndarray) -> bool:
-    """Whether a state has harmonics that are no multiples of the drive's frequency."""
+    """Return whether a state has harmonics that are no multiples of the drive's frequency."""
     z = np.abs(states.balance.unpack(xi[:-1]))
     z[:, :: states.periods] = 0
     return bool(np.linalg.norm(z) > LEAST_SUBHARMONIC * np.linalg.norm(xi[:-1]))
 
 
 def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
-    """Unknowns (n + 1,) of the states of ``curves`` at the scaled parameter ``p``."""
+    """Return unknowns (n + 1,) of the states of ``curves`` at the scaled parameter ``p``."""
     states_found: list[np.ndarray] = []
     for points in curves:
         for before, after in pairwise(point.xi for point in points):
@@ -144,12 +144,12 @@ def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
 
 
 def _is_among(xi: np.ndarray, others: Sequence[np.ndarray]) -> bool:
-    """Whether one of the ``others`` is the same state."""
+    """Return whether one of the ``others`` is the same state."""
     return any(np.linalg.norm(xi - other) <= DIFFERENT * np.linalg.norm(xi) for other in others)
 
 
 def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.ndarray]:
-    """Unknowns of further states with the curve's amplitude, on the line over the amplitude through ``begin``."""
+    """Return unknowns of further states with the curve's amplitude, on the line through ``begin``."""
     line = over_amplitude(states, begin[-1])
     _, amplitude = states.drive(begin[-1])
     # The two equations may have different clearances as units of displacement.
@@ -159,7 +159,7 @@ def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.
 
 
 def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: float) -> Iterator[np.ndarray]:
-    """Unknowns (n + 1,) of states at the scaled parameter ``p`` with the curve's amplitude, found along a ``line``.
+    """Yield states (n + 1,) at the scaled parameter ``p`` with the curve's amplitude, found along a ``line``.
 
     The line is followed in both directions from ``begin`` (n + 1,), unknowns near one of its states, which is left out
     if it has that amplitude itself.
@@ -183,7 +183,7 @@ def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: 
 
 
 def over_amplitude(states: Equations, p: float) -> SteadyStates:
-    """The equations over the amplitude at the scaled parameter ``p`` of a curve over the frequency or a key.
+    """Return the equations over the amplitude at the scaled parameter ``p`` of a curve over the frequency or a key.
 
     Amplitudes range from 1/reach to reach times the curve's own, with reach = ``nfrc.isola_reach``.
     """

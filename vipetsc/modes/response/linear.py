@@ -27,7 +27,7 @@ BESIDE = 1e-6
 def linear_states(
     case: NfrcCase, fixed: float, compliance: WaveCompliance | ModalCompliance, shift: float = 0.0
 ) -> Iterator[Response]:
-    """The linear motions at ``nfrc.points`` values of the frequency or the amplitude, evenly spaced over the range.
+    """Yield linear motions at ``nfrc.points`` values of the frequency or the amplitude, evenly spaced over the range.
 
     The other one of the two is ``fixed``; a force or a wall drives the lattice, whose ``compliance`` is that of
     ``compliance_of``. Frequencies are higher by the fraction ``shift``.
@@ -74,7 +74,7 @@ def linear_states(
 
 
 def resonances(states: Sequence[Response], shifted: Sequence[Response]) -> list[float]:
-    """The frequencies in rad/s of those ``states`` in which a mode that nothing damps has its own.
+    """Return the frequencies in rad/s of those ``states`` in which a mode that nothing damps has its own.
 
     There the displacements are many times as large as those of the states ``shifted`` by ``BESIDE``.
     """
@@ -88,7 +88,7 @@ def resonances(states: Sequence[Response], shifted: Sequence[Response]) -> list[
 
 
 def linear_variables(states: list[Response], over: str) -> Variables:
-    """The ``states`` as variables of a file: the parameter ``over``, motions of sites, and outputs."""
+    """Return the ``states`` as variables of a file: the parameter ``over``, motions of sites, and outputs."""
     measured = [state.measured for state in states]
     values = np.array([getattr(measures, over) for measures in measured])
     variables = {LINEAR: variable(LINEAR, values, LAYOUT[over].units, f"{over} of linear motions")}

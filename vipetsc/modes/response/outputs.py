@@ -79,7 +79,7 @@ class ResponseOutputs:
         self.cells = sorted({cell for cell, _ in self._masses} | {wall.cell for wall in self.walls})
 
     def of(self, motion: HarmonicMotion) -> dict[str, np.ndarray]:
-        """The values of a steady state by their names in its file (``spectra.responses``)."""
+        """Return the values of a steady state by their names in its file (``spectra.responses``)."""
         values: dict[str, np.ndarray] = {}
         if self._springs:
             elongations = motion.relative[len(self.contacts) :]
@@ -114,7 +114,7 @@ class ResponseOutputs:
         return values
 
     def _field(self, motion: HarmonicMotion) -> np.ndarray:
-        """Harmonics (order, cells, dofs) in m of the displacements in the named cells."""
+        """Return harmonics (order, cells, dofs) in m of the displacements in the named cells."""
         orders = motion.forces.shape[1]
         field = np.zeros((orders, len(self.cells), self.compliance.chain.cell.dofs), complex)
         for order in range(orders):
@@ -128,7 +128,7 @@ class ResponseOutputs:
         return field
 
     def _motion(self, motion: HarmonicMotion, harmonics: np.ndarray) -> dict[str, np.ndarray]:
-        """Peaks, first harmonics and phases of named masses from their ``harmonics`` (masses, K + 1) in m."""
+        """Return peaks, first harmonics and phases of named masses from their ``harmonics`` (masses, K + 1) in m."""
         rate = 1j * motion.omega * np.arange(harmonics.shape[1])
         values = {"location_harmonics": harmonics.real, "location_harmonics_imaginary": harmonics.imag}
         # Each quantity is the derivative by time of the one before.
@@ -148,7 +148,7 @@ class ResponseOutputs:
         return values
 
     def _on_walls(self, motion: HarmonicMotion, field: np.ndarray) -> dict[str, np.ndarray]:
-        """Peaks, first harmonics and phases of the forces on the two walls, from the ``field`` of ``cells``."""
+        """Return peaks, first harmonics and phases of the forces on the two walls, from the ``field`` of ``cells``."""
         forces = []
         for name, wall in zip(WALLS, self.walls, strict=True):
             u = field[:, self.cells.index(wall.cell)][:, wall.masses]
@@ -184,7 +184,7 @@ class WallSprings(NamedTuple):
 
 
 def wall_springs(chain: Chain, wall: str) -> WallSprings:
-    """The springs of a lattice with fixed ends to its ``wall``, "left" or "right"."""
+    """Return the springs of a lattice with fixed ends to its ``wall``, "left" or "right"."""
     # A spring between cells belongs to the left one: those to the left wall to the cell before the first one.
     numbers = [number for number, spring in enumerate(chain.cell.springs) if spring.offset]
     springs = [chain.cell.springs[number] for number in numbers]
@@ -205,7 +205,7 @@ def wall_springs(chain: Chain, wall: str) -> WallSprings:
 
 
 def largest_values(harmonics: np.ndarray) -> np.ndarray:
-    """Largest magnitude (rows,) of the motions with the ``harmonics`` (rows, K + 1) over a period.
+    """Return the largest magnitude (rows,) of the motions with the ``harmonics`` (rows, K + 1) over a period.
 
     From the largest of even samples Newton's method leads to the place where the rate is zero.
     """
@@ -227,7 +227,7 @@ def largest_values(harmonics: np.ndarray) -> np.ndarray:
 
 
 def _samples(harmonics: np.ndarray) -> np.ndarray:
-    """Samples (rows, samples) over a period of Re sum Z_k exp(i k Om t) with the ``harmonics`` Z (rows, K + 1)."""
+    """Return samples (rows, samples) over a period of Re sum Z_k exp(i k Om t), ``harmonics`` Z (rows, K + 1)."""
     half = SAMPLES_A_HARMONIC // 2 * harmonics.shape[1]
     # The inverse transform adds to each order its conjugate, but for the mean: hence the halves.
     padded = np.pad(harmonics, ((0, 0), (0, half - harmonics.shape[1]))) * np.where(np.arange(half), 0.5, 1)
@@ -235,7 +235,7 @@ def _samples(harmonics: np.ndarray) -> np.ndarray:
 
 
 def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode], omega: float) -> float:
-    """Largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m.
+    """Return the largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m.
 
     It is that of the law, with the static load of a contact that is pressed at rest. Each of ``episodes``, those of
     this contact, is sampled at equal phases; ``omega`` in rad/s is the frequency of the motion.
@@ -256,7 +256,7 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
 
 
 def lag(phasors: np.ndarray) -> np.ndarray:
-    """Phase (phasor,) in degrees, from 0 to 360, by which each of ``phasors`` (phasor,) is behind the drive.
+    """Return phase (phasor,) in degrees, from 0 to 360, by which each of ``phasors`` (phasor,) is behind the drive.
 
     It is NaN where a phasor is zero.
     """

@@ -65,25 +65,25 @@ class StatesOverKey(SteadyEquations):
         )
 
     def states_at(self, value: float) -> SteadyStates:
-        """The equations of the lattice whose key has a ``value``; raises FlowError where there is none."""
+        """Return the equations of the lattice whose key has a ``value``; raises FlowError where there is none."""
         return self._kept.get(value, lambda: self._build(value))
 
     def linear_motion(self, omega: float) -> LinearMotion:
-        """The motion of the linear lattice at the lower end of the range."""
+        """Return the motion of the linear lattice at the lower end of the range."""
         return self.states_at(self._bounds[0]).linear_motion(omega)
 
     def drive(self, p: float) -> tuple[float, float]:
-        """Frequency (rad/s) and amplitude, which do not depend on the scaled parameter ``p``."""
+        """Return the frequency (rad/s) and amplitude, which do not depend on the scaled parameter ``p``."""
         states = self.states_at(self._bounds[0])
         return states.parameter.fixed, self.parameter.fixed
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses (orders, 1, 1) in N/m by which the compliance is shifted near the state ``xi`` (n + 1,)."""
+        """Return the stiffnesses (orders, 1, 1) in N/m that shift the compliance near the state ``xi`` (n + 1,)."""
         states, inner = self._at(xi)
         return states.shift_near(inner)
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
+        """Return the residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
 
         Beyond the range, at the distance d from its end v, it is R(x, v) + d dR/dv(x, v).
         """
@@ -94,7 +94,7 @@ class StatesOverKey(SteadyEquations):
         return residual
 
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The derivative (n, n + 1) of the ``residual``.
+        """Return the derivative (n, n + 1) of the ``residual``.
 
         Beyond the range the tangent of the ``residual`` changes with the motion, too; the derivative leaves that out,
         which vanishes with the distance to the range. Residual and unknowns are over the same clearance, so that the
@@ -104,12 +104,12 @@ class StatesOverKey(SteadyEquations):
         return np.column_stack([states.jacobian(inner, shift)[:, :-1], self._slope(xi, shift)])
 
     def _within(self, p: float) -> float:
-        """The scaled parameter within the range that is nearest to ``p``."""
+        """Return the scaled parameter within the range that is nearest to ``p``."""
         low, high = (bound / self.parameter.scale for bound in self._bounds)
         return min(max(p, low), high)
 
     def _residual(self, xi: np.ndarray, p: float, shift: np.ndarray) -> np.ndarray:
-        """The residual of the motion in ``xi``, whose parameter is not used, in the lattice at the parameter ``p``.
+        """Return residual of the motion in ``xi``, whose parameter is not used, in the lattice at the parameter ``p``.
 
         Beyond the range it is that at the nearest end.
         """
@@ -117,7 +117,7 @@ class StatesOverKey(SteadyEquations):
         return states.residual(inner, shift) * (states.clearance / self.clearance)
 
     def _slope(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The derivative (n,) of the residual by the scaled parameter, from a difference within the range.
+        """Return the derivative (n,) of the residual by the scaled parameter, from a difference within the range.
 
         An end of the range, at which one of the two places is cut off, has a one-sided difference.
         """
@@ -127,7 +127,7 @@ class StatesOverKey(SteadyEquations):
         return np.asarray(difference / (after - before))
 
     def _at(self, xi: np.ndarray) -> tuple[SteadyStates, np.ndarray]:
-        """The equations of the lattice at the key's value in ``xi`` (n + 1,), and the unknowns in their units."""
+        """Return equations of the lattice at the key's value in ``xi`` (n + 1,), and the unknowns in their units."""
         # Rounding of p times the scale may leave the range: at its ends the value is the bound itself, which is valid.
         value = min(max(xi[-1] * self.parameter.scale, self._bounds[0]), self._bounds[1])
         states = self.states_at(float(value))
@@ -135,29 +135,29 @@ class StatesOverKey(SteadyEquations):
         return states, np.append(motion, self.parameter.fixed / states.parameter.scale)
 
     def from_state(self, value: float, inner: np.ndarray) -> np.ndarray:
-        """The unknowns (n + 1,) of the state ``inner`` (n + 1,) of the lattice whose key has a ``value``."""
+        """Return the unknowns (n + 1,) of the state ``inner`` (n + 1,) of the lattice whose key has a ``value``."""
         motion = inner[:-1] * (self.states_at(value).clearance / self.clearance)
         return np.append(motion, value / self.parameter.scale)
 
     def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
-        """The measures of a state ``xi`` (n + 1,) for its file, with the value of the key among its outputs."""
+        """Return the measures of a state ``xi`` (n + 1,) for its file, with the value of the key among its outputs."""
         states, inner = self._at(xi)
         measures = states.measured(inner, stability)
         value = self._within(xi[-1]) * self.parameter.scale
         return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds and other changes of stability within the range."""
+        """Yield folds and other changes of stability within the range."""
         for kind in super().special_kinds(left, right):
             yield replace(kind, accept=self._is_within)
 
     def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
-        """Hill's determinant of the lattice at the key's value in ``xi`` (n + 1,), and the forces there."""
+        """Return Hill's determinant of the lattice at the key's value in ``xi`` (n + 1,), and the forces there."""
         states, inner = self._at(xi)
         return states.hill_at(inner)
 
     def _is_within(self, point: Response) -> bool:
-        """Whether a state lies within the range, where the equations are those of a lattice."""
+        """Return whether a state lies within the range, where the equations are those of a lattice."""
         return bool(self._within(point.xi[-1]) == point.xi[-1])
 
 
@@ -176,7 +176,7 @@ class KeyedCase:
         self._last: SteadyStates | None = None
 
     def at(self, value: float) -> SteadyStates:
-        """The equations at a ``value`` of the key, over the amplitude; raises FlowError where the case is invalid."""
+        """Return the equations at a ``value`` of the key, over the amplitude; raises FlowError for an invalid case."""
         key = self.case.nfrc.over
         try:
             case = self.case.at(value, self.amplitude)
@@ -195,7 +195,7 @@ class KeyedCase:
 
 
 def _linear_lattice(case: NfrcCase) -> tuple[Chain, tuple[float, ...]]:
-    """What makes up the linear lattice of a ``case``: its chain, and springs in N/m in the place of contacts.
+    """Return what makes up the linear lattice of a ``case``: its chain, and springs in N/m in the place of contacts.
 
     Clearances, which do not belong to it, are left out, so that two can be compared.
     """

@@ -46,10 +46,10 @@ class StatesWithStability(RangeProblem):
 
     @abstractmethod
     def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
-        """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there."""
+        """Return Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there."""
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state ``xi`` (n + 1,). The latest are kept, since neighbours on a curve are compared."""
+        """Return the stability of a state ``xi`` (n + 1,), kept since neighbours on a curve are compared."""
 
         def evaluate() -> Stability:
             hill, series = self.hill_at(xi)
@@ -59,33 +59,33 @@ class StatesWithStability(RangeProblem):
 
     @abstractmethod
     def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
-        """The measures of the state ``xi`` (n + 1,) for its file.
+        """Return the measures of the state ``xi`` (n + 1,) for its file.
 
         Its ``stability`` is looked for unless it is given.
         """
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
+        """Return Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
         hill, series = self.hill_at(xi)
         return float(hill.determinants(series, np.array([exponent]))[0].real)
 
     def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
+        """Return lambda/Om of complex pairs of growing perturbations of the state ``xi`` (n + 1,), slowest first."""
         hill, series = self.hill_at(xi)
         return hill.pairs(series)
 
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of the state ``xi`` (n + 1,) near a ``guess``; raises NoMotionError without one."""
+        """Return lambda/Om of the pair of a state ``xi`` (n + 1,) near a ``guess``; raises NoMotionError."""
         hill, series = self.hill_at(xi)
         return hill.near(series, guess)
 
     def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
+        """Return Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
         hill, _ = self.hill_at(xi)
         return hill.least
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds, where the parameter's component of the tangent changes sign, and other changes of stability."""
+        """Yield folds, where the parameter's component of the tangent changes sign, and other changes of stability."""
         yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
         yield from StabilityChanges(self, left, right).kinds()
 
@@ -99,7 +99,7 @@ class StabilityChanges:
         self.right = right
 
     def kinds(self) -> Iterator[SpecialKind[Response]]:
-        """The kinds of points between the two states, but folds, which tangents show."""
+        """Yield the kinds of points between the two states, but folds, which tangents show."""
         states = self.states
         left = states.stability(self.left.xi)
         right = states.stability(self.right.xi)
@@ -125,7 +125,7 @@ class StabilityChanges:
             yield self._pair(left.unstable, fewer)
 
     def _real(self, name: str, exponent: complex, fewer: int) -> SpecialKind[Response]:
-        """The kind where the real multiplier exp(2 pi ``exponent``) passes; ``fewer`` others grow there."""
+        """Return the kind where the real multiplier exp(2 pi ``exponent``) passes; ``fewer`` others grow there."""
 
         def determinant(point: Response) -> float:
             return self.states.determinant(point.xi, exponent)
@@ -136,7 +136,7 @@ class StabilityChanges:
         return SpecialKind(name, determinant, finish=finish)
 
     def _pair(self, unstable: int, fewer: int) -> SpecialKind[Response]:
-        """The kind where a complex pair passes the line; at the left state ``unstable`` perturbations grow.
+        """Return the kind where a complex pair passes the line; at the left state ``unstable`` perturbations grow.
 
         The test is the distance of the pair's exponent from the line. The exponent is followed from the state at which
         the pair grows. If that fails, the test is a step, +-1/2, where the number of growing perturbations changes.
@@ -145,14 +145,14 @@ class StabilityChanges:
         exponents: dict[bytes, complex] = {}
 
         def distance(point: Response) -> float:
-            """Re lambda over Om beyond the line; the guess is the exponent of the state found last."""
+            """Return Re lambda over Om beyond the line; the guess is the exponent of the state found last."""
             key = point.xi.tobytes()
             if key not in exponents:
                 exponents[key] = states.pair_near(point.xi, [*exponents.values()][-1])
             return exponents[key].real - states.least_growth(point.xi)
 
         def changed(point: Response) -> float:
-            """1/2 where as many perturbations grow as at the left state, else -1/2."""
+            """Return 1/2 where as many perturbations grow as at the left state, else -1/2."""
             return 0.5 - (states.stability(point.xi).unstable != unstable)
 
         def finish(point: Response, left: Response, right: Response) -> Response:
@@ -167,7 +167,7 @@ class StabilityChanges:
         return SpecialKind(NEIMARK_SACKER, changed, finish=finish)
 
     def _measured(self, point: Response, unstable: int, exponent: complex | None) -> Response:
-        """The ``point`` with its measures, where ``unstable`` perturbations grow.
+        """Return the ``point`` with its measures, where ``unstable`` perturbations grow.
 
         The perturbation with that ``exponent`` neither grows nor decays, and is given as the fastest.
         """

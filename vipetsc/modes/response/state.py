@@ -59,7 +59,7 @@ class Response(Solution):
 
 
 def returned(first: Response, before: Response, point: Response) -> bool:
-    """Whether a curve comes back to its ``first`` state in the step from the state ``before`` to ``point``.
+    """Return whether a curve comes back to its ``first`` state in the step from the state ``before`` to ``point``.
 
     There t . (xi - xi_first), with the tangent t at the first state, turns positive, and the state is not farther from
     the first one than a step.

@@ -103,7 +103,7 @@ class SteadyStates(SteadyEquations):
         )
 
     def _unit(self) -> float:
-        """Unit of displacements in m: the first clearance that is positive.
+        """Return the unit of displacements in m: the first clearance that is positive.
 
         Without one, as where all contacts are pressed at rest, it is the size of the linear motion: over the amplitude
         at the upper end of the range, over the frequency at its beginning, or the largest in it if there are springs.
@@ -125,7 +125,7 @@ class SteadyStates(SteadyEquations):
         return amplitude * self._largest_motion([self.case.frequency])
 
     def _scale(self, clearance: float) -> float:
-        """Unit of the parameter: half the range of frequencies, or the amplitude with a linear motion of 1 clearance.
+        """Return the unit of the parameter: half the range of frequencies, or the amplitude that reaches 1 clearance.
 
         The amplitude of a wave is in clearances already. Raises FlowError where the drive moves no pair.
         """
@@ -137,7 +137,7 @@ class SteadyStates(SteadyEquations):
         return clearance / self._largest_motion([self.case.frequency])
 
     def _largest_motion(self, omegas: Iterable[float]) -> float:
-        """The largest elongation in m of linear motions at ``omegas`` in rad/s, for the amplitude 1.
+        """Return the largest elongation in m of linear motions at ``omegas`` in rad/s, for the amplitude 1.
 
         Raises FlowError where all elongations are 0.
         """
@@ -147,7 +147,7 @@ class SteadyStates(SteadyEquations):
         return largest
 
     def linear_motion(self, omega: float) -> LinearMotion:
-        """The motion of the linear lattice for the amplitude 1 at ``omega`` in rad/s.
+        """Return the motion of the linear lattice for the amplitude 1 at ``omega`` in rad/s.
 
         Raises FlowError outside a wave's band.
         """
@@ -169,7 +169,7 @@ class SteadyStates(SteadyEquations):
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray, stability: Stability | None = None) -> Measures:
-        """The measures of the state ``xi`` (n + 1,) for its file.
+        """Return the measures of the state ``xi`` (n + 1,) for its file.
 
         Its ``stability`` is looked for unless it is given.
         """
@@ -206,7 +206,7 @@ class SteadyStates(SteadyEquations):
         )
 
     def _harmonic_motion(self, omega: float, amplitude: float, z: np.ndarray, series: ForceSeries) -> HarmonicMotion:
-        """A state, whose pairs have the harmonics ``z`` (pairs, K + 1) in m, as ``ResponseOutputs`` takes it."""
+        """Return a state, whose pairs have the harmonics ``z`` (pairs, K + 1) in m, as ``ResponseOutputs`` takes it."""
         wave = self.linear_motion(omega).wave
         incident: np.ndarray | float = 0.0
         if wave is not None and self.outputs.cells:
@@ -224,7 +224,7 @@ class SteadyStates(SteadyEquations):
         )
 
     def hill_at(self, xi: np.ndarray) -> tuple[Hill, ForceSeries]:
-        """Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there.
+        """Return Hill's determinant of motions near the state ``xi`` (n + 1,), and the forces there.
 
         The latest is kept, since it keeps the compliances at the frequencies of perturbations.
         """
@@ -245,7 +245,7 @@ class SteadyStates(SteadyEquations):
         return self._hill, self.balance.series(xi[:-1] * self.clearance, omega)
 
     def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
-        """T, R, U and L (4,) of the module's docstring: powers over the power that comes in.
+        """Return T, R, U and L (4,) of the module's docstring: powers over the power that comes in.
 
         ``forces`` (pairs, K + 1) in N are those of the pairs, ``loss`` in J is what contacts lose in a period. T, R and
         U are NaN unless the lattice is infinite; all four are NaN where nothing comes in.

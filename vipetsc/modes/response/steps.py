@@ -50,7 +50,7 @@ class TurningSteps(BoundedTurn):
         return Ending.END_OF_RANGE.with_numbers(end=bound * self.problem.parameter.scale)
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Message where and why the curve cannot go on, and which key to change."""
+        """Return the message where and why the curve cannot go on, and which key to change."""
         states = self.problem
         omega, amplitude = states.drive(last.xi[-1])
         at = f"{omega:.8g} rad/s at amplitude {amplitude:.6g}"
@@ -74,7 +74,7 @@ class TurningSteps(BoundedTurn):
 def first_state(
     states: SteadyStates | StatesOverKey, stop: StopRequest | None = None, is_ramp: bool = False
 ) -> Response:
-    """The state at the lower end of the range, with its tangent towards larger parameters.
+    """Return the state at the lower end of the range, with its tangent towards larger parameters.
 
     Where the linear motion touches no contact it is that motion. Otherwise it is reached by growing amplitudes from one
     at which no contact is touched. If that fails, or if stops touch at rest, it is reached by growing weights of the
@@ -103,7 +103,7 @@ def first_state(
 
 
 def _begun(states: SteadyStates | StatesOverKey, guess: np.ndarray) -> Response:
-    """The state near the unknowns ``guess`` with their parameter, from which the parameter grows."""
+    """Return the state near the unknowns ``guess`` with their parameter, from which the parameter grows."""
     # The guess is the linear motion, or the end of a homotopy, which is a state already but for rounding.
     start = Response(xi=states.at(guess, guess[-1]), next_step=states.options.first_step)
     tangent = states.first_tangent(start, 1)
@@ -111,7 +111,7 @@ def _begun(states: SteadyStates | StatesOverKey, guess: np.ndarray) -> Response:
 
 
 def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
-    """Whether a state differs from the linear motion ``linear`` (pairs,), the first harmonics in m.
+    """Return whether a state differs from the linear motion ``linear`` (pairs,), the first harmonics in m.
 
     It does where that motion comes to a stop, or opens a contact that is pressed at rest. Springs that are not linear
     act at every amplitude: with them the answer is always yes.
@@ -125,7 +125,7 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
 
 
 def _by_weights(states: SteadyStates, omega: float, amplitude: float, stop: StopRequest) -> np.ndarray:
-    """Scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
+    """Return the scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
 
     The forces of all contacts, less those of springs in their place, are multiplied by a weight s^4. Each contact has a
     parallel dashpot of (1 - s) d, where d = 1/(Om |G_jj(Om)|) in N s/m is the impedance of the lattice at its pair j.
@@ -140,7 +140,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float, stop: Stop
     case = states.case.model_copy(update={"nfrc": states.options.model_copy(update=update)})
 
     def weighted(s: float) -> SteadyStates:
-        """The equations with contacts, and the nonlinear parts of springs, of the weight s^4."""
+        """Return the equations with contacts, and the nonlinear parts of springs, of the weight s^4."""
         stops = [
             one._replace(weight=s**4, drag=(1 - s) * drag, spring=s**4 * one.spring)
             for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=False)
@@ -163,7 +163,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float, stop: Stop
 
 
 def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float, stop: StopRequest) -> np.ndarray:
-    """Scaled harmonics of the state at ``omega`` in rad/s, reached by amplitudes that grow from 1e-3 of ``amplitude``.
+    """Return scaled harmonics of the state at ``omega`` in rad/s, by amplitudes that grow from 1e-3 of ``amplitude``.
 
     With stiff contacts that have a loss, states over the amplitude may come to motions that close a contact ever more
     slowly, as the damping factor is divided by the speed at which it closes: steps become ever shorter. They may also
@@ -186,7 +186,7 @@ def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float, stop: S
 
 
 def _followed(curve: Continuation[Response], stop: StopRequest) -> list[Response]:
-    """All points of a ``curve``; raises StoppedError at the next one where a ``stop`` is requested."""
+    """Return all points of a ``curve``; raises StoppedError at the next one where a ``stop`` is requested."""
     points = []
     for point in curve:
         if stop.requested:

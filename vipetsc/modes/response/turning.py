@@ -30,7 +30,7 @@ class RangeProblem(PeriodicProblem[Response]):
 
     @abstractmethod
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
-        """Unknowns (n + 1,) of the solution at the scaled parameter ``p`` near a ``guess``; or ContinuationError."""
+        """Return unknowns (n + 1,) at the scaled parameter ``p`` near a ``guess``; or ContinuationError."""
 
 
 class BoundedTurn(ABC):
@@ -95,4 +95,4 @@ class BoundedTurn(ABC):
 
     @abstractmethod
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Why no step leads on from the ``last`` point."""
+        """Return why no step leads on from the ``last`` point."""

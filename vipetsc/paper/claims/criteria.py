@@ -64,7 +64,7 @@ class Criterion:
     decisive: bool = False
 
     def met(self, value: SupportsFloat | None) -> bool:
-        """Whether ``value`` keeps to the threshold; a number that is not there or not finite does not."""
+        """Return whether ``value`` keeps to the threshold; a number that is not there or not finite does not."""
         if value is None or not isfinite(value):
             return False
 
@@ -109,7 +109,7 @@ class ClaimSpec:
 
 
 def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | None]) -> tuple[str, list[str]]:
-    """The verdict on the numbers ``value``, by quantity, and the quantities of the criteria that they do not meet.
+    """Return verdict on the numbers ``value``, by quantity, and the quantities of the criteria that they do not meet.
 
     The claim holds if every criterion is met. It does not hold if none is met, or if a decisive one is not. Otherwise
     it holds in part. A number that is None was not measured and meets no criterion; if all are, the claim is not
@@ -129,7 +129,7 @@ def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | N
 
 
 def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
-    """The criteria of a claim from its ``rows`` in ``claims.toml``; those of the contact laws (*) come first."""
+    """Return the criteria of a claim from its ``rows`` in ``claims.toml``; those of the contact laws (*) come first."""
     criteria = []
     for law in (*LAWS, ""):
         for quantity, comparison, threshold, unit, source, *decisive in rows:

@@ -51,7 +51,7 @@ class AmplitudeTriple:
         self.distance = int(np.min(np.abs(sites - model.drive_cell)))
 
     def new_fraction(self, run: AnalysedMember) -> Fraction:
-        """Fraction of the kinetic energy of a ``run`` at new wavenumbers, outside of the burst's main lobe.
+        """Return the fraction of the kinetic energy of a ``run`` at new wavenumbers, outside of the burst's main lobe.
 
         It is over the time from the passage of the burst's middle at the first site to the end.
         """
@@ -141,7 +141,7 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
 
 
 def _on_branches(run: AnalysedMember) -> float:
-    """Fraction of the energy in the space-time spectrum of a ``run`` that lies near a Bloch branch.
+    """Return the fraction of the energy in the space-time spectrum of a ``run`` that lies near a Bloch branch.
 
     A frequency is near a branch if it is at most ``HALF_WIDTH`` times the top edge of the bands away from it.
     """
@@ -175,7 +175,7 @@ def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fraction:
-    """Kinetic energy before the first site over the incident one, when the reflected packet is halfway to the drive.
+    """Return kinetic energy before the first site over the incident one, as the reflected packet is halfway back.
 
     Mean and deviation are over half a burst's duration about that time, when the incident packet has passed the site
     and the reflected one has not reached the end of the lattice. The incident energy is that of the whole run at low

@@ -44,7 +44,7 @@ class EntropyDecay(AmplitudeCurve):
         self.half_width = (fitted("exponent_high") - fitted("exponent_low")) / 2
 
     def reaches(self, r2: float, bound: float) -> bool:
-        """Whether ``r2``, that of one of the fits, reaches the ``bound``, and the fit has enough points."""
+        """Return whether ``r2``, that of one of the fits, reaches the ``bound``, and the fit has enough points."""
         return bool(r2 >= bound and self.points >= FEWEST)
 
     @property
@@ -55,7 +55,7 @@ class EntropyDecay(AmplitudeCurve):
 
 
 def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: float) -> list[EntropyDecay]:
-    """The curves of one ``average`` of the entropy in the sweep ``step``, one for each number of sites.
+    """Return the curves of one ``average`` of the entropy in the sweep ``step``, one for each number of sites.
 
     ``wanted`` are coordinates of the sweep, as of `Evidence.select`. Raises MissingEvidence.
     """

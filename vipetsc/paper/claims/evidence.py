@@ -63,7 +63,7 @@ class AnalysedMember:
         return float("nan")
 
     def arrays(self, *names: str) -> tuple[np.ndarray, ...]:
-        """Variables of the analysis by name, each with its shape (...) in the file."""
+        """Return variables of the analysis by name, each with its shape (...) in the file."""
         return tuple(self.analysis[name].values for name in names)
 
 
@@ -89,7 +89,7 @@ class AmplitudeCurve:
         self.peak_amplitude = float(self.amplitude[self.peak])
 
     def growth_ratio(self, low: float, high: float) -> float:
-        """Ratio of the amplitudes between which the values grow on the way to the peak.
+        """Return the ratio of the amplitudes between which the values grow on the way to the peak.
 
         It is that of the first point with a value >= ``high`` after the last one with a value <= ``low``; NaN if there
         are no such points.
@@ -107,7 +107,7 @@ class AmplitudeCurve:
         return float(self.amplitude[last + 1 + after[0]] / self.amplitude[last])
 
     def interpolate(self, amplitude: float) -> float:
-        """The value at ``amplitude`` in N, interpolated over its logarithm; NaN beyond the ends."""
+        """Return the value at ``amplitude`` in N, interpolated over its logarithm; NaN beyond the ends."""
         return float(np.interp(np.log(amplitude), np.log(self.amplitude), self.value, left=np.nan, right=np.nan))
 
 
@@ -129,7 +129,7 @@ class Evidence(ExitStack):
         self._open = cache(lambda path, needs: self.enter_context(open_netcdf(path, "file of results", needs)))
 
     def path(self, *parts: str) -> Path:
-        """A file below ``root``, noted down; raises MissingEvidence where there is none, or of an unusable step."""
+        """Return a file below ``root``, noted down; raises MissingEvidence if it is missing or its step unusable."""
         name = "/".join(parts)
         step = name.split("/")[0]
         if step in self.unusable:
@@ -145,11 +145,11 @@ class Evidence(ExitStack):
         return self._open(self.path(*parts), needs)
 
     def ensemble(self, step: str) -> xr.Dataset:
-        """The ensemble of the finished sweep ``step``."""
+        """Return the ensemble of the finished sweep ``step``."""
         return self._open_ensemble(self.path(step, "ensemble.h5").parent)
 
     def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
-        """The members of the sweep ``step`` over rising amplitude, in one reading and with the coordinates ``wanted``.
+        """Return members of the sweep ``step`` over rising amplitude, in one reading and at the coordinates ``wanted``.
 
         Of an axis that is not among these the first value is taken. Raises MissingEvidence if the sweep has no such
         members.
@@ -173,7 +173,7 @@ class Evidence(ExitStack):
         return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
 
     def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[AnalysedMember]:
-        """The members that ``select`` gives, each with its analysis, by rising amplitude.
+        """Return the members that ``select`` gives, each with its analysis, by rising amplitude.
 
         Raises MissingEvidence if a member failed or is missing, ValueError if an analysis lacks one of ``needs``.
         """

@@ -68,7 +68,7 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _on_grid(values: np.ndarray) -> np.ndarray:
-    """Indices of those ``values`` that are multiples of ``GRID``; of all values if fewer than two are."""
+    """Return indices of those ``values`` that are multiples of ``GRID``; of all values if fewer than two are."""
     # Values of a grid are rounded to twelve digits, and so are no exact multiples.
     multiples = np.nonzero(np.abs(values / GRID - np.round(values / GRID)) < 1e-6)[0]
     if multiples.size < 2:
@@ -79,7 +79,7 @@ def _on_grid(values: np.ndarray) -> np.ndarray:
 def _transfer(
     evidence: Evidence, reading: str, law: str, sites: int, cycles: int, mean: str = "ibtet"
 ) -> AmplitudeCurve:
-    """The transfer over the amplitude, with so many ``sites`` and ``cycles``; ``mean`` is the name of the average."""
+    """Return the transfer over the amplitude, with so many ``sites`` and ``cycles``; ``mean`` names the average."""
     return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), mean)
 
 
@@ -123,7 +123,7 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _floor(curve: AmplitudeCurve) -> float:
-    """The mean transfer without contact; NaN where there is contact at every amplitude."""
+    """Return the mean transfer without contact; NaN where there is contact at every amplitude."""
     if not curve.untouched.any():
         return float("nan")
     return float(curve.value[curve.untouched].mean())
@@ -180,7 +180,7 @@ def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def modal_error(run: AnalysedMember) -> float:
-    """Bound on the relative error of the sum of the linear modes' energies, of any motion at any instant.
+    """Return the bound on the relative error of the sum of the linear modes' energies, of any motion at any instant.
 
     In mass-normalised displacements x (``lattice.modes``), with the modes V and their frequencies Om, the modes have
     the kinetic energy |V^T x'|^2/2 and the spring energy |Om V^T x|^2/2. The actual energies are |x'|^2/2 and x^T A x/2
@@ -205,7 +205,7 @@ def modal_error(run: AnalysedMember) -> float:
 
 
 def split_errors(run: AnalysedMember) -> dict[str, float]:
-    """Errors of a run's split into bands and gaps, whose energies over time come from frequency filters; by name.
+    """Return the errors of a run's split into bands and gaps, with energies from frequency filters, by name.
 
     The mean over the record agrees with the total for any complete split without overlap (Parseval). The mean over a
     period of the drive agrees if no motion straddles an edge between two parts; it is judged a burst away from the ends

@@ -33,7 +33,7 @@ def measure_claims(root: str | Path, unusable: Mapping[str, str] | None = None) 
 
 
 def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
-    """Row of ``claims.json`` for a claim, by its id, in one reading."""
+    """Return the row of ``claims.json`` for a claim, by its id, in one reading."""
     spec = CLAIMS[claim]
     # By its name in the table of claims, so that all about a claim stands in one place.
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
@@ -79,7 +79,7 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
 
 
 def rounded(numbers: Numbers) -> dict[str, float | None]:
-    """``numbers`` with ``DIGITS`` significant digits; None for what is not finite."""
+    """Return ``numbers`` with ``DIGITS`` significant digits; None for what is not finite."""
     short: dict[str, float | None] = {}
     for name, number in numbers.items():
         short[name] = None

@@ -110,7 +110,7 @@ def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
 
 
 def _largest(values: np.ndarray) -> float | None:
-    """The largest of the ``values`` that are finite; None if none is."""
+    """Return the largest of the ``values`` that are finite; None if none is."""
     if not np.isfinite(values).any():
         return None
     return float(np.nanmax(values))
@@ -198,7 +198,7 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np.ndarray, float]:
-    """Velocities (t,) in m/s of host and resonator at the only site of a ``run``, and the fraction of fast motion.
+    """Return velocities (t,) in m/s of host and resonator at a ``run``'s only site, and the share of fast motion.
 
     The fraction is that of the pair's kinetic energy at frequencies above the driven band, over the whole record under
     a Hann window. Raises MissingEvidence if the site's velocity was not recorded.
