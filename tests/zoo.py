@@ -57,7 +57,9 @@ class Kind:
         """Return the table of the case for an ``engine``."""
         base = {name: section for name, section in BASE.items() if name not in self.without}
         table = with_sections(base, self.sections)
-        return with_sections(table, {"time": {"engine": engine}})
+        table = with_sections(table, {"time": {"engine": engine}})
+        # None takes a key of the base away.
+        return {name: {k: v for k, v in section.items() if v is not None} for name, section in table.items()}
 
     def key_units(self) -> dict[str, str]:
         """Return units of keys that depend on others, by the path of the key."""
@@ -82,6 +84,7 @@ def driven(**drive: Any) -> dict[str, Any]:
 
 HERTZ = {"contacts": {"law": "hertz", "stiffness": 1e9}}
 HERTZ_UNITS = {"contacts.stiffness": "N/m^1.5"}
+RIGID = {"law": "rigid", "stiffness": None}
 # Contacts that join cells: each reaches into the next cell.
 JOINED = {"pair": [1, 1], "next_cell": True, "side": "minus"}
 INSIDE = {"start": 1, "end": 2, "stiffness": 4.1e4}
@@ -104,6 +107,9 @@ ZOO = {
     "hertz": Kind(HERTZ, exact=False, units=HERTZ_UNITS),
     "restitution": Kind({"contacts": {"restitution": 0.6}}, conservative=False),
     "one side": Kind({"contacts": {"side": "plus"}}),
+    "rigid": Kind({"contacts": RIGID}),
+    "rigid with loss": Kind({"contacts": RIGID | {"restitution": 0.4}}, conservative=False),
+    "rigid, sticking": Kind({"contacts": RIGID | {"restitution": 0.0}}, conservative=False),
     "pressed": Kind(
         {"contacts": {"side": "plus", "clearance": 0.0, "precompression": 2e-5}, "drive": {"amplitude": 240.0}}
     ),

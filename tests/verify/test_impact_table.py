@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 import vipetsc
+from tests.verify.test_rigid_impacts import row
 from vipetsc import Case, simulate
 
 # A mass between soft springs, which meets a stop at its largest speed.
@@ -37,6 +38,22 @@ def test_the_impulse_of_an_impact_is_the_change_of_momentum(engine, law, restitu
     assert impact.impulse == pytest.approx(MASS * (1 + restitution) * SPEED, rel=1e-5)
     assert impact.loss == pytest.approx(MASS * SPEED**2 * (1 - restitution**2) / 2, rel=1e-5, abs=1e-12)
     assert (impact.cell, impact.side) == (1, 1)
+
+
+@pytest.mark.parametrize("law", ["hertz", "bilinear", "rigid"])
+@pytest.mark.parametrize("clearance", [0.01, 0.02, 0.03, 0.05])
+def test_an_onset_at_the_border_of_two_steps_is_an_impact(law, clearance):
+    """The log has the full approach velocity of a mass that comes to its stop where a step of the engine ends."""
+    stiffness = {"law": law}
+    if law != "rigid":
+        stiffness["stiffness"] = 1e6
+    run = simulate(row(8, 0.5, "propagator", contacts={"clearance": clearance, "sites": [1]} | stiffness))
+    # The mass moves at 1 m/s.
+    steps = clearance / run.statistics["interval"]
+    assert steps == pytest.approx(round(steps), rel=1e-12)
+    log = vipetsc.impacts(run)
+    np.testing.assert_allclose(log["onset"], clearance, rtol=1e-12)
+    np.testing.assert_allclose(log["approach_velocity"], -1.0, rtol=1e-12)
 
 
 def test_impulses_of_both_engines_agree_in_a_lattice():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import small_case
+from tests.conftest import run_of, small_case
 from vipetsc.case import Case, CaseError
 from vipetsc.dynamics import simulate
 
@@ -127,6 +127,42 @@ def test_a_ball_bounces_in_a_geometric_series_and_rests(restitution, engine):
     forces = data["sites/force"].values[:, 0]
     assert forces[-1] == pytest.approx(-GRAVITY, rel=1e-12)
     assert data["displacement"].values[-1].item() == pytest.approx(-1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("restitution", [0.3, 0.9])
+def test_a_ball_sticks_where_its_next_flight_would_be_too_short(restitution, engine):
+    """All flights but the one that would follow the last impact are longer than 1e-6 of the shortest period, 0.2 s."""
+    log, _ = impacts(ball(restitution, engine, contacts={"clearance": 0.01}))
+    flights = -2 * restitution * log["approach_velocity"] / GRAVITY
+    shortest = 1e-6 * 2 * RAMP
+    assert flights[-1] < shortest < flights[:-1].min()
+
+
+@pytest.mark.parametrize("damping", ["exact", "paper"])
+@pytest.mark.parametrize(("law", "least", "factor"), [("bilinear", 1e4, 100.0), ("hertz", 1e5, 1000.0)])
+def test_stiff_stops_come_to_the_rigid_answer_with_the_duration_of_their_contact(law, least, factor, damping):
+    """With r = 1 for any factor, else with the exact one: the difference goes with the first power of the duration."""
+    restitution = {"exact": 0.8, "paper": 1.0}[damping]
+
+    def run(**contacts: Any) -> Any:
+        """Return the dataset of an oscillator with a clearance up to its fourth impact."""
+        time = {"end": 20.0, "sample_interval": 0.01}
+        changes = {"contacts": {"clearance": 0.05} | contacts, "output": {"fields": None}, "time": time}
+        return run_of(oscillator(restitution, 2.4, **changes))
+
+    rigid = run()
+    differences = []
+    durations = []
+    for stiffness in (least, factor * least, factor**2 * least):
+        stiff = run(law=law, stiffness=stiffness, damping=damping)
+        assert stiff.sizes["episode"] == rigid.sizes["episode"] > 3
+        differences.append(np.abs(stiff["displacement"].values - rigid["displacement"].values).max())
+        durations.append(np.mean(stiff["impacts/separation"].values - stiff["impacts/onset"].values))
+    powers = np.diff(np.log(differences)) / np.diff(np.log(durations))
+    np.testing.assert_allclose(powers[-1], 1.0, atol=0.02)
+    np.testing.assert_allclose(powers[0], 1.0, atol=0.06)
+    assert differences[-1] < 2 * durations[-1]
 
 
 @pytest.mark.parametrize("engine", ENGINES)

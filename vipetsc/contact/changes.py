@@ -195,6 +195,10 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
     # A rigid site only rests, and is stuck then, where it is pressed so that no flight would leave the tolerance.
     if site.rigid and not 0.5 * end[1] * end[1] <= side * end[2] * site.tolerance:
         return False
+    # A fast one comes from beyond the tolerance, however short the step: one that ends just before an onset leaves next
+    # to nothing for the step after it.
+    if site.mode == FREE and side * end[1] > 0.0 and 0.5 * end[1] * end[1] > MOVED * site.tolerance * abs(end[2]):
+        return False
     # A contact may be so stiff that an impact of any speed ends within the tolerance: its separation is not rest.
     if site.mode != FREE and gap_of(site, side) > 0.0:
         return False
