@@ -178,7 +178,7 @@ def test_every_command_of_the_manual_is_understood(words, monkeypatch):
     """The program's own parser takes every command of the manual, and the case file that the command names exists."""
     calls = []
 
-    def note(options, petsc) -> int:
+    def note(options, petsc, comm) -> int:
         calls.append(options)
         return 0
 

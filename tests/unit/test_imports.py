@@ -53,7 +53,7 @@ def module_of(path: Path) -> str:
 
 
 # Modules of examples stand for a user's modules: cases name them, and the package does not import them.
-SOURCES = [path for path in sorted(ROOT.rglob("*.py")) if path.parent != ROOT / "examples"]
+SOURCES = [path for path in sorted(ROOT.rglob("*.py")) if ROOT / "examples" not in path.parents]
 MODULES = {module_of(path): path for path in SOURCES}
 
 
