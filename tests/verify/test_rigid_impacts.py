@@ -190,6 +190,9 @@ def test_masses_that_stick_go_on_together(engine):
     """Without restitution the first mass takes all others along: momentum is kept, losses are those of two bodies."""
     log, data = impacts(row(5, 0.0, engine))
     np.testing.assert_allclose(data["velocity"].values[-1].ravel(), 0.2, rtol=1e-12)
+    # A long row needs thousands of blows at an instant before all of it moves alike.
+    _, long = impacts(row(40, 0.0, engine, contacts={"clearance": 1e-5}, time={"end": 0.012, "sample_interval": 1e-3}))
+    np.testing.assert_allclose(long["velocity"].values[-1].ravel(), 1 / 40, rtol=1e-9)
     # n masses at v = 1/n meet one at rest.
     n = np.arange(1, 5)
     np.testing.assert_allclose(-log["approach_velocity"], 1 / n, rtol=1e-9)

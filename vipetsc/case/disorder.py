@@ -5,7 +5,7 @@ draw. Each quantity has its own generator (Philox), keyed by the seed and its na
 number of ranks, on the order of the draws or on the other quantities.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,7 @@ from vipetsc.case.contacts import lists_of
 from vipetsc.case.inhomogeneity_sections import Deviation, ScatterTable
 from vipetsc.case.quantities import QUANTITIES, Quantity, Sections, differs_by_side
 from vipetsc.case.reading import Table
+from vipetsc.case.schema import LatticeTable
 from vipetsc.case.section import Problem, Section, described
 from vipetsc.case.sites import ContactsTable
 
@@ -101,6 +102,9 @@ def scatter(sections: Sections, disorder: DisorderTable, given: ContactsTable) -
     if not (disorder.quantities() or disorder.cells):
         remedy = "contains no quantity that scatters; give one, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]
+    problems = list(_in_plane_problems(sections["lattice"], disorder))
+    if problems:
+        return {}, problems
 
     # A resolved case has no modulus: one that is drawn scales the stiffnesses, which are proportional to it. Where each
     # site has a modulus of its own, none holds for all sites.
@@ -120,6 +124,17 @@ def scatter(sections: Sections, disorder: DisorderTable, given: ContactsTable) -
     for key, numbers in drawn.items():
         changed = _put(changed, key, numbers, values[key])
     return changed, []
+
+
+def _in_plane_problems(lattice: LatticeTable, disorder: DisorderTable) -> Iterator[Problem]:
+    """Yield problems with masses and springs that scatter in a strip that moves in the plane."""
+    if lattice.cell is None or not lattice.cell.moves_in_plane:
+        return
+    # A mass of the plane is two of the wide cell, and a spring several.
+    remedy = "scatters both components of a mass, and the parts of a spring, one by one in the plane; remove it"
+    scattered = [key for key in disorder.quantities() if key in SCATTERED and SCATTERED[key].of != "site"]
+    for key in (*scattered, *(["cells"] if disorder.cells else [])):
+        yield Problem(f"disorder.{key}", None, remedy)
 
 
 def _put(sections: dict[str, Any], key: str, drawn: list[float], values: Sequence[float]) -> dict[str, Any]:

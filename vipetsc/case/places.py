@@ -149,6 +149,9 @@ class Placing:
             if not rows:
                 self.problems.append(Problem(key, None, "no cell of the strip is of this pattern"))
         cells = [(i, j) for i, j in rows]
+        if rows is places and len(set(cells)) < len(cells):
+            twice = next(cell for cell in cells if cells.count(cell) > 1)
+            self.problems.append(Problem(key, list(twice), "given twice"))
         outside = [list(cell) for cell in cells if not self.is_inside(cell)]
         if outside:
             remedy = f"outside the strip of {self.shape[0]} x {self.shape[1]} cells, numbered [i, j] from [1, 1]"
@@ -224,6 +227,8 @@ class Placing:
             if "offset" in table:
                 self.problems.append(Problem("contacts.offset", None, "give it with contacts.places"))
             return table
+        if "sites" in table:
+            self.problems.append(Problem("contacts.places", None, "give places or sites, not both"))
         each = table.get("each") or {}
         pairs = each.get("pair", table.get("pair", [0, 1])) if isinstance(each, dict) else None
         cells = self.cells(named.places, "contacts.places")
