@@ -16,7 +16,7 @@ from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Guard, Ledger, Setup
 from vipetsc.dynamics.plan import choose_engine
-from vipetsc.dynamics.run import ENGINES, Begin, Run
+from vipetsc.dynamics.run import ENGINES, Clocks, Run
 from vipetsc.endings import Ending
 from vipetsc.io.store import RunMemory
 
@@ -75,7 +75,7 @@ class EngineRun:
         seconds = time.process_time() - begin
         if ended.ending is not Ending.COMPLETE:
             raise RuntimeError(ended.sentence)
-        self._run.finish(ended, Begin(wall=0.0, cpu=0.0), {})
+        self._run.finish(ended, Clocks(wall=0.0, cpu=0.0), {})
         assert self.output.dataset is not None
         return self.output.dataset.velocity.values, seconds
 

@@ -46,7 +46,7 @@ def test_every_chapter_has_a_page_and_the_interface_its_signatures(pages):
     assert {*CHAPTERS, KEYS, "start", "vipetsc.contact"} <= {path.stem for path in pages.glob("*.html")}
     page = (pages / "vipetsc.contact.html").read_text(encoding="utf-8")
     assert 'id="vipetsc.contact.law.contact_force"' in page
-    assert "Force on the host in N and dissipated power in W of site" in page
+    assert "Return force on the host in N and dissipated power in W of site" in page
 
 
 @pytest.fixture(scope="module")

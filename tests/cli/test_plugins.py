@@ -220,7 +220,7 @@ def test_names_are_those_of_the_modules_that_a_case_names(folder):
     Case.load(folder / "case.toml")
     others = [str(folder / name) for name in ("factors.py", "pulses.py")]
     with pytest.raises(
-        CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; other names come from modules"
+        CaseError, match="'hardening': must be 'hertz', 'bilinear', 'power' or 'rigid'; other names come from modules"
     ):
         Case.load(folder / "case.toml", [f"plugins.modules={others}"])
     with pytest.raises(CaseError, match="did you mean 'hardening'"):

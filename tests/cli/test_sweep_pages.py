@@ -122,7 +122,7 @@ def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_pat
     assert {"ibtet-over-drive.frequency.png", "contact_episodes-over-drive.frequency.png"} <= names
     # Members with fields have pages of their own, named by their case.
     for frequency in (800, 1000):
-        assert f"transfer-hertz-2-sites-drive.frequency-{frequency}-rad-s-12N.png" in names
+        assert f"transfer-hertz-2-sites-drive-frequency-{frequency}-rad-s-12N.png" in names
     assert not [name for name in names if "calibrated" in name or "cycles" in name]
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 import pytest
@@ -84,14 +85,14 @@ def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(
     """A state of more than 2^31 - 1 numbers is refused with a hint at PETSc with 64-bit indices."""
     case = small_case(lattice={"cells": 300_000_000}, contacts={"sites": [6], "clearance": 1e-4})
     message = r"lattice.cells = 300000000: results in a state of 2400000002 numbers, .*2147483647 .*64-bit-indices"
-    monkeypatch.setattr(memory.PETSc, "IntType", np.int32)
+    monkeypatch.setattr(PETSc, "IntType", np.int32)
     with pytest.raises(CaseError, match=message):
         simulate(case, folder / "run")
     with pytest.raises(CaseError, match=message):
         run_rows(case, 1)
 
     # With wider indices the run is refused for its memory, as any other.
-    monkeypatch.setattr(memory.PETSc, "IntType", np.int64)
+    monkeypatch.setattr(PETSc, "IntType", np.int64)
     with pytest.raises(CaseError, match="300000000 cells, 1 sites and 251 samples need"):
         simulate(case, folder / "run")
 

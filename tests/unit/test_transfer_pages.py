@@ -86,8 +86,8 @@ def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, m
         pages = {drawing.stem: drawing.draw() for drawing in FIGURES["ibtet_backbone"].function(sweeps)}
     assert len(pages) == len(RESTITUTIONS)
     for (stem, figure), restitution in zip(pages.items(), RESTITUTIONS, strict=True):
-        assert stem.endswith(f"contacts.restitution-{restitution}")
-        assert f"contacts.restitution {restitution}" in figure._suptitle.get_text()
+        assert stem.endswith(f"contact-restitution-{restitution}")
+        assert f"contact restitution {restitution}" in figure._suptitle.get_text()
         (axes,) = figure.axes
         (lattice,) = [line for line in axes.lines if line.get_label() == "lattice"]
         np.testing.assert_allclose(lattice.get_ydata(), transfer_of(restitution), rtol=1e-12)

@@ -62,9 +62,11 @@ def ending(table: dict[str, Any], **nnm: Any) -> str:
 
 @pytest.mark.parametrize("table", [AT_START, AT_END])
 def test_a_branch_that_ends_at_a_touch_names_the_contact(table):
-    """A branch that ends at the grazing of contact 2 names it, and goes on with smaller steps and a wider guard."""
+    """A branch that ends at the grazing of contact 2 names it, and goes on with smaller steps and wider guards."""
     assert "contact 2 grazes there" in ending(table)
-    assert "points reached" in ending(table, smallest_step=1e-18, guards={"corrector": 0.5})
+    assert "points reached" in ending(
+        table, smallest_step=1e-18, guards={"corrector": 0.5, "turn": 1.0, "turn_relative": 1.0}
+    )
 
 
 def test_the_chart_of_grazing_leads_through_a_touch_at_the_start():

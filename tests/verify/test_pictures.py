@@ -53,6 +53,18 @@ def study(name: str, *changes: str) -> Callable[[Path], list[Path]]:
     return make
 
 
+def on_a_strip(folder: Path) -> list[Path]:
+    """Simulate a strip of 8 x 4 cells with a stop."""
+    lattice = {"cells": 8, "ends": "periodic"}
+    lattice["strip"] = {"rows": 4, "kind": "square", "mass": 0.01, "stiffness": 1e4, "edges": "periodic"}
+    contacts = {"places": [[4, 2]], "clearance": 2e-4, "stiffness": 1e7}
+    drive = {"amplitude": 20.0, "waveform": "harmonic", "frequency": 1500.0, "place": [3, 2]}
+    table = {"name": "strip", "lattice": lattice, "contacts": contacts, "drive": drive, "time": {"end": 0.02}}
+    simulate(Case.from_table(table), folder)
+    measure_run(folder)
+    return [folder]
+
+
 def travelling(folder: Path) -> list[Path]:
     """Write a run with a travelling wave."""
     write_run(folder / "run.h5")
@@ -104,6 +116,7 @@ def condensed(folder: Path) -> list[Path]:
 ZOO: dict[str, tuple[str, Callable[[Path], list[Path]]]] = {
     "travelling wave": ("run", travelling),
     "repeating motion": ("run", repeating),
+    "strip": ("run", on_a_strip),
     "bifurcations": ("sweep", bifurcating),
     "entropies": ("sweep", scattered),
     "transfer": ("sweep", transferred),
@@ -121,8 +134,8 @@ SPOILT = ("nan", "all nan", "infinite", "empty")
 TRIALS = 5  # of the results of each kind; all variables, faults and figures take minutes
 # Labels of pure numbers: ratios, fractions, counts, places. Every other label has a unit in brackets.
 PURE = re.compile(
-    r"|.*(/|raction|elative|misfit|deviance|autocorrelation|% from).*|Cell|cell|Bin|Design|direction|valley|window|λ|η"
-    r"|z - 1|distance from the end|between its bounds|κ\* = .*"
+    r"|.*(/|raction|elative|misfit|deviance|autocorrelation|% from).*|Cell|cell|Cell i|Row j|Bin|Design|direction"
+    r"|valley|window|λ|η|z - 1|distance from the end|between its bounds|κ\* = .*"
 )
 
 

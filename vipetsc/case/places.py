@@ -321,7 +321,8 @@ def without_strip(table: Table) -> Iterator[Problem]:
     remedy = "names places of a strip; give [lattice.strip], or cells"
     for at, one in _placed_tables(table):
         for key in _keys_at(at):
-            if key in one:
+            # A key of a resolved case that is not given is None.
+            if one.get(key) is not None:
                 _, mistyped = read_section(Named, {key: one[key]}, at)
                 yield from mistyped or [Problem(f"{at}.{key}", None, remedy)]
 

@@ -16,8 +16,9 @@ runs has errors of about 1e-10 of the state by the engines' tolerance, and is pr
 
 **Times.** The companion begins as soon as anything moves. The mean is taken over the second half of the run, the same
 that pictures of Poincare sections show: until then the deviation turns to the direction that grows fastest. What is
-kept of an interval does not depend on the end of the run, which may be extended. An interval in which the deviation
-vanishes counts with the smallest one that a double has beside the state, so that the exponent is an upper bound.
+kept of an interval does not depend on the end of the run, which may be extended. Where a mass comes to rest at its stop
+and the deviation vanishes, the mean begins anew: it is that of the motion since then, and where masses rest again and
+again there are too few intervals for a number.
 
 References
 ----------
@@ -27,7 +28,6 @@ A. Stefanski, Estimation of the largest Lyapunov exponent in systems with impact
 (2000) 2443-2451.
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -144,16 +144,14 @@ class LargestExponent(Observer):
 
         deviation = of_companion["cells"] - cells
         grown = self._norm(deviation)
-        # A mass that rests at its stop forgets where it came from: the deviation is then smaller than any that a double
-        # has beside the state.
-        lost = grown == 0
-        if lost:
-            grown = sys.float_info.epsilon * self.largest
-        self.growth.append((time, time - self.last, float(np.log(grown / self.size))))
-        self.last = time
-        if lost:
+        if grown == 0:
+            # A mass that rests at its stop forgets where it came from. What follows may be chaotic all the same.
+            self.growth = []
+            self.last = time
             self._begin_companion(cells)
             return
+        self.growth.append((time, time - self.last, float(np.log(grown / self.size))))
+        self.last = time
         self.size = SIZE * self.largest
 
         # A contact that is closed has the velocity of its approach as a further part of its state.

@@ -1,5 +1,6 @@
 """Pictures and movies of a run on a strip of the plane: its motion over the cells (i, j), and over wave vectors."""
 
+from string import ascii_lowercase
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -151,9 +152,9 @@ def snapshots(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     height = shape[0] * (style.PAGE - 1.2) / shape[1] / strip.ratio
     figure = style.new_figure(style.PAGE, min(height + 0.25 * shape[0] + 0.4, 9.0))
     grid = figure.subplots(*shape, squeeze=False, sharex=True, sharey=True)
-    for axes, field, row in zip(grid.flat, fields, rows, strict=False):
+    for tag, axes, field, row in zip(ascii_lowercase, grid.flat, fields, rows, strict=False):
         mesh = strip.draw(axes, field, norm, "RdBu_r")
-        axes.set_title(f"t = {time[row]:.4g} s")
+        axes.set_title(f"({tag}) t = {time[row]:.4g} s" if len(rows) > 1 else f"t = {time[row]:.4g} s")
         axes.label_outer()
     for axes in grid.flat[len(rows) :]:
         axes.set_axis_off()

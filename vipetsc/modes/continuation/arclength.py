@@ -299,7 +299,8 @@ class GuardedSteps:
             graze = f"contacts {', '.join(map(str, numbers))} graze"
         return (
             f"{graze} there, at no speed, where a stiff contact bends the branch within less than a step: "
-            'try nnm.chart = "grazing", or nnm.guards.corrector = 0.5 with nnm.smallest_step = 1e-18; '
+            'try nnm.chart = "grazing", or nnm.smallest_step = 1e-18 with nnm.guards.corrector = 0.5, turn = 1 and'
+            " turn_relative = 1; "
         )
 
 

@@ -10,6 +10,7 @@ and acceleration follow by factors i k Om. Peaks are those of the sum of all har
 converge slowly at its kinks: its peak is taken along each contact episode from the law itself.
 """
 
+import cmath
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -108,7 +109,7 @@ class ResponseOutputs:
                 motion.forces[: len(springs), motion.drive_order]
                 + springs * motion.relative[: len(springs), motion.drive_order]
             )
-            values |= {"largest_force": np.array(peaks), "first_force": np.abs(first), "force_lag": lag(first)}
+            values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
         if self.walls:
             values |= self._on_walls(motion, field)
         return values
@@ -135,11 +136,11 @@ class ResponseOutputs:
         for power, quantity in enumerate(QUANTITIES):
             series = harmonics * rate**power
             values[f"peak_{quantity}"] = largest_values(series)
-            values[f"first_{quantity}"] = np.abs(series[:, motion.drive_order])
+            values[f"first_{quantity}"] = magnitude(series[:, motion.drive_order])
         values["lag"] = lag(harmonics[:, motion.drive_order])
         if self.pairs:
             # The mean square of a velocity is the sum of those of its harmonics. At rest a quotient is 0/0: NaN.
-            speed = np.abs(harmonics * rate)
+            speed = magnitude(harmonics * rate)
             rms = np.sqrt((speed**2).sum(axis=1) / 2)
             source, receiver = np.array(self.pairs).T
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -169,7 +170,7 @@ class ResponseOutputs:
         harmonics = np.array(forces)
         return {
             "largest_wall_force": largest_values(harmonics),
-            "first_wall_force": np.abs(harmonics[:, motion.drive_order]),
+            "first_wall_force": magnitude(harmonics[:, motion.drive_order]),
             "wall_force_lag": lag(harmonics[:, motion.drive_order]),
         }
 
@@ -214,16 +215,20 @@ def largest_values(harmonics: np.ndarray) -> np.ndarray:
     top = np.abs(samples[np.arange(len(samples)), highest])
     spacing = 2 * np.pi / samples.shape[1]
     phase = spacing * highest
-    rates = 1j * np.arange(harmonics.shape[1])
+    orders = np.arange(harmonics.shape[1])
+    # Real numbers throughout: the bits of complex products depend on where the numbers lie in memory.
     for _ in range(NEWTON_STEPS):
-        turned = harmonics * np.exp(rates * phase[:, None])
-        slope = (rates * turned).sum(axis=1).real
-        bend = (rates**2 * turned).sum(axis=1).real
+        angles = orders * phase[:, None]
+        in_phase = harmonics.real * np.cos(angles) - harmonics.imag * np.sin(angles)
+        quadrature = harmonics.real * np.sin(angles) + harmonics.imag * np.cos(angles)
+        slope = -(orders * quadrature).sum(axis=1)
+        bend = -(orders**2 * in_phase).sum(axis=1)
         # Beyond a sample's distance lies another peak. Where nothing bends, nothing moves.
         step = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend != 0)
         phase = phase + np.clip(step, -spacing, spacing)
-    highest_value = np.abs((harmonics * np.exp(rates * phase[:, None])).sum(axis=1).real)
-    return np.maximum(highest_value, top)
+    angles = orders * phase[:, None]
+    highest_value = (harmonics.real * np.cos(angles) - harmonics.imag * np.sin(angles)).sum(axis=1)
+    return np.maximum(np.abs(highest_value), top)
 
 
 def _samples(harmonics: np.ndarray) -> np.ndarray:
@@ -255,9 +260,19 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
     return largest
 
 
+def magnitude(phasors: np.ndarray) -> np.ndarray:
+    """Return the magnitude (...) of each of ``phasors`` (...), complex.
+
+    Unlike those of ``np.abs`` its bits do not depend on where the numbers lie in memory.
+    """
+    return np.hypot(phasors.real, phasors.imag)
+
+
 def lag(phasors: np.ndarray) -> np.ndarray:
     """Return phase (phasor,) in degrees, from 0 to 360, by which each of ``phasors`` (phasor,) is behind the drive.
 
     It is NaN where a phasor is zero.
     """
-    return np.where(phasors != 0, np.mod(-np.angle(phasors, deg=True), 360.0), np.nan)
+    # Unlike those of np.angle its bits do not depend on where the numbers lie in memory.
+    radians = np.array([cmath.phase(phasor) for phasor in phasors.tolist()])
+    return np.where(phasors != 0, np.mod(-np.degrees(radians), 360.0), np.nan)
