@@ -134,8 +134,8 @@ SPOILT = ("nan", "all nan", "infinite", "empty")
 TRIALS = 5  # of the results of each kind; all variables, faults and figures take minutes
 # Labels of pure numbers: ratios, fractions, counts, places. Every other label has a unit in brackets.
 PURE = re.compile(
-    r"|.*(/|raction|elative|misfit|deviance|autocorrelation|% from).*|Cell|cell|Cell i|Row j|Bin|Design|direction"
-    r"|valley|window|λ|η|z - 1|distance from the end|between its bounds|κ\* = .*"
+    r"|.*(/|raction|elative|misfit|deviance|autocorrelation|% from).*|Cell|cell|Cell i|Row j|Episodes|Bin|Design"
+    r"|direction|valley|window|λ|η|z - 1|distance from the end|between its bounds|κ\* = .*"
 )
 
 

@@ -40,7 +40,10 @@ LEGEND = "above: cell; below: clearance in mm; arrow: drive"
 
 def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the unit cell of the run's lattice and, below it, the lattice with ends, drive and contact sites."""
-    model = Case.of(run).model()
+    case = Case.of(run)
+    if case.lattice.cell is not None and case.lattice.cell.from_strip is not None:
+        raise style.NoPicture("the cell of a strip is a row of cells of the plane; snapshots show its sites and drives")
+    model = case.model()
     if len(model.chain.cell.springs) > MOST_SPRINGS:
         raise style.NoPicture(f"needs a cell of at most {MOST_SPRINGS} springs")
     figure = style.new_figure(style.PAGE, 2.7)
