@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-CASE = """
+FOLDED = """
 [lattice]
 preset = "four-band"
 reading = "printed"
@@ -21,7 +21,7 @@ locate_grazing = false
 @pytest.fixture
 def case(tmp_path):
     path = tmp_path / "small.toml"
-    path.write_text(CASE)
+    path.write_text(FOLDED)
     return path
 
 

@@ -11,21 +11,10 @@ import numpy as np
 import pytest
 import tomli_w
 
+from tests.cli.test_nnm import FOLDED
 from tests.conftest import search_table, set_words
 from vipetsc.cli.main import main
 
-FOLDED = """
-[lattice]
-preset = "four-band"
-reading = "printed"
-[contacts]
-law = "bilinear"
-modulus = 1e8
-[nnm]
-modes = [2]
-energy = [0.0, 1.0]
-locate_grazing = false
-"""
 # For each verb: wrong changes of its case, and sentences that the message must contain.
 REFUSED = {
     "design": (

@@ -30,7 +30,12 @@ LANDED = 1e-10
 ROUNDINGS = 1000 * float(np.finfo(float).eps)
 # Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. The modes
 # PERMANENT and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
-FREE, CLOSED, CLIPPED, PERMANENT, RESTING, STUCK = 0, 1, 2, 3, 4, 5
+FREE = 0
+CLOSED = 1
+CLIPPED = 2
+PERMANENT = 3
+RESTING = 4
+STUCK = 5
 # A rigid site sticks where its next flight would take less than this fraction of the shortest period of the motion.
 SHORTEST_FLIGHT = 1e-6
 
