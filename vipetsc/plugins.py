@@ -63,6 +63,14 @@ class Plugin:
         every = [part for parts in PARTS.values() for part in parts.values() if part.modules & self.modules]
         return sorted(every, key=lambda part: (part.kind, part.name))
 
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the source on which results depend: of one file, else of the files' hashes; empty without any."""
+        digests = sorted({part.sha256 for part in self.parts if part.kind not in NEVER_RESULTS})
+        if len(digests) > 1:
+            return sha256(" ".join(digests).encode()).hexdigest()
+        return "".join(digests)
+
 
 _PLUGINS: dict[str, Plugin] = {}
 # A context variable rather than an argument: the types of keys need the names, and pydantic passes them no arguments.

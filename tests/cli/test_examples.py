@@ -61,7 +61,7 @@ def test_a_copied_case_has_its_modules(in_process, tmp_path, monkeypatch):
 
     copied = Case.load(tmp_path / "mine/own-law.toml")
     shipped = Case.load(EXAMPLES / "own-law.toml")
-    assert copied.plugins.parts["law"]["rubber-stop"].module == str(tmp_path / "mine/own_law.py")
+    assert [*copied.plugins.sources] == [str(tmp_path / "mine/own_law.py")]
     assert copied.contacts == shipped.contacts
     # The comment in the case says that at this depth the force is twice that of the linear law, k x.
     depth = 0.32e-3

@@ -164,8 +164,8 @@ def test_an_installed_package_registers_a_law(site, tmp_path):
     )
     call(site / "bin/vipetsc", "run", *laws, *TINY, cwd=tmp_path, site=site)
     case = tomllib.loads((tmp_path / "runs/four-band/case.toml").read_text(encoding="utf-8"))
-    record = {"module": "users-stops", "version": "1.2", "sha256": hashlib.sha256(source).hexdigest()}
-    assert case["plugins"]["parts"] == {"law": {"hardening": record}}
+    record = {"version": "1.2", "sha256": hashlib.sha256(source).hexdigest()}
+    assert case["plugins"]["sources"] == {"users-stops": record}
     assert case["contacts"]["law"] == "hardening"
 
 

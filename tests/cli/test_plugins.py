@@ -89,14 +89,10 @@ def test_a_run_uses_and_records_the_parts(folder, out):
     # Herbert and McWhannell's factor, 6 (1 - r)/[(2 r - 1)^2 + 3], at r = 0.6.
     assert law.damping == pytest.approx(6 * 0.4 / (0.2**2 + 3))
 
-    parts = case.plugins.parts
-    expected = {"law": ("hardening", "stops.py"), "dissipation": ("herbert-mcwhannell", "factors.py"),
-                "waveform": ("ricker", "pulses.py"), "measure": ("longest_contact", "durations.py")}  # fmt: skip
-    assert parts.keys() == expected.keys()
-    for kind, (name, file) in expected.items():
-        record = parts[kind][name]
-        assert record.module == str(folder / file)
-        assert record.sha256 == hashlib.sha256((folder / file).read_bytes()).hexdigest()
+    sources = case.plugins.sources
+    assert [*sources] == [str(folder / file) for file in ("stops.py", "factors.py", "pulses.py", "durations.py")]
+    for file, source in sources.items():
+        assert source.sha256 == hashlib.sha256(Path(file).read_bytes()).hexdigest()
     # An empty picture takes fewer bytes.
     assert (out / "figures/kinetic.png").stat().st_size > 5000
 
@@ -159,23 +155,20 @@ def test_results_of_another_source_are_not_continued(folder, out, tmp_path, in_p
     old = edited_copy(out, tmp_path / "old", digest, "0" * 64)
     ended = in_process("run", folder / "case.toml", "--out", old, "--resume")
     assert ended.returncode == 2
-    assert f"plugins.parts.law.hardening.sha256 = {'0' * 16}... there, {digest[:16]}... here" in ended.stderr
+    assert f"stops.py.sha256 = {'0' * 16}... there, {digest[:16]}... here" in ended.stderr
     # The case is refused before anything is written; the lock, whose name begins with a dot, may stay.
     assert {path.name for path in old.iterdir() if path.name[0] != "."} == {"case.toml", "run.h5"}
 
 
 def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplog):
-    """Reading results that record another hash of a module warns once, and names the part."""
+    """Reading results that record another hash of a module warns once, and names the module."""
     digest = hashlib.sha256((folder / "factors.py").read_bytes()).hexdigest()
     text = (out / "case.toml").read_text().replace(digest, "0" * 64)
     # Reading twice gives one warning: a sweep reads the case of every member.
     for _ in range(2):
-        assert Case.from_toml(text).plugins.parts["dissipation"]["herbert-mcwhannell"].sha256 == digest
+        assert Case.from_toml(text).plugins.sources[str(folder / "factors.py")].sha256 == digest
     warned = [line for line in caplog.messages if "has changed" in line]
-    assert warned == [
-        f"vipetsc: {folder / 'factors.py'} has changed since the case was resolved that used it: dissipation"
-        " herbert-mcwhannell"
-    ]
+    assert warned == [f"vipetsc: {folder / 'factors.py'} has changed since the case was resolved that used it"]
 
 
 def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
@@ -318,7 +311,7 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
     assert unhardened == pytest.approx(linear, rel=1e-6)
     # The compiled kernel uses the parameter: changes grow with it, and are far above rounding.
     assert abs(hardened / linear - 1) > abs(little / linear - 1) > 1e-4
-    assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
+    assert "[plugins.sources." in ensemble.attrs["case"]
 
 
 PLAIN = """

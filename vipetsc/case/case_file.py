@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import tomli_w
 
 from vipetsc.case.cell_matrices import with_matrices
-from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_parts
+from vipetsc.case.parts import PluginsTable, missing_modules, module_names, warn_once, with_sources
 from vipetsc.case.reading import (
     Table,
     parsed,
@@ -172,14 +172,17 @@ class CaseFile(Section):
         # Without its cell a case has no other sense: only its matrices or its strip are reported.
         if unread:
             raise CaseError(problems + unread, source)
-        table, wrong = with_parts(table)
+        # Results can be read without modules that their cases do not need, such as those of measures.
+        section = table.get("plugins")
+        is_resolved = isinstance(section, dict) and "sources" in section
+        table, missing = with_sources(table)
         plugins: PluginsTable | None = None
         mistyped: list[Problem] = []
         if "plugins" in table:
             plugins, mistyped = read_section(PluginsTable, table["plugins"], "plugins")
         # Without the modules, names of parts in the case would be invalid too: only the modules are reported.
-        if wrong + mistyped:
-            raise CaseError(problems + wrong + mistyped, source)
+        if mistyped or (missing and not is_resolved):
+            raise CaseError(problems + missing + mistyped, source)
 
         try:
             # Other cases in this process may have imported further modules, whose parts this case must not find.
@@ -188,7 +191,9 @@ class CaseFile(Section):
         except PartError as error:
             raise CaseError([*problems, Problem("plugins.modules", module_names(table), str(error))], source) from error
         if problems + wrong:
-            raise CaseError(problems + wrong, source)
+            raise CaseError(missing + problems + wrong, source)
+        for problem in missing:
+            warn_once(f"{problem.value}: {problem.remedy}; its parts are left out")
         return {"name": name, "plugins": plugins, **fields}
 
     @classmethod
@@ -219,7 +224,7 @@ class CaseFile(Section):
         """Import the modules of the case, which another rank may have read; raises CaseError."""
         if self.plugins is None:
             return
-        problems = missing_parts(self.plugins)
+        problems = missing_modules(self.plugins)
         if problems:
             raise CaseError(problems, self.name)
 

@@ -1,11 +1,11 @@
 """The section ``[plugins]``: modules of the user's, which register laws, waveforms and other parts by name.
 
-The resolved case records every part on which numbers depend, with the version of its module and the SHA-256 of its
-source. Every result thus states them, and a result that was begun with another source is not continued.
+The resolved case records the version of each module and the SHA-256 of its source. Every result thus states them, and a
+result that was begun with another source is not continued.
 """
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,12 +24,11 @@ PHYSICS = (register.LAW, register.DISSIPATION, register.WAVEFORM)  # kinds witho
 NAMING = ("contacts", "drive", "sweep")  # sections whose keys may name a part
 
 
-class PartTable(Section):
-    """A part that a module registers, as the resolved case records it."""
+class SourceTable(Section):
+    """Source of a module, as the resolved case records it."""
 
-    module: str = described("module that registers the part")
     version: str = described("version of the module")
-    sha256: str = described("SHA-256 hash of the source file")
+    sha256: str = described("SHA-256 hash of the source file; of several files, that of their hashes")
 
 
 class PluginsTable(Section):
@@ -41,8 +40,8 @@ class PluginsTable(Section):
         [],
         min_length=1,
     )
-    parts: dict[str, dict[str, PartTable]] | None = described(
-        "parts that the modules register, by kind and name, filled in", None
+    sources: dict[str, SourceTable] | None = described(
+        "source of each module that registers more than figures, filled in", None
     )
 
 
@@ -111,11 +110,10 @@ def _located(name: str, folder: Path) -> str:
         return name
 
 
-def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
-    """Return ``table`` with a record of the parts of its modules, which are imported, and what is wrong with them.
+def with_sources(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
+    """Return ``table`` with the sources of its modules, which are imported, and problems with importing them.
 
-    If a resolved case does not need a module for its physics, the module may be missing: a warning says so, and the
-    record stays as it is.
+    A module that cannot be imported keeps the source that a resolved case records.
     """
     names = module_names(table)
     if not names:
@@ -126,35 +124,21 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
 
     # Absolute paths, since results are read from other folders than the one in which they were computed.
     table = with_located(table, Path())
-    earlier = table["plugins"].get("parts")
-    recorded: dict[str, Any] = {}
-    if isinstance(earlier, dict):
-        recorded = earlier
-
-    parts: dict[str, dict[str, Any]] = {}
+    recorded = _by_file_name(table["plugins"].get("sources"))
+    sources: dict[str, dict[str, str]] = {}
     problems = []
     for number, name in enumerate(module_names(table)):
+        before = recorded.get(Path(name).name)
         try:
-            rows = _record(name)
+            now = _source(name)
         except plugins.PluginError as error:
-            # The record of an earlier reading takes the place of a module that is missing.
-            rows = _rows_of(recorded, name)
-            if earlier is None or any(kind in PHYSICS and part in _texts(table) for kind, part, _ in rows):
-                problems.append(Problem(f"plugins.modules[{number + 1}]", names[number], str(error)))
-            else:
-                _warn(f"{name}: {error}; its parts are left out")
-        for kind, part, row in rows:
-            parts.setdefault(kind, {})[part] = row
-
-    changed: dict[str, list[str]] = {}
-    for kind, part, row in _all_rows(recorded):
-        now = parts.get(kind, {}).get(part)
-        if now and now.get("sha256") != row.get("sha256"):
-            changed.setdefault(now["module"], []).append(f"{kind} {part}")
-    # One warning for each module, which lists its parts.
-    for name, which in changed.items():
-        _warn(f"{name} has changed since the case was resolved that used it: {', '.join(which)}")
-    return table | {"plugins": table["plugins"] | {"parts": parts}}, problems
+            now = before
+            problems.append(Problem(f"plugins.modules[{number + 1}]", names[number], str(error)))
+        if now:
+            sources[name] = now
+        if now and before and now["sha256"] != before.get("sha256"):
+            warn_once(f"{name} has changed since the case was resolved that used it")
+    return table | {"plugins": table["plugins"] | {"sources": sources}}, problems
 
 
 def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, RegisteredPart]]:
@@ -176,7 +160,7 @@ def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, Registe
     return used
 
 
-def missing_parts(table: PluginsTable) -> list[Problem]:
+def missing_modules(table: PluginsTable) -> list[Problem]:
     """Return problems with importing the modules that a resolved case records, as on a rank that did not read it.
 
     A module is a problem if it is missing, or if its source is not the one recorded.
@@ -187,45 +171,32 @@ def missing_parts(table: PluginsTable) -> list[Problem]:
     where = ""
     if rank is not None:
         where = f"on rank {rank}: "
+    recorded = table.sources or {}
     for number, name in enumerate(table.modules, 1):
         try:
-            rows = _record(name)
+            now = _source(name)
         except plugins.PluginError as error:
             problems.append(Problem(f"plugins.modules[{number}]", name, f"{where}{error}"))
             continue
-        for kind, part, row in rows:
-            recorded = (table.parts or {}).get(kind, {}).get(part)
-            if recorded and recorded.sha256 != row["sha256"]:
-                problems.append(Problem(f"plugins.modules[{number}]", name, "differs from rank to rank"))
-                break
+        if now and name in recorded and recorded[name].sha256 != now["sha256"]:
+            problems.append(Problem(f"plugins.modules[{number}]", name, "differs from rank to rank"))
     return problems
 
 
-def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
-    """Return kind, name and record of the parts of the module ``name`` on which numbers depend; raises PluginError."""
+def _source(name: str) -> dict[str, str] | None:
+    """Return the record of the module ``name``; None if it registers figures alone. Raises PluginError."""
     plugin = plugins.load(name)
-    rows = []
-    for part in plugin.parts:
-        if part.kind not in plugins.NEVER_RESULTS:
-            row = {"module": name, "version": plugin.version, "sha256": part.sha256}
-            rows.append((part.kind, part.name, row))
-    return rows
+    if not plugin.sha256:
+        return None
+    return {"version": plugin.version, "sha256": plugin.sha256}
 
 
-def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield kind, name and record of all parts in ``plugins.parts``; the check of types reports other entries."""
-    for kind, parts in recorded.items():
-        if not isinstance(parts, dict):
-            continue
-        for part, row in parts.items():
-            if isinstance(row, dict):
-                yield kind, part, row
-
-
-def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
-    """Return kind, name and record of the parts of the module ``name`` in ``plugins.parts``."""
-    # Only the last part of the path counts: the file may have been recorded in another folder.
-    return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
+def _by_file_name(recorded: Any) -> dict[str, dict[str, str]]:
+    """Return the records in ``plugins.sources`` by the last part of the path: files may have been moved since."""
+    if not isinstance(recorded, dict):
+        return {}
+    # The check of types reports other entries.
+    return {Path(name).name: row for name, row in recorded.items() if isinstance(row, dict)}
 
 
 def _texts(table: Mapping[str, Any]) -> set[str]:
@@ -244,7 +215,7 @@ def _texts(table: Mapping[str, Any]) -> set[str]:
 
 
 @cache
-def _warn(text: str) -> None:
+def warn_once(text: str) -> None:
     """Warn on one rank, and once for each ``text``, since a file's case is read many times."""
     if not launched_rank():
         logger.warning("vipetsc: %s", text)

@@ -45,13 +45,13 @@ def schema(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> 
 def schema_of(path: str | None) -> dict[str, Any]:
     """Return JSON schema of case files that name the same modules as the file ``path``, or none; raises CaseError."""
     from vipetsc.case.keys import json_schema
-    from vipetsc.case.parts import module_names, with_parts
+    from vipetsc.case.parts import module_names, with_sources
     from vipetsc.case.reading import read_toml
 
     given: dict[str, Any] = {}
     if path is not None:
         given = read_toml(path)
-    table, problems = with_parts(given)
+    table, problems = with_sources(given)
     if problems:
         raise CaseError(problems, str(path))
     return json_schema(module_names(table))
