@@ -53,7 +53,7 @@ MODULES = {
     "open": ("vipetsc.io.read", "open_results"),
     "plot": ("vipetsc.studies.pictures", "plot"),
     "register": ("vipetsc", "register"),
-    "simulate": ("vipetsc.dynamics.run", "simulate"),
+    "simulate": ("vipetsc.studies.simulation", "simulate"),
     "sweep": ("vipetsc.studies.sweep", "run_sweep"),
 }
 

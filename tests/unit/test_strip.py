@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from vipetsc.case import Case, CaseError
+from vipetsc.case.keys import json_schema
+from vipetsc.figures.strips import bands
+from vipetsc.figures.style import rc_style
 from vipetsc.lattice import Chain, bloch
 from vipetsc.lattice.plane import PlaneCell, PlaneSpring, honeycomb, square, triangular
 
@@ -11,10 +14,13 @@ K, M = 1e4, 0.01
 W2 = K / M  # (rad/s)^2
 
 
-def strip_table(rows=4, cells=6, ends="fixed", drive=None, time=None, **keys):
+IN_PLANE = {"motion": "in-plane", "kind": "triangular"}
+
+
+def strip_table(rows=4, cells=6, ends="fixed", drive=None, time=None, profiles=None, **keys):
     strip = {"rows": rows, "mass": M, "stiffness": K} | keys
     return {
-        "lattice": {"cells": cells, "ends": ends, "strip": strip},
+        "lattice": {"cells": cells, "ends": ends, "strip": strip} | ({"profiles": profiles} if profiles else {}),
         "drive": {"amplitude": 1.0, "frequency": 1000.0} | (drive or {}),
         "time": {"end": 0.01} | (time or {}),
         "output": {"figures": False},
@@ -166,6 +172,10 @@ def test_resolved_strip_reads_back_and_a_key_replaces_one():
         ("lattice.ends", "cut", {"motion": "in-plane", "kind": "triangular", "ends": "free"}),
         ("lattice.strip.rows", "springs", {"rows": 20_000}),
         ("lattice.strip.row", "rows", {"row": 2}),
+        ('lattice.profiles."masses[1]"', "masses[2]", IN_PLANE | {"profiles": {"masses[1]": [M] * 6}}),
+        ('lattice.profiles."masses[6]"', "masses[5]", IN_PLANE | {"profiles": {"masses[6]": [M] * 6}}),
+        ('lattice.profiles."springs[1].stiffness"', "several",
+            IN_PLANE | {"profiles": {"springs[1].stiffness": [K] * 6}}),
         ("lattice.strip.springs[1].offset", "-1", {"kind": "cell", "mass": None, "stiffness": None, "masses": [M],
             "springs": [{"start": 1, "end": 1, "stiffness": K, "offset": [2, 0]}]}),
     ],
@@ -265,9 +275,46 @@ def test_defects_and_scatter_by_place():
     assert len(np.unique(scattered)) == 24 and abs(scattered.mean() / M - 1) < 0.1
 
 
+def test_both_components_of_a_mass_in_the_plane_may_vary():
+    heavy = {"masses[3]": [M, 2 * M] * 3, "masses[4]": [M, 2 * M] * 3}
+    defects = [{"quantity": "masses[1]", "places": [[i, 2] for i in (2, 4, 6)], "factor": 2.0}]
+    assert strip_case(profiles=heavy, **IN_PLANE).model() == strip_case(defects=defects, **IN_PLANE).model()
+    with pytest.raises(CaseError, match="one mass"):
+        strip_case(**IN_PLANE).varied(overrides=["lattice.cell.masses[8]=0.02"])
+
+
+def test_a_point_has_a_cell_or_a_place():
+    point = json_schema()["$defs"]["PointTable"]
+    assert point["required"] == ["name"]
+    assert point["anyOf"] == [{"required": ["cell"]}, {"required": ["place"]}]
+    table = run_table() | {"output": {"points": [{"name": "nowhere"}]}}
+    with pytest.raises(CaseError, match=r"points\[1\].cell: missing"):
+        Case.from_table(table)
+
+
+@pytest.mark.parametrize("edges", ["free", "fixed", "periodic"])
+@pytest.mark.parametrize("kind", ["square", "triangular"])
+def test_bands_have_the_colours_of_their_wave_number_across(kind, edges):
+    if (kind, edges) == ("triangular", "free"):
+        pytest.skip("rows at a free edge have two bonds less, and no standing wave is one of half-waves")
+    case = strip_case(kind=kind, rows=5, edges=edges)
+    with rc_style():
+        figure = bands(case.lattice.cell.from_strip, case.lattice.unit_cell())
+    shown = 0
+    for sign, lines in zip((1, -1), figure.axes[0].collections[:2], strict=True):
+        for segment, across in zip(lines.get_segments(), lines.get_array(), strict=True):
+            for kappa, frequency in np.pi * segment * [1, 1e3 / np.pi]:
+                lean = kappa / 2 if kind == "triangular" and edges == "fixed" else 0.0
+                exact = squared(kind, kappa, sign * np.pi * across + lean)
+                np.testing.assert_allclose(frequency**2 / W2, exact, rtol=0, atol=1e-12)
+            shown += 1
+    assert shown > 180 * 4
+
+
 @pytest.mark.parametrize(
     ("section", "value", "key", "word"),
     [
+        ("contacts", {"places": [{"row": 3}]}, "contacts.places[1]", "the table itself"),
         ("contacts", {"places": [[3, 6]]}, "contacts.places", "outside"),
         ("contacts", {"places": [[3]]}, "contacts.places[1]", "2 items"),
         ("contacts", {"places": {"rows": 3}}, "contacts.places.rows", "row"),

@@ -118,7 +118,21 @@ def test_export_names_cells_and_rows(folder):
     with open_run(folder / "run.h5") as run, h5py.File(folder / "run.h5") as file:
         dofs = run.sizes["dof"] // 6
         grid = tree.findall(".//Grid[@GridType='Uniform']")[25]
-        assert grid.find("Topology").get("Dimensions") == "10 6"
+        mesh = [tree.find(f"Domain/{name}") for name in ("Topology", "Geometry")]
+        if is_square := mesh[0] is None:
+            mesh = [grid.find(name) for name in ("Topology", "Geometry")]
+        else:
+            assert {part.get("Reference") for part in grid} >= {f"/Xdmf/Domain/{part.tag}[1]" for part in mesh}
+        assert mesh[0].get("Dimensions") == "10 6"
+        numbers = [np.array(item.text.split(), float) for item in mesh[1].findall("DataItem")]
+        i, j = np.meshgrid(np.arange(1.0, 11), np.arange(1.0, 7), indexing="ij")
+        if is_square:
+            assert mesh[0].get("TopologyType") == "2DCoRectMesh"
+            np.testing.assert_array_equal(numbers, [[1, 1], [1, 1]])
+        else:
+            # Rows of the honeycomb lattice lean by 60 degrees.
+            exact = np.stack([i + 0.5 * j, np.sqrt(0.75) * j], axis=-1)
+            np.testing.assert_allclose(numbers[0].reshape(10, 6, 2), exact, rtol=1e-15)
         attributes = grid.findall("Attribute")
         assert len(attributes) == 2 * dofs
         for number, attribute in enumerate(attributes):

@@ -276,10 +276,11 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """Return warnings of settings that are allowed but probably unintended."""
+        is_measured = any(one.samples is not None for _, one in self.drive.every)
         return [
             *unit_warnings(self.drive, self.model().chain),
             *loss_warnings(self.lattice),
-            *warnings_of(self.model(), self.output, self.petsc_options),
+            *warnings_of(self.model(), self.output, self.petsc_options, is_measured),
         ]
 
 

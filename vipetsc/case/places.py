@@ -4,6 +4,7 @@
 [i, j] or [i, j, mass], which becomes ``cell`` and ``mass``; drives, struck masses and contacts may have ``places``.
 """
 
+import copy
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -27,6 +28,7 @@ OF_A_STRIP = {
     "initial": ("place", "places"),
     "contacts": ("places", "offset"),
     "output": ("place",),
+    "identify": ("place",),
 }
 """Keys that only a strip has, by section."""
 
@@ -340,11 +342,8 @@ def _placed_tables(table: Table) -> Iterator[tuple[str, Table]]:
     contacts = table.get("contacts")
     if isinstance(contacts, dict):
         yield "contacts", contacts
-    output = table.get("output")
-    points = output.get("points") if isinstance(output, dict) else None
-    for number, point in enumerate(points if isinstance(points, list) else [], 1):
-        if isinstance(point, dict):
-            yield f"output.points[{number}]", point
+    for path, _, one in _in_lists(table):
+        yield path, one
 
 
 def translated(table: Table, placing: Placing) -> Table:
@@ -355,16 +354,29 @@ def translated(table: Table, placing: Placing) -> Table:
             table[key] = placing.of_drives(table[key], key)
     if isinstance(table.get("contacts"), dict):
         table["contacts"] = placing.of_contacts(table["contacts"])
-    output = table.get("output")
-    if isinstance(output, dict) and isinstance(output.get("points"), list):
-        points = []
-        for number, point in enumerate(output["points"], 1):
-            placed = [point]
-            if isinstance(point, dict):
-                placed = placing.spread(point, f"output.points[{number}]")
-            points += placed
-        table["output"] = output | {"points": points}
+    placed = {path: placing.spread(one, path)[0] for path, _, one in _in_lists(table)}
+    if placed:
+        # Entries of lists deep in the table, which stays as it is.
+        table = copy.deepcopy(table)
+        for path, keys, _ in _in_lists(table):
+            keys[int(path.rpartition("[")[2][:-1]) - 1] = placed[path]
     return table
+
+
+def _in_lists(table: Table) -> Iterator[tuple[str, list[Any], Table]]:
+    """Yield the path of each point and sensor of a case, the list that it is in, and its table."""
+
+    def tables(owner: Any, key: str, path: str) -> Iterator[tuple[str, list[Any], Table]]:
+        entries = owner.get(key) if isinstance(owner, dict) else None
+        if not isinstance(entries, list):
+            return
+        for number, one in enumerate(entries, 1):
+            if isinstance(one, dict):
+                yield f"{path}.{key}[{number}]", entries, one
+
+    yield from tables(table.get("output"), "points", "output")
+    for path, _, record in tables(table.get("identify"), "records", "identify"):
+        yield from tables(record, "sensors", path)
 
 
 def for_all(table: Table, masses: int, springs: int) -> Table:

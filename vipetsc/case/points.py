@@ -1,9 +1,9 @@
 """Named masses whose motion is recorded at every sample: the keys ``output.points`` and ``output.transmission``."""
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from vipetsc.case.places import Place
 from vipetsc.case.section import Problem, Section, described
@@ -14,13 +14,21 @@ NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point, which is part of names in result
 MOST_POINTS = 1000
 
 
+def _cell_or_place(schema: dict[str, Any]) -> None:
+    """Let the JSON ``schema`` of a point ask for a cell or a place: a place becomes a cell before it is read."""
+    schema["required"].remove("cell")
+    schema["anyOf"] = [{"required": ["cell"]}, {"required": ["place"]}]
+
+
 class PointTable(Section):
     """A ``mass`` of a ``cell``, both counted from 1, whose motion is recorded under its ``name``."""
+
+    model_config = ConfigDict(json_schema_extra=_cell_or_place)
 
     name: Annotated[str, Field(pattern=NAME, max_length=40)] = described(
         "name of the point in files and measures: letters, digits, underscores"
     )
-    cell: int = described("cell of the point", ge=1)
+    cell: int = described("cell of the point; required without a place", ge=1)
     mass: int = described("number of the mass in the cell", 1, ge=1)
     place: Place | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
 

@@ -16,7 +16,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, TypeVar, get_args
@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from vipetsc.case.parts import with_located
-from vipetsc.case.section import MARK, CaseError, Problem, Section, is_within, unit_at
+from vipetsc.case.section import MARK, CaseError, Problem, Section, is_within, table_of, unit_at
 from vipetsc.wording import nearest
 
 # Magnitude of a number in a case. A product of six is at most 1e300, and one of six of the smallest at least 1e-300:
@@ -364,7 +364,7 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
             # pydantic writes small numbers with all their zeros.
             message = re.sub(r"[\d.]+$", f"{details[limit]:g}", message)
     if item["type"] == "list_type" and isinstance(value, dict):
-        message += f" of tables; write [[{path}]]"
+        message += _list_remedy(kind, item["loc"], path)
     choices = details.get("expected")
     if isinstance(value, str) and choices:
         near = nearest(value, re.findall(r"'([^']+)'", choices), cutoff=0.4)
@@ -373,6 +373,18 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     if isinstance(value, str) and (unit := unit_at({name: kind}, path, {})):
         message += f', in {unit}, or a text with such a unit, as "1 {unit}"'
     return Problem(path, value, message)
+
+
+def _list_remedy(kind: type[Section], place: Sequence[int | str], path: str) -> str:
+    """Return what to write instead of a table at a ``place`` in the section ``kind`` where a list is needed."""
+    keys = [part for part in place if isinstance(part, str) and not part.startswith(MARK)]
+    section = _section_at(kind, place[: place.index(keys[-1])])
+    if table_of(section, keys[-1]) is None:
+        return ""
+    if place[-1] == keys[-1]:
+        return f" of tables; write [[{path}]]"
+    # The key may also be a table, which is no entry of a list.
+    return f"; give the table itself: {keys[-1]} = {{ ... }}, without [ ]"
 
 
 def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]:

@@ -261,6 +261,11 @@ class LatticeTable(Section):
     absorbing: AbsorbingTable | None = described("an end with dashpots that absorb waves", None)
 
     @property
+    def section_of_strip(self) -> StripTable | None:
+        """The strip that the cell was made of; None for another cell."""
+        return self.cell.from_strip if self.cell else None
+
+    @property
     def nonlinear_keys(self) -> list[str]:
         """Keys of the case by which springs have, or may have in some cells, a quadratic or a cubic part.
 

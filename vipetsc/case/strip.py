@@ -103,6 +103,12 @@ class StripTable(Section):
         named = KINDS[self.kind](self.mass or 0.0, stiffness, self.stiffness_across or stiffness)
         return PlaneCell(named.masses, named.springs, named.vectors, named.positions, in_plane)
 
+    def place(self, cell: int, mass: int) -> list[int]:
+        """Return the place [i, j] of a ``mass`` of a wide ``cell``, both from 1; with the mass if there are several."""
+        row, number = divmod(mass - 1, self.plane_cell().dofs)
+        place = [cell, row + 1, number + 1]
+        return place if self.plane_cell().dofs > 1 else place[:2]
+
     def problems(self, ends: Any) -> Iterator[Problem]:
         """Yield problems between the keys of the section, in a lattice with these ``ends``."""
         is_given = self.kind == "cell"
@@ -207,11 +213,34 @@ def _with_all(table: Table, strip: StripTable, placing: Placing) -> Table:
     table = translated(table, placing)
     profiles = table["lattice"].get("profiles")
     if isinstance(profiles, dict):
-        table["lattice"] = table["lattice"] | {"profiles": for_all(profiles, *counts)}
+        profiles = for_all(profiles, *counts)
+        table["lattice"] = table["lattice"] | {"profiles": profiles}
+    if strip.motion == "in-plane":
+        placing.problems += _unlike_components(cell.get("masses", ()), profiles)
     disorder = table.get("disorder")
     if isinstance(disorder, dict) and isinstance(disorder.get("cells"), dict):
         table["disorder"] = disorder | {"cells": for_all(disorder["cells"], *counts)}
     return table
+
+
+def _unlike_components(masses: Any, profiles: Any) -> Iterator[Problem]:
+    """Yield problems of a mass of the plane that would differ along x and along y, and of single springs."""
+    values = masses if isinstance(masses, list) else []
+    for number, (x, y) in enumerate(zip(values[::2], values[1::2], strict=False)):
+        if x != y:
+            remedy = f"masses {2 * number + 1} and {2 * number + 2} are one mass, along x and along y; give both values"
+            yield Problem("lattice.cell.masses", [x, y], remedy)
+    for key, value in profiles.items() if isinstance(profiles, dict) else ():
+        kind, _, index = str(key).rstrip("]").partition("[")
+        if kind != "masses" or not index.isdecimal():
+            remedy = "a spring of the plane is several of the wide cell; remove it"
+            yield Problem(f'lattice.profiles."{key}"', None, remedy)
+            continue
+        # The other component: 2 of 1, 1 of 2.
+        other = f"masses[{((int(index) - 1) ^ 1) + 1}]"
+        if profiles.get(other) != value:
+            remedy = f"is one mass with {other}, along x and along y: give both, or lattice.strip.defects"
+            yield Problem(f'lattice.profiles."{key}"', None, remedy)
 
 
 def _spring_table(spring: Spring) -> dict[str, Any]:

@@ -32,11 +32,14 @@ STEPS = 10.0  # of fixed length in a contact: a half sine of ten points has its 
 DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt does not give one
 
 
-def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> list[str]:
-    """Return the warnings about a run of ``model`` of which ``output`` is kept, with the options ``petsc`` of PETSc."""
+def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str], is_measured: bool = False) -> list[str]:
+    """Return the warnings about a run of ``model`` of which ``output`` is kept, with the options ``petsc`` of PETSc.
+
+    ``is_measured``: a drive is one of measured samples.
+    """
     return [
         *wave_warnings(model),
-        *length_warnings(model),
+        *length_warnings(model, is_measured),
         *end_warnings(model, output),
         *field_warnings(model, output),
         *closing_warnings(model),
@@ -145,13 +148,17 @@ def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) 
     return ""
 
 
-def length_warnings(model: Model) -> Iterator[str]:
-    """Yield warnings of waves that are long for the lattice, and of a run that ends before its drive."""
+def length_warnings(model: Model, is_measured: bool = False) -> Iterator[str]:
+    """Yield warnings of waves that are long for the lattice, and of a run that ends before its drive.
+
+    ``is_measured``: a drive is one of measured samples.
+    """
     drive = model.drive
     cells = model.chain.cells
     waves = waves_at(model.chain.cell, drive.frequency)
-    # A rig of one cell is not about waves, and a steady motion not about the wave that comes first.
-    if model.first_drive_acts and waves and cells > 1 and not drive.repeats:
+    # A rig of one cell, or one that moves as measured, is not about waves, and a steady motion not about the wave that
+    # comes first.
+    if model.first_drive_acts and waves and cells > 1 and not (drive.repeats or is_measured):
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
         wavelength = 2 * pi / max(kappa, 1e-300)
         if wavelength * WAVELENGTHS > cells:

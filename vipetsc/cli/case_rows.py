@@ -20,7 +20,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     lattice = f"{counted(chain.cells, 'cell')}, {counted(chain.cells * cell.dofs, 'mass')}, {describe_ends(case)}"
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
-    strip = case.lattice.cell and case.lattice.cell.from_strip
+    strip = case.lattice.section_of_strip
     if strip:
         lattice += f"; strip of {chain.cells} x {strip.rows} cells, {strip.kind}, {strip.edges} edges, {strip.motion}"
     band_list = "none: no spring runs from cell to cell"
@@ -35,6 +35,10 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     # stiffness.
     laws = model.used_laws[: min(len(chain.sites), MOST_SHOWN)]
     clearances = describe_stops(model.gaps)
+    sites: list[object] = [cell + 1 for cell in chain.sites]
+    if strip:
+        pairs = zip(chain.sites, chain.contact_pairs, strict=True)
+        sites = [strip.place(cell + 1, pair.resonator + 1) for cell, pair in pairs]
 
     return [
         ("case", case.name),
@@ -43,7 +47,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         ("gaps", gap_list),
         ("loss", describe_losses(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, laws))) or "none"),
-        ("sites", first_few([cell + 1 for cell in chain.sites])),
+        ("sites", first_few(sites)),
         ("clearance", first_few(clearances)),
     ]
 

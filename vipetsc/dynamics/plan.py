@@ -37,7 +37,11 @@ class RunPlan(NamedTuple):
         """Return the plan of a run of ``case``; raises CaseError for PETSc options that there are not."""
         check_petsc_options(case)
         model = case.model()
-        return cls(case, model, choose_engine(case, model), tuple(case.warnings()))
+        engine = choose_engine(case, model)
+        warnings = case.warnings()
+        if case.time.engine == PROPAGATOR and engine.refused:
+            warnings.append(f"time.engine = {PROPAGATOR!r} is not used: {engine.refused}; {engine.name} simulates it")
+        return cls(case, model, engine, tuple(warnings))
 
 
 def check_petsc_options(case: CaseFile) -> None:

@@ -6,13 +6,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import vipetsc
 from vipetsc.case.html import html_table
 from vipetsc.io.read import open_results
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
 # Statistics that a notebook shows, with their words.
 SHOWN = {
@@ -65,10 +63,6 @@ class Result:
         if self.folder is None or self.resumable:
             return self.held
         return open_results(self.folder / "run.h5")
-
-    def plot(self, name: str) -> "Figure":
-        """Return the picture ``name`` of the run as a figure of matplotlib; see ``vipetsc.plot``."""
-        return vipetsc.plot(self, name)
 
     def _repr_html_(self) -> str:
         """Return the ending, warnings and some numbers, as a notebook shows them."""

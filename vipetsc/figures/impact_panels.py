@@ -98,7 +98,11 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         _draw_markers(raster, episodes)
     else:
         _draw_speed_map(raster, episodes)
-    _label_sites(raster, episodes, every)
+    raster.set_xlabel("Time (s)")
+    raster.set_xlim(episodes.span)
+    raster.set_ylim(0.4, len(episodes.cells) + 0.6)
+    raster.set_yticks(episodes.rows[::every], panels.site_labels(run)[::every])
+    raster.set_ylabel(f"Contact site ({panels.sites_title(run)})")
     force = np.abs(run["impacts/force"].values) if are_pressed else None
     _draw_bars(bars, episodes, has_rows, force)
     return figure
@@ -146,14 +150,6 @@ def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
     image = axes.imshow(largest, extent=extent, norm=norm, cmap=SPEEDS)
     axes.set_title(f"(a) {len(episodes.site)} contact episodes")
     panels.colour_bar(image, axes, "Largest approach speed (m/s)")
-
-
-def _label_sites(axes: Axes, episodes: Episodes, every: int) -> None:
-    """Label the axis of time, and the common one of sites: the cells of every ``every``-th site."""
-    shown = episodes.rows[::every]
-    axes.set_yticks(shown, [f"{cell}" for cell in episodes.cells[shown - 1]])
-    axes.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=episodes.span)
-    axes.set_ylim(0.4, len(episodes.cells) + 0.6)
 
 
 def _draw_bars(axes: Axes, episodes: Episodes, has_rows: bool, force: np.ndarray | None) -> None:

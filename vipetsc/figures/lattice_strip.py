@@ -9,11 +9,11 @@ from vipetsc.figures import style
 from vipetsc.lattice import Chain
 
 
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int, gaps: Gaps) -> None:
-    """Draw the lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances.
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: float, gaps: Gaps) -> None:
+    """Draw the lattice as a strip: its ends, drive and contacts with their cells and clearances.
 
-    ``gaps`` (site, 2) in m are the clearances of each site's sides + and -. Cells have a width of 1
-    on the axis, and the strip a height of 1.
+    ``drive_cell`` is 0-based, and lies beyond the last cell where a wall moves. ``gaps`` (site, 2) in m are the
+    clearances of each site's sides + and -. Cells have a width of 1 on the axis, and the strip a height of 1.
     """
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))

@@ -64,7 +64,7 @@ class MovedEnergies(NamedTuple):
         rows = np.unique(row)
         by_size = np.argsort(-np.abs(moved[rows]).sum(axis=1), kind="stable")
         shown = np.sort(rows[by_size][:MOST_ROWS])
-        labels = [*map(str, sites), SEVERAL]
+        labels = [*panels.site_labels(run), SEVERAL]
         return cls(labels=[labels[i] for i in shown], energy=moved[shown], rows=len(rows))
 
 
@@ -103,6 +103,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     _draw_impacts(panel["impacts"], run)
     percent = 100 * moved.energy / float(run["energy/work"][-1])
     _draw_matrix(panel["matrix"], moved.labels, [*(style.part_label(names[p]) for p in parts), "lost"], percent)
+    panel["matrix"].set_ylabel(f"Contact site ({panels.sites_title(run)})")
     panels.label_panels([panel["steps"], panel["impacts"], panel["matrix"]])
     if len(moved.labels) < moved.rows:
         style.add_note(figure, f"transfers: the {MOST_ROWS} of {moved.rows} rows with the largest ones")
@@ -134,10 +135,11 @@ def _looks(names: list[str], parts: list[int]) -> list[dict[str, Any]]:
 def _draw_impacts(axes: Axes, run: xr.Dataset) -> None:
     """Draw a stroke at the onset of every episode in the row of its site."""
     axes.plot(run["impacts/onset"], run["impacts/site"], "|", color=style.BLACK, ms=4, mew=0.5)
-    sites = run["sites/cell"].values
+    sites = panels.site_labels(run)
     ticks = np.unique(np.linspace(0, len(sites) - 1, min(len(sites), MOST_TICKS)).astype(int))
-    axes.set_yticks(ticks + 1, sites[ticks])
-    axes.set(xlabel="Time (s)", ylabel="Site (cell)", xlim=run["time"][[0, -1]], ylim=(0.4, len(sites) + 0.6))
+    axes.set_yticks(ticks + 1, [sites[tick] for tick in ticks])
+    axes.set(xlabel="Time (s)", xlim=run["time"][[0, -1]], ylim=(0.4, len(sites) + 0.6))
+    axes.set_ylabel(f"Site ({panels.sites_title(run)})")
 
 
 def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.ndarray) -> None:
@@ -157,7 +159,7 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
     axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
-    axes.set(title="Transferred by site (% of work)", ylabel="Contact site (cell)")
+    axes.set_title("Transferred by site (% of work)")
 
 
 def _in_cell(value: float, is_wide: bool) -> str:

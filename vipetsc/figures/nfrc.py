@@ -185,10 +185,11 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         motion_label = "largest |w| / clearance"
         scale = 1 / clearance
     else:
-        motion_label = "largest elongation (mm)"
-        if branch.sizes["site"]:
-            motion_label = "largest |w| (mm)"
-        scale = np.full(largest.shape[1], 1e3)
+        quantity = "largest |w|" if branch.sizes["site"] else "largest elongation"
+        # Also of motions of a meter and more, as those of equations without units.
+        unit, per_unit = ("mm", 1e3) if np.nanmax(largest) < 1 else ("m", 1.0)
+        motion_label = f"{quantity} ({unit})"
+        scale = np.full(largest.shape[1], per_unit)
     relative = scale * largest
     size = relative[:, 0]
 
@@ -225,6 +226,7 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     draw_special(axes, branch, size, labelled=True)
     name = "largest" if branch.sizes["site"] else "largest_elongation"
     draw_linear(axes, branch, name, 0, scale=scale[0])
+    panels.widen(axes)
     axes.set_ylabel(motion_label)
     axes.legend(fontsize=6, loc="best")
 
@@ -279,6 +281,9 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
             look = StabilityLook(colour, broad=1.4, thin_dashes=line, broad_dashes=line)
             draw_states(axes, parameter, fraction, unstable, look, label)
 
-    axes.set(ylabel="fraction of the energy", ylim=(-0.02, 1.04))
+    axes.set(ylabel="fraction of the energy")
+    # Losses alone may be small; what is transmitted and reflected adds up to nearly 1.
+    if np.nanmax(branch["share"].values) > 0.5:
+        axes.set_ylim(-0.02, 1.04)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=6, loc="best")

@@ -37,12 +37,18 @@ class ComparedDesign(NamedTuple):
 def _label(objective: ObjectiveTable) -> str:
     """Return what an objective measures, with its unit, as the label of an axis."""
     if objective.is_of_responses:
-        return objective.name.replace(RESPONSE, "")
+        return _of_responses(objective.name)
     if objective.is_of_runs:
         _, unit, _ = row_of(str(objective.measure))
         return with_unit(objective.name, unit)
     part = f", {objective.part[0]:g}-{objective.part[1]:g} rad/s" if objective.part else ""
     return SYMBOLS.get(objective.measure, f"band {objective.band}{part} at the end / work")
+
+
+def _of_responses(name: str) -> str:
+    """Return the ``name`` of a quantity of responses in words, as "peak displacement of mass"."""
+    quantity, _, place = name.replace(RESPONSE, "").partition("/")
+    return " of ".join(filter(None, [quantity.replace("_", " "), place]))
 
 
 def _misses_constraint(optimum: xr.Dataset) -> np.ndarray:
@@ -221,7 +227,7 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
         axes.axhline(objective.below, color=style.GREY, lw=0.5, ls=style.DASHED)
     case = plan.responses(plan.base)
     unit = case.measures()[str(objective.measure)].unit
-    label = str(objective.measure).removeprefix(RESPONSE)
+    label = _of_responses(str(objective.measure))
     over = case.nfrc.over.capitalize()
     if case.nfrc.over == "frequency":
         over += " (rad/s)"

@@ -20,12 +20,14 @@ from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 DECADES = 5  # decades of energy that a map shows: each then has 50 of the map's 256 colours
 # Most rows and columns of a map. A page of maps takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
 PIXELS = 600
+MOST_DASHED = 12  # branches over a map that are dashed
 MOST_LINES = 30  # lines across a map at its sites; more would hide it
 # Numerals of the rows of a grid of panels. Further rows have none.
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 ROUNDING = 1e-6  # degrees by which equal phases may differ
+LEAST_RATIO = 0.02  # of the range of a vertical axis over its largest value
 LEAST_SPAN = 1.0  # degrees of an axis of phases
 # Of the cells in a map: fewer would take less than 20 of its 400 pixels.
 LEAST_PART = 0.05
@@ -242,7 +244,11 @@ def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: Un
     image = draw_map(axes, wavenumber, frequency, spectrum.values.T, norm)
     # At intervals of one degree of phase a cell, at which the steepest branches look smooth.
     kappa = np.linspace(0, np.pi, 181)
-    axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
+    look: dict[str, Any] = {"lw": 0.5, "ls": (0, (4, 3)), "alpha": 0.75}
+    # Dashes of many branches side by side make a pattern of their own.
+    if cell.dofs > MOST_DASHED:
+        look = {"lw": 0.25, "alpha": 0.5}
+    axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", **look)
     axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]), xlabel=KAPPA, ylabel=OMEGA)
     return image
 
@@ -269,8 +275,31 @@ def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "
 def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
     """Draw the colour bar of a map at one or several axes, with an arrow for values below the lowest colour's."""
     panels = np.ravel(axes).tolist()
-    options = {"pad": 0.02, "extend": "min"} | options
-    panels[0].figure.colorbar(image, ax=panels, label=label, **options)
+    options = {"extend": "min"} | options
+    if "cax" not in options:
+        options = {"ax": panels, "pad": 0.02} | options
+    panels[0].figure.colorbar(image, label=label, **options)
+
+
+def bar_axes(axes: Axes) -> Axes:
+    """Return axes for a colour bar as high as ``axes``, which may be less high than the figure has room for."""
+    return axes.inset_axes((1.02, 0, 0.03 * max(1, axes.get_data_ratio()), 1))
+
+
+def site_labels(run: xr.Dataset) -> list[str]:
+    """Return the number of the cell of each contact site of a ``run``; of a strip of the plane also that of its row."""
+    labels = [f"{cell}" for cell in run["sites/cell"].values]
+    if "sites/row" in run:
+        rows = run["sites/row"].values
+        labels = [f"{label}, {row}" for label, row in zip(labels, rows, strict=True)]
+    return labels
+
+
+def sites_title(run: xr.Dataset) -> str:
+    """Return what ``site_labels`` are."""
+    if "sites/row" in run:
+        return "cell, row"
+    return "cell"
 
 
 def continuous_phase(angle: np.ndarray, begin: float) -> np.ndarray:
@@ -294,6 +323,15 @@ def mark_degrees(axes: Axes) -> None:
         middle = (low + high) / 2
         axes.set_ylim(middle - LEAST_SPAN / 2, middle + LEAST_SPAN / 2)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
+
+
+def widen(axes: Axes) -> None:
+    """Let the vertical axis span ``LEAST_RATIO`` of its largest value, so that rounding of a constant is not seen."""
+    low, high = axes.get_ylim()
+    least = LEAST_RATIO * max(abs(low), abs(high))
+    if high - low < least:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - least / 2, middle + least / 2)
 
 
 def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float], **options: Any) -> None:

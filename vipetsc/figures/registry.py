@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 from matplotlib.figure import Figure
 
+from vipetsc.case.strip import StripTable
 from vipetsc.figures import (
     condensed_branches,
     cost_maps,
@@ -70,6 +71,8 @@ class FigureSpec(NamedTuple):
         (runs, records) -> Figure.
     on_request
         Whether it is drawn only if it is asked for.
+    without
+        Words of warnings that do not concern the figure: those with one of them are not printed below it.
     """
 
     name: str
@@ -79,6 +82,7 @@ class FigureSpec(NamedTuple):
     needs: str = ""
     together: bool = False
     on_request: bool = False
+    without: tuple[str, ...] = ()
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -124,6 +128,9 @@ THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three v
 POINTS_KEPT = "one swept number, members with their fields ([sweep] fields = true), points and time.samples_per_period"
 BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
+# Words of warnings about histories and their amplitudes, which a picture of states once a period does not show.
+HISTORIES = "sample_interval", "steady amplitude"
+
 _SPECS = (
     # The figures of a run are listed by falling duration, so that ranks which share them end at about the same time.
     FigureSpec("modal_energies", RUN, modal.modal_energies),
@@ -140,8 +147,10 @@ _SPECS = (
         FigureSpec(name, RUN, draw, needs="[output] points", together=True, on_request=name != "points")
         for name, draw in points.FIGURES.items()
     ),
-    FigureSpec("poincare", RUN, sections.poincare, needs="[output] points and time.samples_per_period"),
-    FigureSpec("bifurcation", SWEEP, sections.bifurcation, needs=POINTS_KEPT),
+    FigureSpec(
+        "poincare", RUN, sections.poincare, needs="[output] points and time.samples_per_period", without=HISTORIES
+    ),
+    FigureSpec("bifurcation", SWEEP, sections.bifurcation, needs=POINTS_KEPT, without=HISTORIES),
     FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("partition", SWEEP, wavenumber_bins.partition, measure="entropy", needs=THREE_AMPLITUDES),
@@ -288,10 +297,17 @@ def draw(
             )
 
 
-def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
-    """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
+def draw_bands(
+    cell: UnitCell, path: str | Path, frequency: float | None = None, strip: StripTable | None = None
+) -> Path:
+    """Draw the dispersion diagram of ``cell``, perhaps that of a ``strip``, into ``path``.
+
+    ``frequency`` in rad/s marks a drive.
+    """
     sys.audit("vipetsc.draw", "bands")
     with rc_style():
+        if strip is not None and strip.rows > 1:
+            return save(strips.bands(strip, cell, frequency), Path(path))
         return save(runs.bands(cell, frequency), Path(path))
 
 
@@ -381,7 +397,7 @@ def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files:
     whole_sweeps = [Shown(str(table(sweep).get("name", "")), [sweep]) for sweep in sweeps]
     for offered in spec.function(sweeps):
         stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
-        yield Drawing(stem, warned(offered.draw, offered.shown or whole_sweeps))
+        yield Drawing(stem, warned(offered.draw, offered.shown or whole_sweeps, spec.without))
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
@@ -466,7 +482,7 @@ def _run_drawings(
         if spec.together:
             yield Drawing(stem, warned(partial(spec.function, shown, records), shown), figure=spec.name)
         elif len(folders) == 1:
-            yield Drawing(stem, warned(partial(spec.function, *opened[0]), shown))
+            yield Drawing(stem, warned(partial(spec.function, *opened[0]), shown, spec.without))
         elif len(specs) == 1:
             yield Drawing.without_picture(spec.name, "it shows one run; give one folder")
 

@@ -114,11 +114,16 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
         for part, text in zip(parts, texts, strict=True):
             part.append(text)
     texts = []
+    names = [str(curve.attrs["name"]) for curve in curves]
     for part, curve in zip(parts, curves, strict=True):
-        # An isolated curve has the keys of its main curve: its number tells it from that.
-        isola = curve.attrs.get("isola")
-        named = [*part, f"isola {isola}"] if part and isola else part
-        texts.append(", ".join(named) or str(curve.attrs["name"]))
+        # A curve that was found from another one has the keys of that: the rest of its name tells them apart.
+        name = str(curve.attrs["name"])
+        origin = min((other for other in names if name.startswith(f"{other}-")), key=len, default=name)
+        has_others = any(other.startswith(f"{name}-") for other in names)
+        named = [*part, name[len(origin) + 1 :].replace("-", " ")]
+        if origin == name and not part:
+            named = ["main curve" if has_others else name]
+        texts.append(", ".join(filter(None, named)))
     return texts
 
 

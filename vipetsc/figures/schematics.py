@@ -49,7 +49,11 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
     draw_unit_cell(upper, model.chain.cell, tuple(dict.fromkeys(model.chain.pairs)))
-    draw_lattice(lower, model.chain, model.drive_cell, model.gaps)
+    # The arrow of a wall that moves points at the wall.
+    cells = model.chain.cells
+    walls = {"left": -0.5 - 0.01 * cells, "right": cells - 0.5 + 0.01 * cells}
+    driven = walls.get(Case.of(run).drive.end or "", model.drive_cell)
+    draw_lattice(lower, model.chain, driven, model.gaps)
 
     title = "(a) Unit cell"
     differing = int(model.chain.differs.sum())

@@ -7,23 +7,26 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import QuadMesh
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from vipetsc import spectra
 from vipetsc.case import Case
+from vipetsc.case.strip import StripTable
 from vipetsc.figures import panels, style
 from vipetsc.figures.layout import lay_out
 from vipetsc.figures.movie_frames import WIDTH, CheckedShot, Shot
 from vipetsc.figures.style import NoPicture
 from vipetsc.io.read import field_time
+from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.plane import PlaneCell
 from vipetsc.spectra.wave_vectors import wave_vector_energies
 
 INSTANTS = 4  # of the snapshots
 DECADES = 4  # of energy that a map shows
 WIDE = 2.5  # a strip that is so many times as long as wide has its snapshots one below the other
+BRANCHES = 181  # points of a branch of the bands
 CONTOUR = 181  # points of a wave vector's component along which a line of equal frequency is drawn
 INCHES = 8.0  # width of a movie's page for which the sizes of type are chosen
 
@@ -47,7 +50,7 @@ class Strip(NamedTuple):
     def of(cls, run: xr.Dataset) -> Self:
         """Return the strip of a ``run``; raise NoPicture for another lattice, or a record with gaps."""
         case = Case.of(run)
-        section = case.lattice.cell and case.lattice.cell.from_strip
+        section = case.lattice.section_of_strip
         if not section:
             raise NoPicture("needs a strip of the plane ([lattice.strip])")
         cells = run["cell"].values
@@ -136,6 +139,46 @@ def _symmetric(values: np.ndarray) -> Normalize:
     return Normalize(-largest, largest)
 
 
+def bands(strip: StripTable, cell: UnitCell, frequency: float | None = None) -> Figure:
+    """Draw the bands of a ``strip``, whose wide cell is ``cell``, in colours of the wave number across it.
+
+    Between periodic edges that number tells branches apart: those of k and -k are a full and a dashed line, which
+    coincide where the lattice has a mirror. Between other edges colours show the half-waves of most energy.
+    """
+    plane = strip.plane_cell()
+    kappa = np.linspace(0, np.pi, BRANCHES)
+    if strip.edges == "periodic":
+        waves = 2 * np.pi * np.fft.fftfreq(strip.rows, 1.0)
+        frequencies = plane.frequencies(kappa[:, None], waves).reshape(BRANCHES, -1)
+        across = np.broadcast_to(np.repeat(waves, plane.dofs), frequencies.shape)
+    else:
+        point = bloch(cell, kappa)
+        frequencies = point.frequency
+        across = plane.across(point.vectors * np.sqrt(cell.masses)[:, None], kappa, strip.edges)
+
+    figure = style.new_figure(style.COLUMN, 3.0)
+    axes = figure.subplots()
+    points = np.stack(np.broadcast_arrays(kappa[:, None] / np.pi, frequencies / 1e3), axis=-1)
+    segments = np.stack([points[:-1], points[1:]], axis=2)
+    colours = across[:-1] / np.pi
+    for dashed in (False, True):
+        shown = (colours < 0) == dashed
+        # A line of many pieces has gaps by leaving out every third of them.
+        if dashed:
+            shown &= (np.arange(BRANCHES - 1) // 4 % 2 == 0)[:, None]
+        lines = LineCollection(segments[shown], array=np.abs(colours[shown]), cmap="viridis", lw=0.7)
+        lines.set_clim(0, 1)
+        axes.add_collection(lines)
+    passing = pass_bands(cell)
+    panels.shade_bands(axes, gaps(passing))
+    if frequency is not None:
+        axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
+    axes.set(xlim=(0, 1), ylim=(0, 1.08 * passing[-1].high / 1e3), xlabel=panels.KAPPA, ylabel=panels.OMEGA)
+    axes.set_title(f"{strip.rows} rows, {strip.edges} edges")
+    panels.colour_bar(lines, axes, "|Wavenumber across| (π rad/row)", extend="neither")
+    return figure
+
+
 def snapshots(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the displacement (m) of the first mass of every cell at four instants."""
     strip = Strip.of(run)
@@ -178,7 +221,7 @@ def envelope(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     axes = figure.subplots()
     mesh = strip.draw(axes, largest, panels.log_norm(largest, decades=DECADES), "inferno")
     axes.set_title("Largest kinetic energy of a cell at any time")
-    panels.colour_bar(mesh, axes, "Energy (J)")
+    panels.colour_bar(mesh, axes, "Energy (J)", cax=panels.bar_axes(axes))
     return figure
 
 
@@ -191,11 +234,12 @@ def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if not content.any():
         raise NoPicture("nothing moves at the last sample")
 
-    figure = style.new_figure(style.COLUMN, 3.0)
+    figure = style.new_figure(style.COLUMN, 2.6)
     axes = figure.subplots()
-    # The order of the transform, from -pi on.
-    along, across = (np.fft.fftshift(2 * np.fft.fftfreq(n, 1.0)) for n in content.shape)
-    shown = np.fft.fftshift(content)
+    # From -pi to pi: of an even number of cells -pi is the first wave vector, and the last one, too.
+    counts = content.shape
+    along, across = (2 * np.arange(-(n // 2), n // 2 + 1) / n for n in counts)
+    shown = content[np.ix_(*(np.arange(-(n // 2), n // 2 + 1) % n for n in counts))]
     image = panels.draw_map(axes, along, across, shown.T, panels.log_norm(shown, decades=DECADES), "viridis")
     frequency = Case.of(run).model().drive.frequency
     k = np.linspace(-np.pi, np.pi, CONTOUR)
@@ -206,7 +250,7 @@ def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     axes.set(xlim=(-1, 1), ylim=(-1, 1), xlabel="Along the strip (π rad/cell)", ylabel="Across (π rad/cell)")
     axes.set_aspect("equal")
     axes.set_title(f"t = {field_time(run)[-1]:.4g} s")
-    panels.colour_bar(image, axes, "Energy per wave vector (J)")
+    panels.colour_bar(image, axes, "Energy per wave vector (J)", cax=panels.bar_axes(axes))
     return figure
 
 
@@ -257,7 +301,7 @@ class StripMovie:
             cmap = "inferno"
             label = "Kinetic energy of a cell (J)"
         self._mesh = strip.draw(axes, self.content.wave[0], norm, cmap)
-        panels.colour_bar(self._mesh, axes, label, extend="neither")
+        panels.colour_bar(self._mesh, axes, label, extend="neither", cax=panels.bar_axes(axes))
         axes.set_title(Case.of(run).name)
         self._time = axes.text(1, 1.02, "", ha="right", va="bottom", transform=axes.transAxes, size=8)
         self._canvas = FigureCanvasAgg(figure)

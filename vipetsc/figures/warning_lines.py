@@ -14,13 +14,15 @@ MOST_WARNINGS = 4  # below a picture: the strip must not be higher than the pane
 MOST_NAMES = 4  # of members before a warning; of more their number is given
 
 
-def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], Figure]:
+def warned(make: Callable[[], Figure], shown: Sequence[Shown], without: Sequence[str] = ()) -> Callable[[], Figure]:
     """Return a function like ``make`` whose figure has the warnings of the results ``shown`` as lines of its label.
+
+    Those that contain one of the words ``without`` are left out.
 
     Results have them as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the
     picture.
     """
-    lines = warning_lines(shown)
+    lines = warning_lines(shown, without)
 
     def labelled() -> Figure:
         figure = make()
@@ -32,15 +34,17 @@ def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], F
     return labelled
 
 
-def warning_lines(shown: Sequence[Shown]) -> list[str]:
+def warning_lines(shown: Sequence[Shown], without: Sequence[str] = ()) -> list[str]:
     """Return the warnings of the results ``shown``, each once; if several names are shown, with those of its members.
 
-    Of sentences that differ only in numbers the first is given.
+    Of sentences that differ only in numbers the first is given; those with a word of ``without`` are left out.
     """
     by_kind: dict[str, list[str]] = {}
     names: dict[str, list[str]] = {}
     for member in shown:
         for sentence in _warnings(member):
+            if any(word in sentence for word in without):
+                continue
             kind = NUMBER.sub("0", sentence)
             by_kind.setdefault(kind, []).append(sentence)
             names.setdefault(kind, []).append(member.name)

@@ -1,5 +1,6 @@
 """Export of results to other programs: XDMF for ParaView, which reads ``run.h5`` itself, and curves as CSV."""
 
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.chunks import FORCES, MOTION
 from vipetsc.io.impacts import impacts
 from vipetsc.io.read import field_time, open_results, open_run
+from vipetsc.lattice.plane import KINDS
 from vipetsc.wording import with_unit
 
 # Samples that run.xdmf lists; of a run with more, every n-th. One takes about 1 kB, so that the text has 5 MB at most.
@@ -25,7 +27,10 @@ FIELDS = "displacement", "velocity"
 DESIGN_LABELS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
 # Second dimensions that variables of a frequency response may have. Their labels name the columns of its table.
 RESPONSE_LABELS = {"way", "site", "location", "pair", "wall"}
-HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
+Vectors = tuple[tuple[float, ...], tuple[float, ...]]
+SQUARE: Vectors = ((1.0, 0.0), (0.0, 1.0))
+HEAD = '<Xdmf Version="3.0"><Domain>\n'
+GRID = '<Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
 
@@ -43,35 +48,69 @@ def write_xdmf(folder: Path) -> Path | None:
         times = field_time(run)
         cells = run["cell"].values
         shape = run[next(iter(units))].shape
-        rows_of_strip = int(run["row"][-1]) if "row" in run.coords else None
+        across = shape[2]
+        vectors = SQUARE
+        if "row" in run.coords:
+            across = int(run["row"][-1])
+            vectors = _vectors(tomllib.loads(run.attrs["case"])["lattice"]["cell"]["from_strip"])
 
+    # Nodes that lie askew are listed, once for all frames. The others are a regular mesh, which each frame describes.
+    mesh = _mesh(cells, across, vectors)
+    head = HEAD
+    if vectors != SQUARE:
+        head += "".join(Xml.tostring(part, "unicode") + "\n" for part in mesh)
+        mesh = [Xml.Element(part.tag, Reference=f"/Xdmf/Domain/{part.tag}[1]") for part in mesh]
     # The XML is made once, since frames differ in two numbers only.
-    frame = _frame(cells, shape, units, rows_of_strip)
+    frame = _frame(shape, units, across, mesh)
     rows = range(0, shape[0], -(-shape[0] // MOST_FRAMES))
     frames = [frame.format(row=row, time=float(times[row])) for row in rows]
-    write_text(folder / "run.xdmf", HEAD + "".join(frames) + TAIL)
+    write_text(folder / "run.xdmf", head + GRID + "".join(frames) + TAIL)
     return folder / "run.xdmf"
 
 
-def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str], rows: int | None) -> str:
+def _vectors(strip: Mapping[str, Any]) -> Vectors:
+    """Return the vectors from a cell to the next one along and across, as the section of a ``strip`` has them."""
+    if strip["kind"] != "cell":
+        return KINDS[strip["kind"]](1.0, 1.0, 1.0).vectors
+    along, across = strip.get("vectors") or SQUARE
+    return tuple(along), tuple(across)
+
+
+def _mesh(cells: np.ndarray, across: int, vectors: Vectors) -> list[Xml.Element]:
+    """Return topology and geometry of the nodes of ``cells`` (i,), each with ``across`` ones.
+
+    Node j of cell i lies at i a_1 + j a_2, with the ``vectors`` a_1 and a_2.
+    """
+    # Cells are the slower axis, as in the datasets, and come first.
+    dimensions = _words((len(cells), across))
+    if vectors == SQUARE:
+        topology = Xml.Element("Topology", TopologyType="2DCoRectMesh", Dimensions=dimensions)
+        geometry = Xml.Element("Geometry", GeometryType="ORIGIN_DXDY")
+        # A single cell has no spacing of its own.
+        spacing = cells[1] - cells[0] if len(cells) > 1 else 1
+        _child(geometry, "DataItem", _words((cells[0], 1)), Dimensions="2", Format="XML")
+        _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")
+        return [topology, geometry]
+
+    topology = Xml.Element("Topology", TopologyType="2DSMesh", Dimensions=dimensions)
+    geometry = Xml.Element("Geometry", GeometryType="XY")
+    numbers = np.stack(np.meshgrid(cells, np.arange(1, across + 1), indexing="ij"), axis=-1)
+    positions = _words((numbers @ np.array(vectors)).ravel().tolist())
+    _child(geometry, "DataItem", positions, Dimensions=f"{dimensions} 2", Format="XML")
+    return [topology, geometry]
+
+
+def _frame(shape: tuple[int, ...], units: dict[str, str], across: int, mesh: list[Xml.Element]) -> str:
     """Return the text of a frame's grid, in which ``{row}`` and ``{time}`` are to be filled in.
 
-    ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``cells`` are those recorded,
-    ``rows`` the number of those of a strip, None for a chain.
+    ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``across`` is the number of
+    nodes of a cell, ``mesh`` their topology and geometry.
     """
-    across = rows or shape[2]
     masses = shape[2] // across
-    mesh = _words((shape[1], across))
+    nodes = _words((shape[1], across))
     grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")
     _child(grid, "Time", Value="{time!r}")
-    _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
-    geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
-    # Cells are the slower axis, as in the datasets, and come first; a single cell has no spacing of its own.
-    spacing = 1
-    if len(cells) > 1:
-        spacing = cells[1] - cells[0]
-    _child(geometry, "DataItem", _words((cells[0], 1)), Dimensions="2", Format="XML")
-    _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")
+    grid.extend(mesh)
 
     for name, unit in units.items():
         for mass in range(masses):
@@ -79,8 +118,8 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str], row
             number = f" {mass + 1}" if masses > 1 else ""
             about = {"Name": f"{name}{number} ({unit})", "AttributeType": "Scalar", "Center": "Node"}
             node = _child(grid, "Attribute", **about)
-            slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=mesh)
-            start_stride_count = f"{{row}} 0 {mass} 1 1 {masses} 1 {mesh}"
+            slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=nodes)
+            start_stride_count = f"{{row}} 0 {mass} 1 1 {masses} 1 {nodes}"
             _child(slab, "DataItem", start_stride_count, Dimensions="3 3", Format="XML")
             source = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
             _child(slab, "DataItem", f"run.h5:/{name}", **source)

@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import fft
 
 from vipetsc.lattice.cell import GROUND, Spring
 
@@ -98,6 +99,32 @@ class PlaneCell:
             matrix[..., end, start] -= block * phase.conj()
         root = 1 / self.roots
         return np.asarray(matrix * (root[:, None] * root))
+
+    def across(self, shapes: np.ndarray, kappa: ArrayLike, edges: Edges) -> np.ndarray:
+        """Return the wave number (..., branch) in rad/row across a strip that has most of the energy of each wave.
+
+        ``shapes`` (..., dof of the wide cell, branch) are amplitudes M^(1/2) U of waves along the strip with the phases
+        ``kappa`` (...) in rad/cell. Between free edges there are n half-waves on the rows, n = 0, 1, ..., between fixed
+        ones on the rows and one more.
+        """
+        rows = shapes.shape[-2] // self.dofs
+        fields = shapes.reshape(*shapes.shape[:-2], rows, self.dofs, shapes.shape[-1])
+        # Along a_2 the lattice may lean: what is a standing wave between two edges has a phase from row to row.
+        (x1, y1), (x2, y2) = self.vectors
+        lean = (x1 * x2 + y1 * y2) / (x1**2 + y1**2)
+        phase = np.asarray(kappa, float)[..., None] * lean * np.arange(rows)
+        standing = fields * np.exp(-1j * phase)[..., None, None]
+        if edges == "periodic":
+            waves = 2 * np.pi * np.abs(fft.fftfreq(rows))
+            parts = fft.fft(fields, axis=-3)
+        elif edges == "free":
+            waves = np.pi * np.arange(rows) / rows
+            parts = fft.dct(standing, axis=-3, norm="ortho")
+        else:
+            waves = np.pi * np.arange(1, rows + 1) / (rows + 1)
+            parts = fft.dst(standing, type=1, axis=-3, norm="ortho")
+        energy = np.sum(np.abs(parts) ** 2, axis=-2)
+        return np.asarray(waves[energy.argmax(axis=-2)])
 
     def wide_masses(self, rows: int) -> list[float]:
         """Return the masses (rows dofs,) in kg of the wide cell, in the order of its degrees of freedom."""

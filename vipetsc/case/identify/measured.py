@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
+from vipetsc.case.places import Place as CellPlace
 from vipetsc.case.points import masses_remedy
 from vipetsc.case.reading import MISSING
 from vipetsc.case.samples import WALL_UNITS, Place
@@ -28,6 +29,7 @@ class SensorTable(Section):
     column: Place = described("column: name or number from 1; of HDF5 a dataset, with [3] behind it its third column")
     cell: int | None = described("cell of the sensor, from 1", None, ge=1)
     mass: int | None = described("mass of the cell, from 1; default: 1", None, ge=1)
+    place: CellPlace | None = described("a strip: cell [i, j] or [i, j, mass], instead of cell and mass", None)
     drive: int | None = described("for a force: number of the drive, from 1; default: 1", None, ge=1)
     factor: Finite = described("factor that makes the values SI units", 1.0)
     noise: Positive | None = described(

@@ -56,7 +56,8 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     with locked(ALONE, folder):
         picture: dict[str, str] = {}
         if cell.joins_cells:
-            picture["picture"] = str(draw_bands(cell, folder / "bands.png", case.wave_frequency))
+            drawn = draw_bands(cell, folder / "bands.png", case.wave_frequency, case.lattice.section_of_strip)
+            picture["picture"] = str(drawn)
         text = json.dumps(numbers | picture | origin(), indent=2)
         write_text(folder / "bands.json", text + "\n")
 

@@ -4,12 +4,14 @@ import argparse
 import json
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vipetsc.case import Case, CaseError, Model, Problem, Sweep
+from vipetsc.case.points import PointTable
 from vipetsc.case.wave_at_sites import sends_one_wave, wave_over_clearance
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
 # What a run counts where a contact reaches a limit of the law or of the method, as a sentence that begins "n contacts".
 LIMITS = {
-    "grazes": "touched without an impact",
     "floored": "slower than contacts.approach_floor",
     "clipped": "cut off where damping would have pulled",
     "pulled": "pulled by damping for a moment",
@@ -169,7 +170,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         *_drive_rows(case),
         ("wave/clearance", _closing(model)),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
-        ("points", ", ".join(f"{p.name} (cell {p.cell}, mass {p.mass})" for p in case.output.points or [])),
+        ("points", ", ".join(map(partial(point_text, case), case.output.points or []))),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", engine),
         ("disk", f"{size / 2**20:.4g} MiB, twice that during the run; {free / 2**30:.4g} GiB free here"),
@@ -277,6 +278,14 @@ def run_table(result: "Result", faster: str = "", drives: Sequence[str] = ()) ->
         ("faster", faster),
     ]
     return f"{result.sentence}\n{table(rows)}"
+
+
+def point_text(case: Case, point: PointTable) -> str:
+    """Return the name of a named ``point`` and where it is."""
+    strip = case.lattice.section_of_strip
+    if strip:
+        return f"{point.name} {strip.place(point.cell, point.mass)}"
+    return f"{point.name} (cell {point.cell}, mass {point.mass})"
 
 
 def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
