@@ -86,20 +86,6 @@ def test_only_temporary_files_of_processes_that_have_ended_are_removed(tmp_path,
     assert {*tmp_path.iterdir()} == {*others, written}
 
 
-def test_temporary_names_are_not_those_of_another_host_process_or_call(tmp_path, monkeypatch):
-    """Temporary names differ between hosts, processes and calls."""
-    names = set()
-    # Folders are shared between hosts; a thread of the same process may write the same file at once.
-    for host, process in (("one", 7), ("two", 7), ("two", 8), ("two", 8)):
-        monkeypatch.setattr("platform.node", lambda host=host: host)
-        monkeypatch.setattr(os, "getpid", lambda process=process: process)
-        with atomic_write(tmp_path / "a") as temporary:
-            temporary.touch()
-        assert f"{host}-{process}" in temporary.name
-        names.add(temporary.name)
-    assert len(names) == 4
-
-
 def open_and_close_run(path: Path) -> None:
     with open_run(path):
         pass
@@ -120,19 +106,6 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, name, read, content):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(OSError, match=str(path)):
-        read(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "read"), [("arrays.h5", StoredArrays), ("a.h5", lambda path: open_netcdf(path, "run"))]
-)
-def test_a_file_cut_in_the_middle_is_named(tmp_path, name, read):
-    """A file of which the second half is missing raises OSError with its name."""
-    path = tmp_path / name
-    WRITERS[name](path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(OSError, match=str(path)):
         read(path)
 

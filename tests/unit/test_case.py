@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vipetsc.case import Case, CaseError, DesignCase, LawCase, case_id
+from vipetsc.case import Case, CaseError, LawCase, case_id
 from vipetsc.case.resolve import _round_down
 from vipetsc.lattice import Contact
 
@@ -65,13 +64,6 @@ def test_the_builtin_case_lasts_until_the_wave_has_crossed():
     assert crossed - model.sample_interval < model.end < crossed
     assert model.samples == 4421
     assert model.scale == pytest.approx(2.42261e-3, rel=1e-5)
-
-
-@pytest.mark.parametrize(("preset", "site", "clearance"), [("four-band", 100, 10**-2.75), ("diatomic", 150, 2e-4)])
-def test_a_single_site_has_the_papers_cell_and_clearance(preset, site, clearance):
-    case = Case.from_table({"lattice": {"preset": preset}, "contacts": {"sites": 1}})
-    assert case.contacts.sites == [site]
-    assert case.contacts.clearance == [pytest.approx(clearance)]
 
 
 @pytest.mark.parametrize("wavenumber", ["5pi/9", "5*pi/9", 5 * np.pi / 9])
@@ -146,38 +138,10 @@ def test_tolerances_of_the_paper_are_a_billionth_of_its_amplitude():
     assert Case.load(overrides=["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
 
 
-def test_unknown_keys_name_the_nearest():
-    """An unknown key is refused with the nearest valid key."""
-    found = problems({"lattice": {"cels": 3}, "contcts": {}, "drive": {"amplitud": 1.0}})
-    assert "did you mean lattice.cells?" in found["lattice.cels"]
-    assert "did you mean contacts?" in found["contcts"]
-    assert "did you mean drive.amplitude?" in found["drive.amplitud"]
-
-
 def test_a_misspelt_choice_and_an_unknown_section_name_the_nearest():
     found = problems({"contacts": {"law": "hertzz"}}, "desing.wavenumbers=5")
     assert "did you mean 'hertz'?" in found["contacts.law"]
     assert "did you mean design?" in found["desing"]
-
-
-def test_a_value_of_no_type_of_its_key_is_refused_with_all_types():
-    """A value of a wrong type is refused with all types that its key may have."""
-    assert "must be a number or 'traverse'" in problems({}, "time.end='foo'")["time.end"]
-    scaled = problems({}, "time.atol='scale'")["time.atol"]
-    assert "must be a number or 'scaled' or 'paper'; did you mean 'scaled'?" in scaled
-    assert "must be a whole number, a list or a table" in problems({}, "contacts.sites='a'")["contacts.sites"]
-    # ``[drive.more]`` in a file is a single table, where the key takes a list of tables.
-    more = problems({"drive": {"more": {"amplitude": 1.0}}})["drive.more"]
-    assert more.endswith("must be a valid list of tables; write [[drive.more]]")
-    # An item of a list is not a value of the key.
-    assert "must be a valid integer" in problems({}, "contacts.sites=[1, 'a']")["contacts.sites[2]"]
-    assert "must be greater than 0" in problems({}, "time.end=-1")["time.end"]
-    assert "equal to 1e-14" in problems({}, "time.rtol=0")["time.rtol"]
-
-
-def test_an_override_below_a_value_is_refused():
-    found = problems({"lattice": {"cells": 40}}, "lattice.cells.x=3")
-    assert "lattice.cells is a value, not a section" in found["--set lattice.cells.x"]
 
 
 def test_a_check_that_rests_on_an_invalid_key_is_left_out():
@@ -186,12 +150,6 @@ def test_a_check_that_rests_on_an_invalid_key_is_left_out():
         Case.from_table(PLAIN | {"contacts": PLAIN["contacts"] | {"clearance": -1.0}})
     assert [problem.key for problem in caught.value.problems] == ["contacts.clearance"]
     assert "greater than or equal to 0" in str(caught.value)
-
-
-def test_samples_are_counted_and_held_against_the_bands():
-    """A number of samples that resolves the bands is taken; one that does not is refused."""
-    assert "too coarse" in problems({"time": {"samples": 20}})["time.samples"]
-    assert Case.from_table({"time": {"samples": 5000}}).model().samples == 5000
 
 
 @given(end=st.floats(0.5, 100.0), interval=st.floats(1e-3, 0.5) | st.just("auto"))
@@ -219,55 +177,11 @@ def test_the_identity_of_a_case_stays_what_folders_on_disk_bear():
     assert case_id(Case.from_table(PLAIN, ["drive.amplitude=2.0"])) != case_id(Case.from_table(PLAIN))
 
 
-def test_a_result_names_its_case():
-    case = Case.from_table(PLAIN)
-    assert Case.of(xr.Dataset(attrs={"case": case.to_toml()})) == case
-
-
-def test_the_design_searches_eta_below_one():
-    """The default grid of eta ends below 1, where the host would have no mass."""
-    eta = DesignCase.load().design.eta.values()
-    assert len(eta) == 36
-    assert eta.max() == 0.975
-
-
-def test_a_cell_of_ones_own_is_checked_whole():
-    cell = {"masses": [1.0, -2.0], "springs": [{"start": 1, "end": 3, "stiffness": 0.0}], "contact": [1, 1]}
-    found = problems({"lattice": {"cell": cell}, "drive": {"frequency": 10.0}})
-    keys = {"lattice.cell.masses[2]", "lattice.cell.springs[1]", "lattice.cell.contact", "lattice.cell.springs"}
-    assert keys <= found.keys()
-
-
-def test_a_frequency_in_a_gap_is_a_warning_only():
-    case = Case.load(overrides=["drive.frequency=650.0"])
-    assert any("no pass band" in warning for warning in case.warnings())
-    assert not Case.load().warnings()
-
-
 def test_errors_travel_between_ranks():
     """A CaseError is the same after pickling."""
     with pytest.raises(CaseError) as caught:
         Case.load(overrides=["lattice.cels=3"])
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-
-
-@pytest.mark.slow
-@given(st.text(max_size=30), st.text(max_size=10))
-def test_any_override_is_taken_or_refused(key, value):
-    """An override that makes no sense raises a CaseError with its problems, and no other exception."""
-    try:
-        Case.load(overrides=[f"{key}={value}"])
-    except CaseError as error:
-        assert error.problems
-
-
-def test_exact_damping_is_chosen_by_the_case():
-    """The key ``damping = "exact"`` yields the restitution 0.7; the paper's damping, the default, yields 0.768."""
-    exact = Case.load(overrides=["contacts.damping=exact"]).model().contact
-    assert exact.effective_restitution == pytest.approx(0.7)
-    # The paper's damping returns more than is asked.
-    assert Case.load().model().contact.effective_restitution == pytest.approx(0.768, abs=1e-4)
-    assert case_id(Case.load(overrides=["contacts.damping=paper"])) == case_id(Case.load())
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import pickle
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -17,7 +15,7 @@ import xarray as xr
 import vipetsc
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase, Sweep
-from vipetsc.case.html import cell_svg, html_table
+from vipetsc.case.html import cell_svg
 from vipetsc.lattice import Spring, UnitCell, four_band
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.branches.follow import follow_all
@@ -71,19 +69,6 @@ def test_bad_input_is_refused_as_in_a_file():
         Sweep(**TABLE)
 
 
-def test_signatures_name_the_sections():
-    """Completion and help have the sections of each verb's case."""
-    assert list(inspect.signature(Case).parameters) == ["name", *Case.sections()]
-    assert {"disorder", "drive", "sweep"} <= inspect.signature(Sweep).parameters.keys()
-    assert "law" in inspect.signature(LawCase).parameters
-
-
-def test_a_case_in_code_can_be_sent():
-    """Pickling keeps a case, which other ranks get."""
-    case = Case(**TABLE)
-    assert pickle.loads(pickle.dumps(case)) == case
-
-
 def drawing(cell: UnitCell, pair: Pair | None) -> list[str]:
     """Return the kinds of the elements of a cell's drawing, which is sound XML."""
     root = ElementTree.fromstring(cell_svg(cell, pair))
@@ -119,26 +104,6 @@ def test_every_cell_can_be_drawn():
     assert drawing(lone, Pair(-1, 0)).count("polyline") == 3
     apart = UnitCell((0.1, 0.2, 0.3), (Spring(0, 0, 1e3, offset=1), Spring(1, 2, 1e3)), 0, 1)
     assert drawing(apart, Pair(0, 1)).count("circle") == 4
-
-
-def test_text_in_a_table_is_text():
-    """Titles and values are escaped, hence are no markup; rows without a value are left out."""
-    html = html_table("<b>", [("a", "x < y"), ("gone", None), ("none", "")])
-    assert "&lt;b&gt;" in html
-    assert "x &lt; y" in html
-    assert "gone" not in html
-    # An empty text is left out like None.
-    assert "none" not in html
-
-
-def test_a_notebook_shows_what_a_sweep_varies():
-    """The table of a sweep lists each key that varies with its values, and its title has the number of members."""
-    values = {"amplitude": [1.0, 2.0], "cycles": list(range(1, 13))}
-    html = Sweep(**TABLE, sweep={"drive": values})._repr_html_()
-    assert "<b>case: 24 members</b>" in html
-    assert "drive.amplitude</th>" in html
-    assert ">1.0, 2.0<" in html
-    assert ">1, 2, 3, 4, 5, 6, 7, 8, ... (12)<" in html
 
 
 def test_the_drawing_has_room_for_every_mass_of_the_next_cell():

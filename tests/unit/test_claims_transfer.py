@@ -10,8 +10,7 @@ import xarray as xr
 from tests.unit.claim_files import measure, put_sweep
 from vipetsc.case import Case
 from vipetsc.io.netcdf import write_netcdf
-from vipetsc.paper.claims.criteria import HOLDS, IN_PART, LAWS
-from vipetsc.paper.claims.evidence import Evidence, MissingEvidence
+from vipetsc.paper.claims.criteria import HOLDS, IN_PART
 
 # Amplitude in N of the first contact; the transfer jumps there and decays from there on.
 ONSET = 17.0
@@ -52,31 +51,6 @@ def put_transfer(
 
 
 @pytest.mark.slow
-def test_transfer_that_never_sets_in_is_measured(tmp_path):
-    """Without contacts the transfer has a floor and no onset, and its maximum is that of the floor."""
-    put_transfer(tmp_path, maximum=0.0)
-    onset = measure("C11", tmp_path)
-    assert onset.verdict == IN_PART
-    assert onset.value["ratio of amplitudes from the floor to half the maximum, hertz"] is None
-    assert onset.value["maximum, hertz"] == pytest.approx(2e-6)
-
-
-@pytest.mark.slow
-def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
-    """A selection by two keys of a zipped axis finds their common member, and refuses values that have none."""
-    put_transfer(tmp_path)
-    with Evidence(tmp_path) as evidence:
-        single = evidence.select("interband", "calibrated", law="bilinear", sites=1, cycles=30)
-        assert single["sites"].item() == 1
-        assert single["cycles"].item() == 30
-        assert single["law"].item() == "bilinear"
-        assert single["ibtet"].dims == ("amplitude",)
-
-        with pytest.raises(MissingEvidence, match=r"reading = calibrated, sites = 1, cycles = 15"):
-            evidence.select("interband", "calibrated", sites=1, cycles=15)
-
-
-@pytest.mark.slow
 def test_transfer_as_the_paper_has_it_holds(tmp_path):
     """Claims C11 and C14 hold for a transfer as in the paper; the floor without the record's ends is a fiftieth."""
     put_transfer(tmp_path)
@@ -91,56 +65,6 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
     assert single.verdict == HOLDS
     assert single.value["correlation of 15 and 30 cycles, hertz"] == pytest.approx(1.0)
     assert single.uncertainty["amplitudes, hertz"] == 17
-
-
-def put_scatter(root: Path) -> None:
-    """Write four samples of scattered clearances at one amplitude for each law and number of sites.
-
-    The transfer of each sample deviates from the amplitude as its first clearance does from the nominal one.
-    """
-    rows = [(law, sites) for sites in (5, 1) for law in LAWS]
-    table = {
-        "lattice": {"preset": "four-band", "reading": "calibrated"},
-        "disorder": {"clearance": {"relative": 0.02}},
-        "sweep": {
-            "measures": ["transfer"],
-            "zip": [["contacts.law", "contacts.sites", "drive.amplitude"]],
-            "lattice": {"reading": ["calibrated"]},
-            "contacts": {"law": [law for law, _ in rows], "sites": [sites for _, sites in rows]},
-            "drive": {"amplitude": [20.0, 21.0, 22.0, 23.0]},
-            "disorder": {"seed": {"count": 4}},
-        },
-    }
-    nominal = {}
-    for count in (5, 1):
-        nominal[count] = Case.from_table({"contacts": {"sites": count}}).contacts.clearance[0]
-
-    def content(case: Case) -> dict[str, Any]:
-        clearance = case.contacts.clearance[0]
-        return {"ibtet": case.drive.amplitude * clearance / nominal[len(case.contacts.sites)]}
-
-    put_sweep(root / "interband-scatter", table, content, episodes=lambda case: 1, analyses=False)
-
-
-@pytest.mark.slow
-def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
-    """Scatter adds a mean and a deviation to claims C11 and C14, and changes neither verdict nor threshold."""
-    put_transfer(tmp_path)
-    before = {claim: measure(claim, tmp_path) for claim in ("C11", "C14")}
-    put_scatter(tmp_path)
-
-    for claim, law, amplitude in (("C11", "bilinear", 21.0), ("C14", "hertz", 22.0)):
-        found = measure(claim, tmp_path)
-        name = f"4 samples of 2 % clearance scatter at {amplitude:.4g} N, {law}"
-        mean = found.value[f"mean of {name}"]
-        deviation = found.uncertainty[f"deviation of the {name}"]
-        # Bounds for four samples of a normal deviation of 2 %, of the order of that deviation.
-        assert 0 < abs(mean / amplitude - 1) < 0.05
-        assert 0.002 < deviation / amplitude < 0.06
-
-        assert found.verdict == before[claim].verdict
-        assert found.threshold == before[claim].threshold
-        assert len(found.value) == len(before[claim].value) + 2
 
 
 @pytest.mark.parametrize(

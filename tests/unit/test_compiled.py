@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import subprocess
 import sys
@@ -15,7 +14,6 @@ import pytest
 
 import vipetsc
 from vipetsc import compiled
-from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
 ROOT = Path(vipetsc.__file__).parent
 CONSTANTS = "SCALE = 2.0\n"
@@ -98,16 +96,6 @@ def test_code_is_found_again_until_any_source_changes(small):
     assert len(stored(small.cache)) == count
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.5])
-def test_files_that_are_cut_off_are_compiled_anew(small, kept):
-    """A machine that loses its power leaves files without a part of their contents."""
-    small.ask()
-    for path in stored(small.cache):
-        content = path.read_bytes()
-        path.write_bytes(content[: int(kept * len(content))].rstrip(pickle.STOP))
-    assert small.ask() == [12.0, 7.0, 0, 0]
-
-
 def test_without_a_writable_cache_code_is_compiled_at_every_start(small):
     """The package is then read-only, and so is the home; one line says so."""
     for room in ("contact", "lattice"):
@@ -116,12 +104,6 @@ def test_without_a_writable_cache_code_is_compiled_at_every_start(small):
     for _ in range(2):
         assert small.ask(**nowhere) == [12.0, 7.0, 0, 0]
         assert small.ask.errors.count("NUMBA_CACHE_DIR") == 1
-
-
-def test_two_processes_may_compile_at_once(small):
-    processes = [small.start() for _ in range(2)]
-    assert [process.communicate()[0].split()[:2] for process in processes] == [["12.0", "7.0"]] * 2
-    assert small.ask() == [12.0, 7.0, 1, 1]
 
 
 def test_tables_of_numbers_come_with_the_package():
@@ -134,18 +116,6 @@ def test_tables_of_numbers_come_with_the_package():
     assert {path for path in (ROOT / "examples").glob("*.*") if path.is_file()} <= shipped
 
 
-def test_importing_the_package_changes_no_environment():
-    code = """
-import os
-import sys
-before = dict(os.environ)
-import vipetsc
-assert before == dict(os.environ)
-assert not {"numba", "petsc4py", "mpi4py"} & sys.modules.keys()
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)
-
-
 def test_every_kernel_is_kept_so():
     """Kernels lie in rooms whose sources are looked at, and no module but ``compiled`` uses numba's own decorators."""
     for path in ROOT.rglob("*.py"):
@@ -154,10 +124,3 @@ def test_every_kernel_is_kept_so():
             assert not re.search(r"from numba import .*jit|numba\.(n?jit|cfunc)\b", text), path
         if "from vipetsc.compiled import" in text:
             assert path.relative_to(ROOT).parts[0] in compiled.ROOMS, path
-
-
-@pytest.mark.slow
-def test_the_callback_of_petsc_is_found_again():
-    compile_callback()
-    code = "from vipetsc.dynamics.ts.right_hand_side import compile_callback; print(compile_callback().cache_hits)"
-    assert int(subprocess.check_output([sys.executable, "-c", code], cwd=ROOT.parent)) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,12 @@ import pytest
 from tests.conftest import put_members, small_case
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.disorder import SCATTERED, Deviation, DisorderTable, values_of
-from vipetsc.case.quantities import table_of
 from vipetsc.case.verb_cases import disorder_of
 from vipetsc.cli.verbs.validate_verb import disorder_rows
 from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
-from vipetsc.lattice import Spring, UnitCell, contact_stiffness, pass_bands
-from vipetsc.studies.linear_run import linear_name
+from vipetsc.lattice import pass_bands
 
 BASE = {"name": "small", "lattice": {"preset": "four-band", "cells": 40}, "drive": {"cycles": 4}}
 CLEARANCE = 2e-3
@@ -68,12 +66,6 @@ def test_a_seed_gives_the_same_bits_whatever_else_is_drawn():
     assert fewer_sites.contacts.clearance == one.contacts.clearance[:2]
 
 
-def test_different_quantities_are_drawn_independently():
-    masses = Deviation(relative=1.0).draw(np.ones(4), 3, "masses")
-    springs = Deviation(relative=1.0).draw(np.ones(4), 3, "springs")
-    assert not np.isclose(masses, springs).any()
-
-
 def test_a_deviation_of_zero_leaves_the_case_as_it_is_without_the_section():
     """Deviations of zero give the text of the nominal case."""
     quantities = ("clearance", "masses", "springs", "restitution", "stiffness")
@@ -113,16 +105,6 @@ def test_sites_move_by_whole_cells():
     assert np.abs(np.subtract(case.contacts.sites, [10, 30])).max() <= 6
 
 
-@pytest.mark.slow
-def test_samples_of_contacts_alone_have_one_linear_run():
-    """Samples that differ in contacts alone have one linear run, and samples with other masses one each."""
-    contacts = {"clearance": {"relative": 0.1}, "restitution": {"absolute": 0.02}}
-    by_contacts = {linear_name(draw(seed=seed, **contacts)) for seed in range(3)}
-    by_cells = {linear_name(draw(seed=seed, masses={"relative": 0.1})) for seed in range(3)}
-    assert by_contacts == {linear_name(draw())}
-    assert len(by_cells | by_contacts) == 4
-
-
 def test_the_clearances_of_the_two_sides_are_drawn_independently():
     """Clearances on the side w < 0 have numbers of their own, and those on the side w > 0 are as without them."""
     scatter = {"seed": 2, "clearance": {"relative": 0.05}}
@@ -156,26 +138,6 @@ def test_a_stop_that_touches_does_not_scatter():
     assert re.fullmatch(r"normal, deviation 1 %; seed 0: times 1, (1\.0|0\.9)\d+", text)
 
 
-def test_a_deviation_is_described_with_its_size_and_distribution():
-    assert str(Deviation(relative=0.05)) == "normal, deviation 5 %"
-    assert str(Deviation(absolute=2e-5, distribution="lognormal")) == "lognormal, deviation 2e-05"
-
-
-def test_a_restitution_is_drawn_for_every_site():
-    """Restitutions are drawn for every site, and stand in the list of the sites or, for one site, in the common key."""
-    case = draw(seed=3, restitution={"relative": 0.05})
-    drawn = case.contacts.each.restitution
-    assert len(set(drawn)) == 10
-    assert drawn == pytest.approx([0.7] * 10, rel=0.3)
-    assert [law.restitution for law in case.model().laws] == drawn
-    assert case.contacts.restitution == 0.7
-    assert Case.from_toml(case.to_toml()) == case
-
-    one = draw({"sites": [5], "clearance": CLEARANCE}, seed=3, restitution={"relative": 0.05}).contacts
-    assert one.each is None
-    assert one.restitution == drawn[0]
-
-
 def test_a_cell_with_scattered_springs_keeps_their_nonlinear_parts_and_dashpots():
     table = EVERYTHING
     nominal = Case.from_table(table).lattice.unit_cell()
@@ -186,15 +148,6 @@ def test_a_cell_with_scattered_springs_keeps_their_nonlinear_parts_and_dashpots(
         assert replace(after, stiffness=before.stiffness) == before
     assert cell.grounding == (0.2, 0.1)
     assert (cell.springs[0].cubic, cell.springs[0].quadratic) == (3e9, -2e6)
-
-
-def test_a_cell_that_is_written_out_keeps_all_that_its_springs_have():
-    # Every optional number of a spring, coefficients of its force among them.
-    numbers = {field.name: 0.5 + i for i, field in enumerate(fields(Spring)) if isinstance(field.default, float)}
-    assert {"damping", "quadratic", "cubic"} <= numbers.keys()
-    springs = (Spring(0, 0, 3.0, offset=1, **numbers), Spring(0, 1, 4.0), Spring(-1, 1, 5.0))
-    cell = UnitCell(masses=(1.0, 2.0), springs=springs, host=0, resonator=1, grounding=(0.0, 0.1))
-    assert UnitCell(*table_of(cell).arguments()) == cell
 
 
 SPRINGS = [
@@ -345,25 +298,3 @@ def test_a_modulus_scales_the_stiffness_of_sites_with_radii_of_their_own():
     assert abs(ratio - 1) > 1e-3
     assert drawn.each.stiffness[1] == pytest.approx(ratio * plain.each.stiffness[1], rel=1e-15)
     assert drawn.stiffness == pytest.approx(ratio * plain.stiffness, rel=1e-15)
-
-
-def test_radii_of_the_sites_complete_the_material_of_all():
-    """Sites with radii of their own take the common modulus and Poisson ratio, also with scatter, without a preset."""
-    springs = [{"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 6e3}]
-    contacts = {"sites": [5, 9], "clearance": CLEARANCE, "modulus": 1e8, "poisson": 0.3}
-    lattice = {"cells": 20, "cell": {"masses": [0.01, 0.004], "springs": springs}}
-    table = {"lattice": lattice, "drive": {"frequency": 900.0}}
-    radii = {"radius": [0.004, 0.005]}
-
-    case = Case.from_table(table | {"contacts": contacts | {"each": radii}})
-    stiffness = [contact_stiffness(1e8, radius, 0.3) for radius in radii["radius"]]
-    assert [law.stiffness for law in case.model().laws] == pytest.approx(stiffness)
-    assert Case.from_toml(case.to_toml()) == case
-
-    scattered = table | {"contacts": contacts | {"each": radii}, "disorder": {"modulus": {"relative": 0.1}}}
-    first, second = Case.from_table(scattered).model().laws
-    assert first.stiffness / stiffness[0] == pytest.approx(second.stiffness / stiffness[1])
-    assert first.stiffness != pytest.approx(stiffness[0], rel=1e-3)
-
-    with pytest.raises(CaseError, match=r"contacts\.modulus: missing; needed for the stiffness of each site"):
-        Case.from_table(table | {"contacts": {key: contacts[key] for key in ("sites", "clearance")} | {"each": radii}})

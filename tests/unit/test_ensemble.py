@@ -12,8 +12,8 @@ import xarray as xr
 from tests.conftest import put_members, record_of_linear
 from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
-from vipetsc.io.read import curves, open_ensemble, select
-from vipetsc.io.records import RecordFile, read_records
+from vipetsc.io.read import open_ensemble, select
+from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.paper.engines import agreement, sampled
 from vipetsc.sources import source_key
@@ -100,13 +100,6 @@ def test_a_sample_is_compared_member_by_member(folder, tmp_path):
         assert row["largest"] == pytest.approx(5e-4 if row["agrees"] else 2e-3)
 
 
-def test_a_sample_needs_amplitudes_to_be_drawn_from():
-    """A sweep in which the amplitude does not vary is refused with its name, instead of a bare StopIteration."""
-    table = {"name": "lengths", "lattice": {"preset": "four-band"}, "sweep": {"lattice": {"cells": [60, 80]}}}
-    with pytest.raises(ValueError, match=r"lengths: drive\.amplitude does not vary"):
-        sampled(Sweep.from_table(table), 2, 1)
-
-
 @pytest.mark.slow
 def test_every_member_stands_at_the_values_of_its_keys(folder):
     """Every member has its place by the values of its keys, zipped ones too; a failed member has NaN and a status."""
@@ -140,16 +133,6 @@ def test_every_member_stands_at_the_values_of_its_keys(folder):
     ]
     assert json.loads(ensemble.attrs["rtol"]) == [1e-10]
     assert json.loads(ensemble.attrs["engine"]) == ["ts"]
-
-
-def test_a_curve_comes_with_its_first_member(folder):
-    sweep = Sweep.from_table(SWEEP)
-    found = list(curves(open_ensemble(folder)))
-    assert len(found) == 6
-    for curve, first in found:
-        case = sweep.case(first)
-        assert curve["law"].item() == case.contacts.law
-        assert curve["cycles"].item() == case.drive.cycles
 
 
 def test_a_power_law_is_fitted_from_the_largest_value_on():
@@ -241,13 +224,6 @@ def test_the_exponent_of_an_entropy_does_not_depend_on_the_range_of_amplitudes(e
     assert abs(normalised[0] - normalised[1]) > 0.1
 
 
-def test_a_curve_that_reaches_zero_behind_its_peak_has_no_fit():
-    """No power law reaches zero: an entropy that does is left without a fit."""
-    fit = fit_curve(np.geomspace(1.0, 8.0, 5), np.array([1.0, 3.0, 2.0, 0.0, 0.5]), normalise=False)
-    assert (fit["peak"], fit["points"]) == (3.0, 4)
-    assert np.isnan(fit["exponent"])
-
-
 def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
     """Return a run whose hosts have their largest velocities at the times ``peak`` (cell,), resonators 0.1 s later."""
     cell = four_band()
@@ -321,31 +297,6 @@ def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
     again = read_linear(folder, case)
     assert again.record("") == run.record("")
     assert again.arrival_at(2) == 0.2
-
-
-def test_records_of_other_sources_count_as_missing(folder):
-    sweep = Sweep.from_table(SWEEP)
-    run = LinearRun(
-        envelope=np.array([1.0, 2.0]),
-        arrival=np.array([0.1, 0.2]),
-        statistics={"work": 3.0},
-        measures={7: {"ibtet": 0.1}},
-    )
-    RecordFile(folder / "members-1.jsonl").append(record_of_linear(run, linear_name(Case.load())))
-    results = Results(sweep, folder)
-    assert not (results.status == MISSING).any()
-    assert results.linear
-
-    for path in folder.glob("*.jsonl"):
-        records = [record for record, _ in read_records(path, pytest.fail)]
-        path.unlink()
-        file = RecordFile(path)
-        for record in records:
-            file.append(record | {"source": f"{record['source']}0"})
-        file.close()
-    older = Results(sweep, folder)
-    assert (older.status == MISSING).all()
-    assert not older.linear
 
 
 def test_the_latest_record_counts_but_no_failure_after_a_success(folder):

@@ -9,7 +9,6 @@ import pytest
 
 from vipetsc.case import VERB_CASES, Case, CaseError, CaseFile, DesignCase, NnmCase
 from vipetsc.case.features import FEATURES
-from vipetsc.case.verb_cases import OF_SECTION, SECTIONS
 
 CELL = {
     "masses": [1.0, 2.0],
@@ -104,20 +103,9 @@ def test_normal_modes_refuse_what_they_give_a_reason_for(feature):
     assert (key in refused_keys(NnmCase, changes | of_chain)) == (feature in NnmCase.refuses)
 
 
-def test_every_verb_has_a_name_and_a_section_of_its_own():
-    assert len({kind.verb for kind in VERB_CASES}) == len(VERB_CASES)
-    assert len({kind.section for kind in VERB_CASES}) == len(VERB_CASES)
-
-
 def test_a_plain_run_accepts_every_feature():
     assert VERB_CASES[0] is Case
     assert not Case.section
     assert not Case.refuses
     assert FEATURES.keys() == CHANGES.keys()
     assert all(kind.refuses.keys() <= FEATURES.keys() for kind in VERB_CASES)
-
-
-def test_sections_are_in_the_order_of_the_verbs():
-    verbs = [kind.verb for kind in VERB_CASES[1:]]
-    assert [*OF_SECTION] == verbs
-    assert [*SECTIONS][-len(OF_SECTION) :] == verbs

@@ -13,15 +13,11 @@ from mpi4py import MPI
 
 import pytest
 
-from vipetsc.io import lock
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import Claim, FolderError, claimed
-from vipetsc.io.kinds import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP
+from vipetsc.io.kinds import BRANCHES, KINDS, PAPER, RUN
 from vipetsc.io.lock import locked
 
-ROOT = Path(__file__).parents[2]
-# A file by which the kind of a folder is recognised.
-SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "ensemble.h5", PAPER: "plan.json"}
 # The case of the results in a folder, and the case of a later command.
 OLD = "a = 1\n"
 NEW = "a = 2\n"
@@ -62,32 +58,6 @@ def test_a_new_folder_gets_its_marker(tmp_path, kind):
     # The lock is removed with the claim.
     assert names_in(folder) == {kind.marker}
     assert (folder / kind.marker).read_text() == OLD
-
-
-def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
-    """``--force`` replaces neither a file nor a folder of another kind or without a marker."""
-    (tmp_path / "file").touch()
-    assert_refused("is a file", tmp_path / "file", RUN, OLD, force=True)
-    assert_refused("choose another --out", tmp_path, RUN, OLD, force=True)
-
-    for kind, file in SHOWN.items():
-        folder = tmp_path / kind.noun
-        with claim(folder, kind, OLD):
-            (folder / file).touch()
-        for other in KINDS:
-            if other is not kind:
-                assert_refused("choose another --out", folder, other, OLD, force=True)
-        assert names_in(folder) == {kind.marker, file}
-
-
-def test_the_same_case_is_resumed_and_nothing_is_touched(run):
-    """A claim with the case of the folder goes on with its results and does not write its case file again."""
-    # The time of the last change would differ if the file were written again with the same bytes.
-    before = (run / "case.toml").stat()
-    for resume in (False, True):
-        with claim(run, RUN, OLD, resume=resume) as work:
-            assert work.going_on
-    assert (run / "case.toml").stat() == before
 
 
 @pytest.mark.parametrize("resume", [False, True])
@@ -194,15 +164,6 @@ def test_the_folder_in_which_one_works_is_replaced_too(run, monkeypatch):
     assert (run / "case.toml").read_text() == NEW
 
 
-def test_folders_in_the_folder_of_a_sweep_are_its_members(tmp_path):
-    folder = tmp_path / "sweep"
-    with claim(folder, SWEEP, OLD):
-        (folder / "ensemble.h5").touch()
-        (folder / "000-amplitude").mkdir()
-    with claim(folder, SWEEP, OLD, force=True):
-        assert names_in(folder) == {"case.toml", ".lock"}
-
-
 def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
     for name in ("parts", "figures"):
         (tmp_path / name).mkdir()
@@ -216,16 +177,6 @@ def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
         assert not work.going_on
     assert names_in(tmp_path) == {"case.toml", "parts", "figures"}
     assert not names_in(tmp_path / "figures")
-
-
-def test_verbs_without_results_of_their_own_remove_such_files_too(tmp_path):
-    """``analyse`` and ``plot`` lock a folder that they do not claim: leftovers go, also in the folders of members."""
-    (tmp_path / "member").mkdir()
-    for name in (".ensemble.h5.host-7-ab.part", "member/.analysis.h5.host-7-cd.part", "member/.lock"):
-        (tmp_path / name).touch()
-    with locked(MPI.COMM_SELF, tmp_path):
-        assert names_in(tmp_path) == {".lock", "member"}
-        assert not names_in(tmp_path / "member")
 
 
 def test_a_file_that_another_command_writes_stays(tmp_path):
@@ -269,18 +220,7 @@ def written_at(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("run",),
-        ("run", "--force", "--set", "time.end=0.1"),
-        ("run", "--resume"),
-        ("sweep", ROOT / "runs/examples" / "scattering-amplitudes.toml"),
-        ("nnm", ROOT / "runs/examples" / "nnm-cubic.toml"),
-        ("design",),
-        ("paper", "--quick"),
-    ],
-)
+@pytest.mark.parametrize("command", [("run", "--force", "--set", "time.end=0.1"), ("paper", "--quick")])
 def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command):
     """Every verb refuses a folder that another process has locked and names it; locks of killed processes are free."""
     with held(run) as process:
@@ -298,43 +238,6 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
         assert not (run / ".lock").exists()
 
 
-def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_again(tmp_path, monkeypatch):
-    folder = tmp_path / "new"
-    try_to_lock = lock._try_to_lock
-    removed = []
-
-    # The holder removes the folder after this process has found or created it and before this process locks it.
-    def remove_once(path):
-        if not removed:
-            path.rmdir()
-            removed.append(path)
-        return try_to_lock(path)
-
-    monkeypatch.setattr(lock, "_try_to_lock", remove_once)
-    with locked(MPI.COMM_SELF, folder):
-        assert (folder / ".lock").exists()
-    assert removed == [folder]
-    assert not folder.exists()
-
-
-def test_a_folder_that_its_holder_removes_while_it_is_created_is_created_again(tmp_path, monkeypatch):
-    """The folder is created again if it exists when ``mkdir`` is called and is gone when Python looks for it."""
-    folder = tmp_path / "new"
-    mkdir = os.mkdir
-    refused = []
-
-    def refuse_once(path, *arguments):
-        if not refused:
-            refused.append(path)
-            raise FileExistsError(17, "File exists", str(path))
-        mkdir(path, *arguments)
-
-    monkeypatch.setattr(os, "mkdir", refuse_once)
-    with locked(MPI.COMM_SELF, folder):
-        assert (folder / ".lock").exists()
-    assert refused == [folder]
-
-
 @pytest.mark.parametrize(
     ("path", "reason"),
     [("/proc/vipetsc", "No such file"), ("/dev/null/new", "Not a directory"), ("/proc/self/fd/new/er", "No such file")],
@@ -344,32 +247,3 @@ def test_a_folder_that_cannot_be_created_is_refused(path, reason):
     refused = pytest.raises(FolderError, match=f"{path}: cannot be created or locked: {reason}")
     with refused, locked(MPI.COMM_SELF, Path(path)):
         pass
-
-
-@pytest.mark.parametrize("below", [".", "new"])
-def test_a_link_to_a_folder_that_is_missing_is_refused(tmp_path, monkeypatch, below):
-    """A link to a missing folder is refused after a few attempts, since no folder can be created there."""
-    (tmp_path / "link").symlink_to(tmp_path / "missing")
-    mkdir = os.mkdir
-    tried = []
-
-    def mkdir_a_few_times(path, *arguments):
-        tried.append(path)
-        assert len(tried) < 20
-        mkdir(path, *arguments)
-
-    monkeypatch.setattr(os, "mkdir", mkdir_a_few_times)
-    refused = pytest.raises(FolderError, match=f"link is a link to {tmp_path}/missing, which is missing")
-    with refused, locked(MPI.COMM_SELF, tmp_path / "link" / below):
-        pass
-
-
-def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(13, "Permission denied")
-
-    # A file system without locks refuses so.
-    monkeypatch.setattr("vipetsc.io.lock._acquire", refuse)
-    with pytest.raises(PermissionError), locked(MPI.COMM_SELF, tmp_path / "a" / "b"):
-        pass
-    assert not any(tmp_path.iterdir())

@@ -62,12 +62,6 @@ def test_names_are_the_fields():
     assert {(file, name) for file, name in names if name in DIALECT} == set()
 
 
-def test_no_private_part_of_scipy_is_used():
-    """No source imports or calls a name of SciPy that begins with an underscore."""
-    private = re.compile(r"scipy\.\w+(\.\w+)*\._")
-    assert [file for file, text in SOURCES.items() if private.search(text)] == []
-
-
 def test_the_command_line_alone_prints():
     """Outside ``cli`` no module calls print: its text would stand in the output of every rank."""
     printing = set()
@@ -108,15 +102,6 @@ def test_the_chapter_on_the_code_names_files_and_functions_that_are_there():
     assert [name for name in names if not re.search(rf"(def|class) {name}\b|^ *{name}\b.* = ", together, re.M)] == []
 
 
-def test_the_way_of_a_run_leads_through_files_and_functions_that_are_there():
-    drawing = (ROOT / "manual/house.md").read_text(encoding="utf-8").partition("```text\n")[2].partition("```")[0]
-    stops = re.findall(r"([\w.]+)  +((?:\w+/)+\w+\.py)", drawing)
-    assert len(stops) > 20
-    for name, path in stops:
-        last = name.rpartition(".")[2]
-        assert re.search(rf"(def|class) {last}\b", (ROOT / path).read_text(encoding="utf-8")), name
-
-
 def test_docstrings_of_functions_begin_with_a_verb():
     """What a function does is said in the imperative: "Return the pass bands", not "The pass bands"."""
     nouns = {"The", "A", "An", "Whether", "Problems", "Problem", "Numbers", "Names", "Values", "How", "Why", "What"}
@@ -138,11 +123,3 @@ def test_no_two_classes_have_one_name():
             places[node.name].append(file)
 
     assert {name: files for name, files in places.items() if len(files) > 1} == {}
-
-
-def test_numbers_of_ranks_stand_where_scripts_test_looks_for_them():
-    """Each mark ``parallel`` has its numbers of ranks in its line, by which scripts/test chooses files."""
-    for path in (ROOT.parent / "tests/mpi").glob("test_*.py"):
-        text = path.read_text(encoding="utf-8")
-        with_numbers = re.findall(r"mark\.parallel\((?:\d|\[\d(?:, \d)*\])\)", text)
-        assert len(with_numbers) == text.count("mark.parallel"), path.name

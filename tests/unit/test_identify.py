@@ -11,10 +11,8 @@ import xarray as xr
 
 from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
-from vipetsc.case.identify import IdentifyCase, RecordTable, SensorTable, read_measured
-from vipetsc.io import tables
-from vipetsc.studies.further_sensor import _further_sensor
-from vipetsc.studies.identified import _start_values, _warnings_of_parameters, few_samples
+from vipetsc.case.identify import IdentifyCase, RecordTable, read_measured
+from vipetsc.studies.identified import _start_values, few_samples
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
@@ -134,31 +132,6 @@ def test_contacts_are_not_sought_in_silence(tmp_path):
             IdentifyCase.from_table(identify_table(table, record | {"contact": False}, unknowns=unknowns))
 
 
-@pytest.mark.parametrize("key", ["unknowns", "records"])
-@pytest.mark.parametrize("value", [[], None])
-def test_an_identification_seeks_something_in_something(tmp_path, key, value):
-    """A case without records or without unknowns is refused, whether the list is empty or missing."""
-    table = identify_table(lattice_table(), record_in(written(tmp_path)))
-    del table["identify"][key]
-    if value is not None:
-        table["identify"][key] = value
-    with pytest.raises(CaseError, match=f"identify.{key}"):
-        IdentifyCase.from_table(table)
-
-
-def test_an_offset_alone_may_be_sought(tmp_path):
-    """The clock of a record is an unknown, too."""
-    table = identify_table(lattice_table(), record_in(written(tmp_path), offset=[-1e-3, 1e-3]), unknowns=[])
-    assert [parameter.name for parameter in IdentifyCase.from_table(table).parameters] == ["offset"]
-
-
-def test_the_force_of_a_drive_without_amplitude_is_not_measured(tmp_path):
-    table = lattice_table(drive={"amplitude": 0.0}) | {"initial": {"kind": "velocity", "cell": 2, "velocity": 0.5}}
-    record = record_in(written(tmp_path), sensors=[{"quantity": "force", "column": "v"}])
-    with pytest.raises(CaseError, match="drive 1 has no amplitude"):
-        IdentifyCase.from_table(identify_table(table, record))
-
-
 def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
     """Columns by name or number, with comments, semicolons, decimal commas, factors or a rate, and datasets of one or
     two dimensions yield the same times and values.
@@ -234,22 +207,6 @@ def test_parameters_go_into_the_case(tmp_path):
     assert again.options.records[0].sha256
 
 
-def test_problems_of_the_case_come_with_those_of_its_identification(tmp_path):
-    """A site outside the lattice is named as in a run, beside an unknown that there is not."""
-    table = lattice_table(contacts={"sites": [2, 3, 99]})
-    unknowns = [{"quantity": "clearence", "bounds": [1e-4, 1e-3]}]
-    with pytest.raises(CaseError) as caught:
-        IdentifyCase.from_table(identify_table(table, record_in(written(tmp_path)), unknowns=unknowns))
-    assert {problem.key for problem in caught.value.problems} >= {"contacts.sites", "identify.unknowns[1].quantity"}
-
-
-def test_an_initial_state_of_many_masses_is_refused(tmp_path):
-    record = record_in(written(tmp_path)) | {"initial": "estimate"}
-    table = lattice_table(lattice={"cells": 60})
-    with pytest.raises(CaseError, match="of 240 masses is too much to estimate"):
-        IdentifyCase.from_table(identify_table(table, record))
-
-
 def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
     """Clearances on the side w < 0, of some sites or of all, and dashpots to the ground go into the case."""
     base = lattice_table(contacts={"clearance_minus": 9e-4})
@@ -269,23 +226,6 @@ def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
     unknowns = [{"quantity": "clearance_minus"} | bounds]
     plan = IdentifyCase.from_table(identify_table(base, record, unknowns=unknowns))
     assert plan.case_of([7e-4]).model().gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 7e-4))
-
-
-def test_sites_without_a_stop_on_the_side_minus_keep_their_numbers(tmp_path):
-    """A clearance on the side w < 0 is sought at sites with a stop there, and refused at others.
-
-    Numbers of the other sites stay in the case, whose model has no stop there.
-    """
-    unknown = {"quantity": "clearance_minus", "of": [[1]], "bounds": [1e-4, 1e-2]}
-    record = record_in(written(tmp_path))
-    base = lattice_table(contacts={"clearance_minus": 9e-4, "each": {"side": ["both", "plus", "both"]}})
-    plan = IdentifyCase.from_table(identify_table(base, record, unknowns=[unknown]))
-    case = plan.case_of([7e-4])
-    assert case.contacts.each.clearance_minus == [7e-4, 9e-4, 9e-4]
-    assert [gap for _, gap in case.model().gaps] == [7e-4, np.inf, 9e-4]
-
-    with pytest.raises(CaseError, match="site 2 has no stop on the side w < 0"):
-        IdentifyCase.from_table(identify_table(base, record, unknowns=[unknown | {"of": "each"}]))
 
 
 def test_coordinates_and_values_are_inverse(tmp_path):
@@ -317,26 +257,6 @@ def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
     assert values["starts/deviance"] == pytest.approx([30.0, 0.0, np.nan, 1.0], nan_ok=True)
 
 
-def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_path):
-    """The error is a fraction of a positive parameter, or of the range between the bounds on a linear scale."""
-    plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
-    columns = {
-        "parameter": [parameter.name for parameter in plan.parameters],
-        "at_bound": [0] * 4,
-        "at_least": [np.nan] * 4,
-        "determined": [0, 1, 1, 0],
-        "sensor/cell": [2] * 4,
-        "sensor/mass": [1] * 4,
-        "sensor/relative_error": [0.2] * 4,
-    }
-    data = xr.Dataset({name: ("parameter", values) for name, values in columns.items()}, attrs={"case": plan.to_toml()})
-    clearance, restitution = _warnings_of_parameters(data)
-    assert clearance.startswith("clearance 1:")
-    assert clearance.endswith("with a sensor at mass 1 of cell 2 its error would be 20 %")
-    assert restitution.startswith("restitution:")
-    assert restitution.endswith("its error would be 20 % of the range between its bounds")
-
-
 def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     """A force sensor is accepted for a driving force and refused for a moved wall.
 
@@ -354,35 +274,6 @@ def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     assert "drive 1 moves a wall" in problem.remedy
 
 
-@pytest.mark.parametrize(
-    ("column", "changes", "key", "part"),
-    [
-        (np.array([b"a"] * 20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
-        (1j * np.arange(20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
-        # The file has no samples, and ``begin`` asks for samples from a time on.
-        (np.zeros(0), {"begin": 0.1}, "file", "leaves 0 samples"),
-        (np.zeros((20, 2)), {}, "sensors[1].column", 'is an array of 20 x 2; write "v[1]"'),
-    ],
-)
-def test_bad_data_sets_are_one_clear_error(tmp_path, column, changes, key, part):
-    with h5py.File(tmp_path / "record.h5", "w") as file:
-        file["v"] = column
-    record = {"file": str(tmp_path / "record.h5"), "rate": 1e3, "sensors": [SENSOR]} | changes
-    problems = problems_of(record)
-    assert list(problems) == [f"identify.records[1].{key}"]
-    assert part in problems[f"identify.records[1].{key}"]
-
-
-def test_the_size_of_a_data_set_is_checked_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "MOST_NUMBERS", 19)
-    with h5py.File(tmp_path / "record.h5", "w") as file:
-        file["v"] = np.arange(20.0)
-    problems = problems_of({"file": str(tmp_path / "record.h5"), "rate": 1e3, "sensors": [SENSOR]})
-    assert problems["identify.records[1].sensors[1].column"].endswith(
-        "the dataset has 20 numbers; at most 19 are possible"
-    )
-
-
 def test_the_amplitude_that_is_sought_has_the_unit_of_its_drive(tmp_path):
     """The amplitude of a force is in N, that of a moved wall in m, and that of an impulse in N s."""
     unknowns = [{"quantity": "amplitude", "bounds": [1e-6, 100.0]}]
@@ -395,14 +286,6 @@ def test_the_amplitude_that_is_sought_has_the_unit_of_its_drive(tmp_path):
         table = lattice_table() | {"drive": drive}
         plan = IdentifyCase.from_table(identify_table(table, record_in(written(tmp_path)), unknowns=unknowns))
         assert [parameter.unit for parameter in plan.parameters] == [unit]
-
-
-def test_a_further_sensor_has_the_noise_of_those_that_measure_the_same():
-    """The noise of accelerations in m/s^2 has no part in that of a velocity in m/s."""
-    quantities = ["force", "velocity", "acceleration", "velocity"]
-    sensors = [SensorTable(quantity=quantity, column=1) for quantity in quantities]
-    assert _further_sensor(sensors, np.array([7.0, 0.1, 50.0, 0.3])) == ("velocity", pytest.approx(0.2))
-    assert _further_sensor(sensors[:1], np.array([7.0])) == ("velocity", 1.0)
 
 
 def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):

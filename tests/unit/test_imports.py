@@ -149,13 +149,6 @@ def test_folders_import_in_no_circle():
         pytest.fail(f"circle of folders: {' <- '.join(error.args[1])}")
 
 
-@pytest.mark.parametrize("name", SERIAL)
-def test_sources_name_neither_petsc_nor_mpi(name):
-    for module, path in MODULES.items():
-        if part(module) == name:
-            assert not FORBIDDEN & {other.split(".")[0] for other in imported(path)}, path
-
-
 @pytest.mark.slow
 def test_importing_them_loads_neither_petsc_nor_mpi():
     """Importing all modules of the serial parts loads no PETSc, SLEPc or MPI."""
@@ -164,25 +157,3 @@ def test_importing_them_loads_neither_petsc_nor_mpi():
     code = f"import sys, importlib\nfor m in {modules!r}: importlib.import_module(m)\n"
     code += f"print(*sorted({FORBIDDEN!r} & sys.modules.keys()))"
     assert run_python(code) == ""
-
-
-def test_figures_wait_with_matplotlib():
-    """Importing ``vipetsc.figures`` does not load matplotlib."""
-    assert run_python("import sys, vipetsc.figures; print('matplotlib' in sys.modules)") == "False"
-
-
-@pytest.mark.slow
-def test_no_function_hides_a_module():
-    """No package has an attribute with the name of one of its modules: importing the module would replace it."""
-    names = sorted(module for module in MODULES if not module.startswith("__"))
-    run_python(f"""
-import importlib, inspect, petsc4py
-petsc4py.init([])
-modules = [f"vipetsc.{{name}}" for name in {names!r}]
-for module in modules:
-    importlib.import_module(module)
-for module in modules:
-    parent, _, name = module.rpartition(".")
-    found = vars(importlib.import_module(parent))[name]
-    assert inspect.ismodule(found), (module, found)
-""")

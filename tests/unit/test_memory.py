@@ -3,31 +3,20 @@
 import resource
 import tracemalloc
 from types import SimpleNamespace
-from typing import Any
-
-from mpi4py import MPI
-from petsc4py import PETSc
 
 import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError
-from vipetsc.cli.verbs.run_verb import run_rows
+from vipetsc.case import CaseError
 from vipetsc.dynamics import memory, simulate
 from vipetsc.dynamics.cost import estimate
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import memory_available, memory_needed
 from vipetsc.dynamics.plan import RunPlan
-from vipetsc.io.store import RunFolder
 
 HUGE = {"lattice": {"cells": 50_000_000}, "contacts": {"sites": [6], "clearance": 1e-4}}
-
-
-def bytes_needed(case: Case, engine: str, ranks: int = 1) -> float:
-    """Return the bytes that a rank needs in total."""
-    return sum(memory_needed(case.model(), case.output, engine, ranks).values())
 
 
 def needs_of_many_sites(ranks: int = 1, end: float = 0.01) -> dict[str, float]:
@@ -69,41 +58,10 @@ def test_what_takes_most_is_named_with_a_remedy(folder, monkeypatch, key, sectio
         simulate(small_case(**sections), folder / "run")
 
 
-@pytest.mark.parametrize(("engine", "least"), [("ts", 90e9), ("propagator", 10e9)])
-def test_a_lattice_of_fifty_million_cells_needs_many_gigabytes(engine, least):
-    case = small_case(**HUGE, time={"end": 0.08, "engine": engine})
-    assert least < bytes_needed(case, engine) < 2 * least
-
-
 def test_a_run_too_large_is_refused_with_what_it_needs(folder):
     with pytest.raises(CaseError, match=r"50000000 cells, 1 sites and 251 samples need \d+ GB of memory per rank"):
         simulate(small_case(**HUGE), folder / "run")
     assert not (folder / "run").exists()
-
-
-def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(folder, monkeypatch):
-    """A state of more than 2^31 - 1 numbers is refused with a hint at PETSc with 64-bit indices."""
-    case = small_case(lattice={"cells": 300_000_000}, contacts={"sites": [6], "clearance": 1e-4})
-    message = r"lattice.cells = 300000000: results in a state of 2400000002 numbers, .*2147483647 .*64-bit-indices"
-    monkeypatch.setattr(PETSc, "IntType", np.int32)
-    with pytest.raises(CaseError, match=message):
-        simulate(case, folder / "run")
-    with pytest.raises(CaseError, match=message):
-        run_rows(case, 1)
-
-    # With wider indices the run is refused for its memory, as any other.
-    monkeypatch.setattr(PETSc, "IntType", np.int64)
-    with pytest.raises(CaseError, match="300000000 cells, 1 sites and 251 samples need"):
-        simulate(case, folder / "run")
-
-
-def test_ranks_and_windows_divide_what_is_needed():
-    def needed_on(ranks: int, **output: Any) -> float:
-        return bytes_needed(small_case(**HUGE, output=output), "ts", ranks)
-
-    assert needed_on(4) < needed_on(1)
-    assert needed_on(1, window=[1, 100]) < needed_on(1)
-    assert needed_on(1, every=10**6) < needed_on(1)
 
 
 def test_the_limit_of_the_process_counts(monkeypatch):
@@ -127,21 +85,3 @@ def test_a_billion_equal_linear_cells_cost_an_estimate_and_a_rank_next_to_nothin
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1e7
-
-
-def test_checkpoints_add_little_to_what_a_long_lattice_records(folder):
-    """Where a chunk is one sample, a state as large as a sample follows every fourth one, not each."""
-    sizes: list[int] = []
-
-    class Folder(RunFolder):
-        def save_state(self, state):
-            sizes.append(sum(array.nbytes for array in state.values()))
-            super().save_state(state)
-
-    case = small_case(lattice={"cells": 60}, contacts={"sites": []}, time={"end": 4e-3, "sample_interval": 1e-4})
-    output = Folder(folder / "run", MPI.COMM_SELF)
-    output.chunk_length = 1
-    result = simulate(case, output)
-    assert result.complete
-    recorded = 2 * 8 * 60 * 4 * result.statistics["samples"]
-    assert 0.1 * recorded < sum(sizes) < 0.5 * recorded

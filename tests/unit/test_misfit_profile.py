@@ -53,23 +53,3 @@ def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
     assert costs == pytest.approx(np.square(places), abs=1e-12)
     # The lines of the covariance and through two fits leave the valley, hence some steps are halved.
     assert windows.solutions <= 5
-
-
-def test_a_contact_that_no_motion_keeps_is_given_up():
-    """A profile has the cost with the jump for a < -2, where the motion has one contact for any b."""
-
-    class Lost(BentValley):
-        def onsets(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
-            return np.zeros(2 if z[0] > -2 else 1)
-
-    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)), np.zeros((0, 2)))
-    costs = profile_costs(Lost(), np.zeros(2), profile, 0, "below")
-    assert costs == pytest.approx([1.5**2, 3**2 + JUMP])
-
-
-def test_places_that_bounds_cut_are_followed_from_the_fit():
-    """Places are listed outwards from the fit on one side; a fit at its lower bound has none below."""
-    profile = MisfitProfile(np.linspace(0, 3, 4)[None], np.ones((1, 2)), np.zeros((0, 2)))
-    assert profile.outwards(0, 0.0, "below").tolist() == []
-    assert profile.outwards(0, 0.0, "above").tolist() == [0, 1, 2, 3]
-    assert profile.outwards(0, 1.5, "below").tolist() == [1, 0]

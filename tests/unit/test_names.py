@@ -2,9 +2,7 @@
 
 import pytest
 
-from tests.breathers import breather_case
 from tests.steady_states import nfrc_case
-from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.wording import distinct
 
 
@@ -30,9 +28,3 @@ def test_curves_that_agree_in_six_digits_have_files_of_their_own():
     curves = nfrc_case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
     assert len({name for name, *_ in curves}) == 4
     assert curves[0] == ("r0.7-1023.27", 0.7, 1023.27)
-
-
-def test_breathers_that_agree_in_six_digits_have_files_of_their_own():
-    """Breathers whose frequencies agree in six digits have different names."""
-    method = CondensedMethod(breather_case(start_frequency=[1600.0, 1600.001]))
-    assert [method.name(job) for job in (0, 1)] == ["breather-1600", "breather-1600.001"]

@@ -1,8 +1,6 @@
 """The layout of HDF5 files: files are read back as they were written, by xarray and by h5py."""
 
 import json
-import subprocess
-import sys
 
 import h5py
 import numpy as np
@@ -81,16 +79,6 @@ def test_the_file_is_netcdf_4_for_other_tools(tmp_path):
         assert bands["energy"].attrs["units"] == "J"
 
 
-def test_an_attribute_replaces_one_of_the_same_name(tmp_path):
-    """An attribute of a variable takes the place of one by which HDF5 describes a dimension."""
-    data = measured()
-    data.variables["time"].attrs["NAME"] = "clock"
-    write_netcdf(tmp_path / "a.h5", data)
-
-    with h5py.File(tmp_path / "a.h5") as file:
-        assert file["time"].attrs["NAME"] == "clock"
-
-
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     """A dataset without a needed coordinate is refused; the earlier file keeps its bytes, and no other file is left."""
     path = tmp_path / "a.h5"
@@ -102,16 +90,6 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
 
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_fields_stay_in_the_file_until_they_are_used(tmp_path):
-    """Opening a file loads coordinates alone: fields may be larger than memory."""
-    write_netcdf(tmp_path / "a.h5", measured())
-
-    with open_netcdf(tmp_path / "a.h5", "run") as data:
-        variables = data.drop_vars(list(data.indexes)).variables.values()
-        assert variables
-        assert not any(variable._in_memory for variable in variables)
 
 
 @pytest.mark.parametrize(
@@ -139,23 +117,6 @@ def test_files_of_xarray_itself_are_read(tmp_path):
         assert {name: np.asarray(value).tolist() for name, value in data["field"].attrs.items()} == attributes
 
 
-def test_a_file_without_scales_is_read(tmp_path):
-    """Axes without a scale are dimensions of their own; an attribute may be empty, or of a type that is an array."""
-    values = np.arange(6, dtype="i4").reshape(3, 2)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        field = file.create_dataset("group/field", data=np.zeros((2, 3)))
-        field.attrs["empty"] = h5py.Empty("f8")
-        pair = h5py.h5t.array_create(h5py.h5t.NATIVE_INT32, (2,))
-        pairs = h5py.h5a.create(field.id, b"pairs", pair, h5py.h5s.create_simple((3,)))
-        pairs.write(values, pair)
-
-    with open_netcdf(tmp_path / "a.h5", "state") as data:
-        read = data["group/field"]
-        assert read.dims == ("group/field/axis_0", "group/field/axis_1")
-        assert read.attrs["empty"].tolist() == []
-        np.testing.assert_array_equal(read.attrs["pairs"], values)
-
-
 def test_a_dimension_of_two_lengths_is_refused_with_the_file(tmp_path):
     """A dataset that is shorter than its scale, as netCDF-4 may have it, is an error that names the file."""
     with h5py.File(tmp_path / "uneven.h5", "w") as file:
@@ -180,14 +141,6 @@ def test_files_of_another_kind_are_refused(tmp_path):
         file["values"] = np.zeros((2, 2))
     with pytest.raises(ValueError, match=r"foreign\.h5 is not a run of vipetsc: it lacks time, energy/kinetic, case"):
         open_netcdf(tmp_path / "foreign.h5", "run", ("time", "energy/kinetic", "values", "case"))
-
-
-@pytest.mark.slow
-def test_it_loads_neither_petsc_nor_mpi():
-    """A script that reads results needs no MPI: the module imports neither petsc4py nor mpi4py."""
-    code = "import sys, vipetsc.io.netcdf; print(*{'petsc4py', 'mpi4py'} & sys.modules.keys())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
 
 
 @pytest.mark.parametrize(("below", "above"), [("g/cell", "cell"), ("g/h/part", "g/part"), ("g/h/cell", "cell")])

@@ -13,21 +13,6 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.system import System
 
 
-def test_a_case_reports_everything_at_once():
-    """One error names every wrong key and value of all sections, with the key or value that was meant."""
-    table = {
-        "contacts": {"law": "bilinaer"},
-        "nnm": {"modes": [0], "larget_step": 1.0, "guards": {"turn": -1.0}},
-        "nmn": {},
-    }
-    with pytest.raises(CaseError) as caught:
-        NnmCase.from_table(table)
-
-    text = str(caught.value)
-    for part in ("contacts.law", "bilinear", "nnm.modes", "largest_step", "guards.turn", "did you mean nnm"):
-        assert part in text
-
-
 def test_a_case_is_written_out_and_read_back():
     """The text of a case holds the contact's default numbers, and gives the same case and system again."""
     case = NnmCase.from_table({"name": "a", "lattice": {"reading": "printed"}, "contacts": {"law": "bilinear"}})
@@ -44,33 +29,6 @@ def test_a_case_is_written_out_and_read_back():
     system = System.from_case(case)
     assert system.contacts[0].clearance == pytest.approx(CLEARANCE)
     assert [system.branch_name(mode) for mode in (0, 1)] == ["in-phase", "out-of-phase"]
-
-
-def test_unknowns_by_the_gap_of_a_contact_need_a_contact():
-    """The chart "grazing" is refused for a system without contacts; "auto" takes another one there."""
-    own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}]}
-    nnm = {"system": "own", "modes": [1], "own": own}
-    with pytest.raises(CaseError, match=r"nnm\.chart = 'grazing'.*there is no contact"):
-        NnmCase.from_table({"nnm": nnm | {"chart": "grazing"}})
-    NnmCase.from_table({"nnm": nnm | {"chart": "auto"}})
-
-
-@pytest.mark.parametrize(
-    ("contacts", "lattice", "message"),
-    [
-        ({"pair": [0, 3]}, {}, "two masses in contact within a cell"),
-        ({"each": {"law": ["bilinear"]}}, {}, "one contact; omit the lists"),
-        ({"clearance": [1e-3, 2e-3]}, {}, "one contact"),
-        ({}, {"damping": {"mass": 1.0}}, "where a dashpot has none"),
-        ({}, {"profiles": {"masses[1]": {"first": 5e-3, "last": 6e-3}}}, "one cell, which stands for all others"),
-    ],
-)
-def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
-    """The reduced model refuses features that a lattice alone has, and accepts a stop on one side."""
-    table = {"contacts": {"side": "plus"} | contacts, "lattice": {"preset": "four-band"} | lattice}
-    with pytest.raises(CaseError, match=message):
-        NnmCase.from_table(table)
-    assert NnmCase.from_table({"contacts": {"side": "plus"}}).gaps() == ((pytest.approx(CLEARANCE), float("inf")),)
 
 
 def test_a_lattice_that_nothing_holds_is_not_pushed():

@@ -8,8 +8,6 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-import tomli_w
-import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,10 +15,6 @@ from tests.conftest import run_of, search_table
 from vipetsc.case import Case, CaseError, case_id
 from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.case.reading import relative_names, with_absolute_names
-from vipetsc.case.verb_cases import load_every
-from vipetsc.figures.optimum import compared_curves
-from vipetsc.figures.style import rc_style
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond, measured
 from vipetsc.studies.optimum_file import curves_of
@@ -30,36 +24,6 @@ from vipetsc.studies.sampler import CmaEs, Nsga2, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
 TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
-
-
-def test_designs_of_other_cells_keep_smooth_parts_and_dashpots():
-    """A design that changes a spring's stiffness keeps the spring's other numbers, and the other springs."""
-    # Each number differs from its default, so that a lost one is seen.
-    parts = {"quadratic": -2e6, "cubic": 3e9, "damping": 0.5}
-    springs = [
-        {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True} | parts,
-        {"start": 1, "end": 2, "stiffness": 2e3},
-    ]
-    cell = {"masses": [0.01, 0.02], "springs": springs, "contact": [1, 2]}
-    table = TABLE | {
-        "lattice": {"cell": cell, "cells": 40},
-        "drive": {"frequency": 300.0, "cycles": 3},
-        "contacts": {"sites": [10, 20], "clearance": 1e-4, "stiffness": 1e6},
-        "optimise": {
-            "budget": 12,
-            "variables": {"springs": {"1": [1e3, 1e4]}},
-            "objective": [{"measure": "transmitted"}],
-        },
-    }
-
-    case = OptimiseCase.from_table(table).design(np.array([5e3]))
-
-    first, second = case.lattice.unit_cell().springs
-    assert first.stiffness == 5e3
-    assert {key: getattr(first, key) for key in parts} == parts
-    assert second.stiffness == 2e3
-    assert not second.cubic
-    assert not second.damping
 
 
 @pytest.mark.parametrize(("objectives", "sign"), [([{"measure": "transmitted"}], -1), (None, 1)])
@@ -79,44 +43,6 @@ def test_designs_are_compared_at_amplitudes_of_any_sign(objectives, sign):
     assert np.abs(amplitudes).max() == pytest.approx(40.0 if sign > 0 else 20.0)
 
 
-def test_designs_are_compared_once_at_the_amplitude_of_the_case():
-    """The middle of a curve about the case's amplitude is that amplitude, which rounding must not make a second one."""
-    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": 24.33}}
-    table["optimise"] = BOUNDS | {"objective": [{"measure": "transmitted"}]}
-    search_plan = OptimiseCase.from_table(table)
-    design = SimpleNamespace(case=search_plan.base)
-    search = SimpleNamespace(plan=search_plan, compared=lambda: {"case": 0}, designs=[design])
-
-    amplitudes = [run.drive.amplitude for run in curves_of(search)["case"]]
-
-    assert len(amplitudes) == 11
-    assert amplitudes[5] == 24.33
-
-
-def test_curves_over_amplitudes_of_both_signs_are_drawn_by_size():
-    """A negative amplitude has its place on the logarithmic axis, and the bars of energies are those at it."""
-    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": -5.0}, "optimise": BOUNDS | {"budget": 12}}
-    table["optimise"]["objective"] = [{"measure": "transmitted", "amplitudes": [10.0]}]
-    search_plan = OptimiseCase.from_table(table)
-    amplitude = np.array([-5.0, 2.5, 10.0, 40.0])
-    data = {
-        "comparison/number": ("compared", [0]),
-        "curve/value": (("compared", "amplitude", "objective"), amplitude[None, :, None]),
-        "curve/bands": (("compared", "amplitude", "band"), np.abs(amplitude)[None, :, None] * np.ones(4)),
-        "curve/dissipated": (("compared", "amplitude"), np.zeros((1, 4))),
-    }
-    coords = {"compared": ["case"], "amplitude": amplitude, "band": [1, 2, 3, 4], "objective": ["1: transmitted"]}
-    optimum = xr.Dataset(data, coords=coords, attrs={"case": search_plan.to_toml()})
-
-    with rc_style():
-        curve, bars = compared_curves(optimum).axes
-
-    assert curve.lines[0].get_xdata().tolist() == [2.5, 5.0, 10.0, 40.0]
-    assert curve.lines[0].get_ydata().tolist() == [2.5, -5.0, 10.0, 40.0]
-    assert bars.get_title("left").endswith("At -5 N")
-    assert [bar.get_height() for bar in bars.patches] == [5.0] * 4 + [0.0]
-
-
 @pytest.mark.parametrize(("ends", "beyond"), [("fixed", 9.0), ("periodic", np.nan)])
 def test_nothing_lies_beyond_the_last_site_of_a_ring(ends, beyond):
     """The energy of masses that move beyond the last site is that of a lattice with ends; a ring has no such cells."""
@@ -131,32 +57,6 @@ def test_nothing_lies_beyond_the_last_site_of_a_ring(ends, beyond):
 def plan(*changes: str) -> OptimiseCase:
     """Return the search of ``TABLE`` with some keys changed."""
     return OptimiseCase.from_table(TABLE, changes)
-
-
-def test_all_problems_come_at_once(tmp_path):
-    """Two wrong variables are named in one error, by the case's own reader and by that of all verbs."""
-    path = tmp_path / "bad.toml"
-    wrong = {"masses": {"9": [1.0, 2.0]}, "sites": [30, 2]}
-    options = BOUNDS | {"variables": BOUNDS["variables"] | wrong}
-    path.write_text(tomli_w.dumps(TABLE | {"optimise": options}))
-
-    # ``load_every`` reads a user's file, whose verb it does not know.
-    for load in (OptimiseCase.load, load_every):
-        with pytest.raises(CaseError) as error:
-            load(path)
-        assert [p.key for p in error.value.problems] == ["optimise.variables.masses.9", "optimise.variables.sites"]
-
-
-def test_the_case_as_text_gives_the_same_search():
-    """A search that is written out and read back is equal to it."""
-    first = plan(
-        "optimise.variables.sites=[2, 39]", "optimise.samples=3", "disorder.clearance.relative=0.01", "time.rtol=1e-8"
-    )
-
-    second = OptimiseCase.from_toml(first.to_toml())
-
-    assert second == first
-    assert second.options.samples == 3
 
 
 def test_the_start_is_the_case():
@@ -417,41 +317,6 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
         assert records["stalls"]["reason"] == "stalled"
 
     assert asked == ["stalls", "short", "short"]
-
-
-def test_a_wrong_key_hides_no_other_and_brings_none():
-    """A wrong start does not hide a wrong variable; a wrong objective does not bring problems of the default one."""
-    with pytest.raises(CaseError) as error:
-        plan("optimise.start=midst", "optimise.variables.sites=[30, 2]")
-    assert [problem.key for problem in error.value.problems] == ["optimise.start", "optimise.variables.sites"]
-
-    # The default, energy in the bands above the driven one, would be impossible here.
-    with pytest.raises(CaseError) as error:
-        plan("lattice.preset=diatomic", "drive={wavenumber='5pi/9', band=2}", "optimise.objective=[{band='x'}]")
-    assert [problem.key for problem in error.value.problems] == ["optimise.objective[1].band"]
-
-
-def test_clearances_are_matched_at_sites_of_one_kind():
-    """Equal restitutions in a list are one kind; a stop on one side at one of the sites makes two."""
-    matched = ["optimise.start=matched", "optimise.variables={clearance=[1e-5, 1e-2]}"]
-    plan(*matched, "contacts.each={restitution=[0.7, 0.7, 0.7]}")
-    with pytest.raises(CaseError, match="these sites differ"):
-        plan(*matched, "contacts.each={side=['plus', 'both', 'both']}")
-    with pytest.raises(CaseError, match="these sites differ"):
-        plan(*matched, "contacts.each={restitution=[0.7, 0.8, 0.7]}")
-
-
-def test_a_search_finds_files_next_to_its_case_file(tmp_path, monkeypatch):
-    """Names in a list of initial states are relative to the folder of the case file, not to the working directory."""
-    folder = tmp_path / "case"
-    folder.mkdir()
-    for name in ("a.h5", "b.h5"):
-        (folder / name).touch()
-    monkeypatch.chdir(tmp_path)
-    table = {"optimise": {"variables": {"initial": {"path": ["a.h5", "b.h5"]}}}}
-    assert relative_names(table) == ["a.h5", "b.h5"]
-    variables = with_absolute_names(table, folder)["optimise"]["variables"]
-    assert variables["initial"]["path"] == [str(folder / "a.h5"), str(folder / "b.h5")]
 
 
 def test_a_run_that_received_no_energy_has_a_reason():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,23 +12,21 @@ from typing import Any
 from mpi4py import MPI
 
 import pytest
-from PIL import Image
 
 import vipetsc
 from tests.conftest import assert_same_bits, datasets, put_members
 from tests.faults.inject import Injector
-from vipetsc.case import Case, case_id
+from vipetsc.case import Case
 from vipetsc.io.folder import FolderError, claimed
 from vipetsc.io.kinds import SEARCH
-from vipetsc.io.netcdf import open_netcdf
-from vipetsc.paper import draw, make, steps
-from vipetsc.paper.build_record import read_record, write_record
+from vipetsc.paper import make
+from vipetsc.paper.build_record import read_record
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.claims.criteria import UNMEASURED
 from vipetsc.paper.claims.measure import measure_claims
-from vipetsc.paper.paper_figures import TRANSFER, PaperFigure
-from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, PaperStep, Plan, fingerprint, paper_plan
-from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.paper.paper_figures import TRANSFER
+from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, STALE, PaperStep, Plan, paper_plan
+from vipetsc.parallel import StopRequest
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(vipetsc.__file__).parent
@@ -122,27 +119,6 @@ def test_times_of_files_make_nothing_stale(searched):
     assert set(before) == {"figS3", "fig10", "claims"}
 
 
-def test_a_result_of_other_content_is_another_input(searched):
-    """A byte more in the result of the search changes the inputs of its figure and of the claims alone."""
-    plan, root = searched
-    before = plan.inputs(root)
-
-    path = root / "design" / "design.h5"
-    path.write_bytes(path.read_bytes() + b"\0")
-
-    after = plan.inputs(root)
-    assert {key for key in before if before[key] != after[key]} == {"figS3", "claims"}
-
-
-def test_another_version_of_the_package_is_another_input(searched, monkeypatch):
-    """Another version of the package changes the inputs of everything."""
-    plan, root = searched
-    before = plan.inputs(root)
-
-    monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
-    assert all(before[key] != value for key, value in plan.inputs(root).items())
-
-
 def test_another_case_is_another_input_and_a_stale_step(searched):
     """A step whose case has changed is stale, begun once its folder is claimed, and done when it has ended."""
     plan, root = searched
@@ -185,71 +161,6 @@ def test_no_claim_is_measured_from_results_that_are_stale_or_a_part(searched):
         assert row["verdict"] == UNMEASURED and not row["files"]
         assert "design has results of another case or version" in row["reason"]
     assert [set(unusable) for unusable in given] == [set(), {"design"}]
-
-
-def test_a_relation_that_changes_is_another_input(tmp_path):
-    """The scattering law that a prediction reads is a part of its identity."""
-    step = step_of(paper_plan(FULL), TRANSFER)
-    (tmp_path / TRANSFER).mkdir()
-    before = step.identity(tmp_path)
-
-    (tmp_path / TRANSFER / RELATION).write_bytes(b"another")
-    assert step.identity(tmp_path) != before
-
-
-def test_stale_pictures_go_before_new_ones_are_drawn(searched):
-    """A figure's pictures from other inputs are removed, those of another figure and of the same inputs are not."""
-    plan, root = searched
-    figures = root / "figures"
-    figures.mkdir()
-    old = figures / "figS3-old.png"
-    other = figures / "figS30-other.png"
-    old.touch()
-    other.touch()
-
-    draw._drop_stale(plan, root, plan.inputs(root))
-    assert not old.exists()
-    assert other.exists()
-
-    # The recorded inputs are the present ones, hence the picture counts as drawn from them.
-    old.touch()
-    record = draw._drop_stale(plan, root, plan.inputs(root))
-    assert old.exists()
-    assert record == read_record(root)
-
-
-def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
-    """A request to stop before the first step leaves a folder with the plan alone, without a report."""
-    stop = StopRequest()
-    stop.requested = True
-    reported = []
-
-    with pytest.raises(StoppedError):
-        make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=reported.append)
-
-    assert reported == []
-    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
-
-
-def test_fingerprints_distinguish_parts():
-    """A fingerprint depends on where one part ends and the next begins; text counts as its bytes."""
-    assert len({fingerprint("ab", "c"), fingerprint("a", "bc"), fingerprint("abc")}) == 3
-    assert fingerprint("ab") == fingerprint(b"ab")
-
-
-def test_the_plan_names_what_it_does_not_know():
-    """Unknown figures and claims are refused with a list of the known ones; claims may be in small letters."""
-    with pytest.raises(FolderError, match=r"--only fig99 C99: figures are fig01"):
-        paper_plan(FULL).only(["fig99", "C99", "C1"])
-    assert paper_plan(FULL).only(["c1"]).figures
-
-
-def test_a_search_is_done_when_its_file_has_its_case(searched):
-    """The search's file holds the case that it was computed with, and is the step's result."""
-    plan, root = searched
-    with open_netcdf(root / "design" / "design.h5", "search") as search:
-        assert tomllib.loads(search.attrs["case"]) == tomllib.loads(plan.steps[0].text)
-    assert plan.steps[0].results(root) == [root / "design" / "design.h5"]
 
 
 @pytest.mark.slow
@@ -297,127 +208,3 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
     (root / "plan.json").write_text("")
     with pytest.raises(FolderError, match=r"plan\.json cannot be read; remove it if the folder holds"):
         make.make_paper(plan, root)
-
-
-@pytest.mark.parametrize("end", ["another case", "removed"])
-def test_the_time_of_a_step_is_that_of_the_results_that_are_there(searched, tmp_path, end):
-    """The time of a step is that of its present results, not of earlier ones that were replaced or removed."""
-    plan = replace(searched[0], figures=[], measure=lambda root, unusable: [])
-    root = tmp_path / "paper"
-    make.make_paper(plan, root)
-    record = read_record(root)
-    record["cpu"]["steps"]["design"] = 1e6
-    write_record(root, record)
-
-    if end == "removed":
-        shutil.rmtree(root / "design")
-    else:
-        plan = replace(plan, steps=(replace(plan.steps[0], changes=(*SMALL, "design.eta.count=4")),))
-    assert make.make_paper(plan, root).new_steps == ("design",)
-    assert 0 < read_record(root)["cpu"]["steps"]["design"] < 1e5
-
-
-@pytest.mark.slow
-def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_same_again():
-    """The members that the engine ts computes, too, are of different curves, spread over the amplitudes, and fixed."""
-    steps = {step.name: step for step in paper_plan(FULL).steps}
-    checked = {step.checks for step in steps.values() if step.checks}
-    assert checked == {"interband", "scattering", "scattering-neighbours"}
-
-    def curve(case: Case) -> str:
-        return str((case.lattice.reading, case.contacts.law, case.contacts.sites, case.drive.cycles))
-
-    for name in ("interband", "scattering-neighbours"):
-        sweep = steps[name].case
-        step = steps[f"{name}-ts"]
-        members, sample = ([member.case for member in case.members()] for case in (sweep, step.case))
-        assert len(sample) == len(set(map(curve, sample))) == step.sample
-
-        # The range of amplitudes, cut into as many parts as the sample has members, has one member in each part.
-        amplitudes = sorted({case.drive.amplitude for case in members})
-        places = sorted(amplitudes.index(case.drive.amplitude) for case in sample)
-        assert [place * step.sample // len(amplitudes) for place in places] == list(range(step.sample))
-
-        # Each case of the sample, with the engine of the sweep, is a member of the sweep.
-        assert {case.time.engine for case in sample} == {"ts"}
-        tables = (case.model_dump(by_alias=True, exclude_none=True) | {"name": name} for case in sample)
-        assert {case_id(Case.from_table(t, ["time.engine=auto"])) for t in tables} <= set(map(case_id, members))
-        assert step.text == replace(step).text
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("plain_pictures")
-def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
-    """A second call draws nothing; a missing picture is drawn again, a missing report encodes its pictures again."""
-    plan = replace(searched[0], measure=lambda root, unusable: [])
-    root = tmp_path / "paper"
-    offered: list[str] = []
-    encoded: list[int] = []
-    ordered: list[str] = []
-    offers = PaperFigure.offers
-    quantize = Image.Image.quantize
-    draw_each = draw.draw_each
-
-    def offers_noted(figure, *rest):
-        offered.append(figure.id)
-        return offers(figure, *rest)
-
-    def quantize_noted(image, *arguments, **options):
-        encoded.append(image)
-        return quantize(image, *arguments, **options)
-
-    def order_noted(drawings, *rest):
-        ordered.extend(drawing.stem for drawing in drawings)
-        return draw_each(drawings, *rest)
-
-    monkeypatch.setattr(PaperFigure, "offers", offers_noted)
-    monkeypatch.setattr(Image.Image, "quantize", quantize_noted)
-    monkeypatch.setattr(draw, "draw_each", order_noted)
-
-    first = make.make_paper(plan, root)
-    # The dearest picture is the first, since it would keep one rank busy at the end.
-    assert ordered[0] == "figS3-design-cost-maps"
-    assert len(ordered) == 6
-    assert sorted(offered) == ["fig10", "figS3"]
-    assert len(encoded) == 6
-    # Each picture has a PNG and a PDF.
-    assert len(first.drawn) == 2 * 6
-    cpu = read_record(root)["cpu"]
-    assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
-
-    offered.clear()
-    encoded.clear()
-    assert make.make_paper(plan, root).drawn == ()
-    assert offered == []
-    assert encoded == []
-
-    next((root / "figures").glob("fig10-*.png")).unlink()
-    assert len(make.make_paper(plan, root).drawn) == 2
-    assert offered == ["fig10"]
-    assert encoded == []
-
-    (root / "report.html").unlink()
-    make.make_paper(plan, root)
-    assert len(encoded) == 6
-    assert (root / "report.html").read_text(encoding="utf-8").count("data-of") == 6
-
-
-def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
-    """The parts of all steps with parts are jobs of one pool, the dearest first."""
-    jobs: list[tuple[float, str, int]] = []
-
-    def note(pool, new_jobs, *rest, **options):
-        jobs.extend(new_jobs)
-        return {}
-
-    monkeypatch.setattr(steps.TaskPool, "run", note)
-    plan = paper_plan(FULL)
-    in_parts = [step for step in plan.steps if step.parts]
-
-    make.make_paper(replace(plan, steps=in_parts, figures=[], measure=lambda root, unusable: []), tmp_path)
-
-    assert len(jobs) == 7
-    assert {name for _, name, _ in jobs} == {step.name for step in in_parts}
-    assert [job[1:] for job in jobs[:2]] == [("nnm-hertz", 1), ("nnm-bilinear", 1)]
-    costs = [cost for cost, *_ in jobs]
-    assert costs == sorted(costs, reverse=True)

@@ -82,22 +82,6 @@ def test_what_has_nothing_to_save_ends_at_once():
     assert ended.stderr == "vipetsc: stopped on request\n"
 
 
-def test_a_script_keeps_its_own_handlers():
-    """Work that a script calls, which does not listen, leaves the signals alone."""
-    before = [signal.getsignal(number) for number in STOP_SIGNALS]
-    with StopRequest().at_once():
-        assert [signal.getsignal(number) for number in STOP_SIGNALS] == before
-
-
-def test_after_such_work_a_request_is_kept_again():
-    """After ``at_once`` a signal is a request again."""
-    with StopRequest().listening() as stop:
-        with stop.at_once():
-            pass
-        signal.raise_signal(signal.SIGUSR1)
-        assert stop.requested
-
-
 def test_a_signal_that_nohup_ignores_stays_ignored():
     """SIGHUP is no request to a process that was started to ignore it."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -105,18 +89,3 @@ def test_a_signal_that_nohup_ignores_stays_ignored():
     with StopRequest().listening() as stop:
         signal.raise_signal(signal.SIGHUP)
         assert not stop.requested
-
-
-def test_a_signal_while_handlers_are_replaced_is_a_request(monkeypatch):
-    """A signal that comes after the first handler is replaced, and before the others are, is a request as any other."""
-    replace = signal.signal
-
-    def replace_and_signal(number, handler):
-        before = replace(number, handler)
-        monkeypatch.undo()
-        signal.raise_signal(number)
-        return before
-
-    monkeypatch.setattr(signal, "signal", replace_and_signal)
-    with StopRequest().listening() as stop:
-        assert stop.requested

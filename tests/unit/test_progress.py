@@ -12,7 +12,6 @@ import pytest
 
 from vipetsc import process
 from vipetsc import progress as progress_module
-from vipetsc.process import say
 from vipetsc.progress import Progress
 
 pytestmark = pytest.mark.parallel(1)
@@ -41,23 +40,6 @@ def test_a_script_has_lines_and_an_end(written, monkeypatch):
 
     lines = written().splitlines()
     assert lines == [" 25 %  5 of 20 s, 15 s left", " 50 %  10 of 20 s, 10 s left", " 60 %  12 of 20 s in 12.0 s"]
-
-
-def test_nothing_is_written_that_was_not_asked_for(written):
-    """Progress that is not shown writes nothing, and a level above WARNING silences every line."""
-    quiet = Progress(MPI.COMM_SELF, 1.0, "s", show=False)
-    quiet.update(1.0)
-    quiet.close()
-    assert written() == ""
-
-    logger = logging.getLogger("vipetsc")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        say("a line")
-    finally:
-        logger.setLevel(level)
-    assert written() == ""
 
 
 def test_a_notebook_has_a_bar(written, monkeypatch):

@@ -135,21 +135,6 @@ def test_the_rules_find_what_they_forbid(text):
     assert broken_rules(text)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "import os\nos._exit(0)",
-        "from numba import extending\nclass A: pass\n@extending.register_model(A)\nclass B: pass",
-        "import sys\nsys.excepthook = None",
-        "from vipetsc.case import case\ncase.x = 1\ncase._y",
-        "import numpy as np\nx = np.zeros(3)\nx.flags.writeable = False",
-        "record._replace(a=1)",
-    ],
-)
-def test_the_rules_allow_what_is_public(text):
-    assert broken_rules(text) == []
-
-
 def class_members(path: Path) -> Iterator[tuple[str, set[str]]]:
     """Yield the top-level classes of a file, each with the names that its body defines."""
     for node in ast.parse(path.read_text(encoding="utf-8")).body:

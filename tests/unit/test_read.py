@@ -114,20 +114,6 @@ def test_a_run_that_lacks_a_variable_is_refused(run, tmp_path, name):
         open_run(run)
 
 
-def test_other_files_are_refused(tmp_path, folder):
-    """A missing file and a file of another kind are refused with the reason."""
-    with pytest.raises(OSError):
-        open_run(tmp_path / "absent.h5")
-
-    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it lacks time, cell, dof"):
-        open_run(folder / "ensemble.h5")
-
-    with h5py.File(tmp_path / "ensemble.h5", "w") as file:
-        file["time"] = 1.0
-    with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it lacks status, case"):
-        open_ensemble(tmp_path)
-
-
 @pytest.mark.filterwarnings("error")
 def test_members_are_selected_by_the_values_of_swept_keys(folder):
     """Members are selected by values of swept keys, single or together; a value that no member has is named."""

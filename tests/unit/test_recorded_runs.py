@@ -47,17 +47,6 @@ def test_a_record_of_a_rank_counts_more_than_the_merged_one(tmp_path):
     assert recorded_runs(tmp_path).read().records["run"]["value"] == 2
 
 
-def test_a_key_of_two_parts_is_found_again(tmp_path):
-    """JSON turns a tuple into a list; the record is still found under the tuple and not computed twice."""
-    key = ("site", 1.5)
-    recorded_runs(tmp_path).make([key], lambda key: {"value": 1})
-
-    runs = recorded_runs(tmp_path).read()
-    runs.make([key], lambda key: pytest.fail("it is there"))
-
-    assert runs.records[key]["value"] == 1
-
-
 def test_records_of_other_sources_are_not_continued(tmp_path):
     file = RecordFile(RecordPaths(tmp_path, "some-runs").for_rank(0))
     file.append({"key": "run", "source": f"{source_key()}0", "value": 1})

@@ -7,25 +7,13 @@ from collections.abc import Callable
 import h5py
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from vipetsc import register
 from vipetsc.case.registered import check_factors, check_law
 from vipetsc.case.waveforms import OneDrive, waveform_record
-from vipetsc.figures.registered import drawn, registered_figures
+from vipetsc.figures.registered import registered_figures
 from vipetsc.io.kinds import KIND_OF, STUDIES
 from vipetsc.lattice.drive import impulse
-from vipetsc.register import (
-    DISSIPATION,
-    FIGURE,
-    MEASURE,
-    PARTS,
-    WAVEFORM,
-    DissipationPart,
-    FigurePart,
-    PartError,
-    WaveformPart,
-)
+from vipetsc.register import DISSIPATION, FIGURE, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -40,12 +28,6 @@ class Formulas:
         self.elastic_slope = slope
         self.elastic_energy = energy
         self.onset_exponent = onset_exponent
-
-
-def test_a_sound_law_has_no_defect():
-    """A law with the force k x^1.5, its derivative and its integral passes the check."""
-    law = Formulas(lambda x: 2e6 * x**1.5, lambda x: 3e6 * x**0.5, lambda x: 0.8e6 * x**2.5, 1.5)
-    assert check_law(law) == ""
 
 
 @pytest.mark.parametrize(
@@ -94,40 +76,12 @@ def test_a_factor_that_is_no_number_is_named_with_its_file(monkeypatch, value):
         list(check_factors("contacts.damping", ["odd"], [0.5]))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
-def test_a_factor_that_feeds_energy_in_is_a_problem_of_its_file(monkeypatch, value):
-    part = DissipationPart(name="odd", function=lambda restitution: np.longdouble(value), **ORIGIN)
-    monkeypatch.setitem(PARTS[DISSIPATION], "odd", part)
-    (problem,) = check_factors("contacts.damping", ["odd"], [0.5])
-    assert __file__ in problem.remedy
-
-
 @pytest.mark.parametrize("amplitude", [np.nan, np.inf])
 def test_a_waveform_without_a_finite_force_is_named_with_its_file(monkeypatch, amplitude):
     part = WaveformPart(name="tap", function=lambda drive: impulse(amplitude, 0.1), **ORIGIN)
     monkeypatch.setitem(PARTS[WAVEFORM], "tap", part)
     with pytest.raises(PartError, match=r"the waveform 'tap' of .* not a finite number"):
         waveform_record("tap").build(OneDrive())
-
-
-@pytest.mark.parametrize("inches", [1e4, 1e-4])
-def test_a_figure_of_a_size_that_is_not_drawn_is_named_with_its_file(inches):
-    part = FigurePart(name="wide", function=lambda run: Figure(figsize=(inches, 3.0)), **ORIGIN)
-    with pytest.raises(PartError, match=r"the figure 'wide' of .* pixels"):
-        drawn(part, None)
-    assert drawn(FigurePart(name="ours", function=lambda run: Figure(), **ORIGIN), None)
-
-
-def test_a_part_that_is_typed_in_where_no_text_is_kept_has_a_hash(monkeypatch):
-    """At Python's own prompt a part has the hash of its compiled code: equal for equal code, another one for other."""
-    hashes = []
-    for value in ("1.0", "1.0", "2.0"):
-        monkeypatch.delitem(PARTS[MEASURE], "typed", raising=False)
-        text = f"@register.measure('typed', unit='1', text='')\ndef typed(record):\n    return {value}\n"
-        exec(compile(text, "<stdin>", "exec"), {"register": register, "__name__": "typed"})
-        hashes.append(PARTS[MEASURE].pop("typed").sha256)
-    assert len(hashes[0]) == 64
-    assert hashes[0] == hashes[1] != hashes[2]
 
 
 @pytest.mark.parametrize("frequency", [None, "fast", 0.0, np.nan, np.inf, np.complex128(3 + 1j), [3.0]])

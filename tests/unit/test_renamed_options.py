@@ -16,22 +16,9 @@ def in_database() -> dict[str, str]:
     return {name: value for name, value in PETSc.Options().getAll().items() if name.startswith("ts_")}
 
 
-def test_a_case_stores_the_earlier_name():
-    """A case with the later names of options equals the case with the earlier names, which it stores."""
-    later = small_case(petsc={"ts_time_step": 1e-5, "ts_max_step_rejections": 3})
-    assert later == small_case(petsc={"ts_dt": 1e-5, "ts_max_reject": 3})
-    assert later.petsc.model_dump() == {"ts_dt": "1e-05", "ts_max_reject": "3"}
-
-
 def test_both_names_are_refused():
     with pytest.raises(CaseError, match=r"petsc\.ts_time_step = .*is another name of ts_dt: give only one"):
         check_options(small_case(petsc={"ts_time_step": 1e-5, "ts_dt": 1e-5}))
-
-
-@pytest.mark.parametrize("name", ["ts_dt", "ts_time_step", "ts_max_reject", "ts_max_step_rejections"])
-def test_either_name_is_an_option_of_time_stepping(capfd, name):
-    check_options(small_case(petsc={name: "3"}))
-    assert "DEPRECATION" not in "".join(capfd.readouterr())
 
 
 @pytest.mark.parametrize("name", ["ts_dt", "ts_time_step"])

@@ -7,11 +7,10 @@ import copy
 import numpy as np
 import pytest
 
-from tests.conftest import search_table, with_sections
-from vipetsc.case import CaseError, case_id
-from vipetsc.case.keys import unit_of
+from tests.conftest import with_sections
+from vipetsc.case import case_id
 from vipetsc.case.optimise import OptimiseCase, SearchSpace, Variable
-from vipetsc.case.reading import put, value_at
+from vipetsc.case.reading import put
 from vipetsc.studies.sampler import CmaEs
 
 OWN_CELL = {
@@ -201,62 +200,6 @@ def test_clearances_that_vary_at_pressed_sites_are_warned_of(variables, key, pre
     # What the sentence says: the stop of a design is pressed by the difference of the two.
     design = plan.design(plan.begin())
     assert min(gap for stops in design.model().gaps for gap in stops) == pytest.approx(1e-7 - 1e-6)
-
-
-@pytest.mark.parametrize("key", ["stiffness", "precompression"])
-def test_other_keys_of_pressed_sites_vary_without_a_warning(key):
-    """Where no clearance varies at pressed sites, nothing is taken from the precompression that is not in the case."""
-    pressed = {"side": "minus", "restitution": 1.0, "precompression": 1e-6, "clearance": 0.0}
-    plan = plan_of({"contacts": {key: {"log": [1e-7, 1e-5]}}}, contacts=pressed)
-
-    assert not [sentence for sentence in plan.warnings() if "precompression" in sentence]
-
-
-def test_an_amplitude_that_varies_is_that_of_the_runs():
-    """An amplitude that varies is that of the runs; objectives at given amplitudes are refused beside it."""
-    variables = {"drive": {"amplitude": {"log": [1.0, 10.0]}}}
-    plan = plan_of(variables)
-    assert plan.design(np.array([7.0])).drive.amplitude == 7.0
-    # An objective at given amplitudes would replace the amplitude that varies.
-    with pytest.raises(CaseError, match=r"would take the place of drive\.amplitude"):
-        plan_of(variables, optimise={"objective": [{"measure": "entropy", "amplitudes": [2.0]}]})
-
-
-def test_keys_with_dots_are_found_and_changed():
-    """A path finds and changes a value also where keys contain dots."""
-    table = {"profiles": {"springs[1].stiffness": {"first": 1.0}, "masses[1]": [1.0, 2.0]}, "list": [{"a": 1}]}
-    for path, value in (
-        ("profiles.springs[1].stiffness.first", 3.0),
-        ("profiles.springs[1].stiffness", [4.0]),
-        ("profiles.masses[1][2]", 5.0),
-        ("list[1].a", 6),
-        ("new.b.c", 7),
-    ):
-        # ``put`` returns the problems of the path, of which there is none.
-        assert put(table, path, value) == []
-        assert value_at(table, path) == value
-
-    assert table == {
-        "profiles": {"springs[1].stiffness": [4.0], "masses[1]": [1.0, 5.0]},
-        "list": [{"a": 6}],
-        "new": {"b": {"c": 7}},
-    }
-    # An entry beyond a list, a missing table and a key of a list yield None.
-    assert value_at(table, "list[2].a") is value_at(table, "no.such") is value_at(table, "list.a") is None
-
-
-def test_the_text_of_a_search_over_keys_gives_the_same_search():
-    """A search over keys, dotted ones among them, is equal after a round trip as text; units are those of the keys."""
-    table = search_table(40, [10, 20], lattice={"profiles": {"springs[1].stiffness": {"first": 4e3, "last": 5e3}}})
-    profiles = {"springs[1].stiffness": {"last": {"log": [1e3, 1e4]}}}
-    table["optimise"]["variables"] = {"clearance": [1e-5, 1e-3], "lattice": {"profiles": profiles}}
-    first = OptimiseCase.from_table(table)
-    second = OptimiseCase.from_toml(first.to_toml())
-    assert second == first
-    assert second.variables() == first.variables()
-    units = {"contacts.clearance[1]": "m", "contacts.clearance.first": "m", "lattice.cell.masses[1]": "kg"}
-    units |= {"lattice.cell.springs[2].stiffness": "N/m", "contacts.each.restitution[1]": ""}
-    assert {path: unit_of(path, {}) for path in units} == units
 
 
 @pytest.mark.parametrize(

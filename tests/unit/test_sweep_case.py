@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.sweep import coordinate
 
-# The bound on the number of sites of all tried members together, in tests.
-MOST_TRIED_SITES = 2000
 BASE = """
 name = "small"
 [lattice]
@@ -37,27 +35,6 @@ def test_members_are_the_product_in_the_files_order():
 
     table = tomllib.loads(BASE) | {"drive": {"amplitude": 2.0}, "contacts": {"sites": 2}, "time": {"engine": "auto"}}
     assert cases[3] == Case.from_table(table)
-
-
-def test_a_key_may_be_written_in_one_piece():
-    """A quoted key with dots names the same axis as a table of its section."""
-    nested = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0]\n[sweep.contacts]\nsites = [1, 2]")
-    flat = sweep_of('[sweep]\n"drive.amplitude" = [1.0, 2.0]\n"contacts.sites" = [1, 2]')
-
-    assert flat.ids() == nested.ids()
-    assert flat.members() == nested.members()
-
-
-def test_ranges():
-    """A logarithmic range has equal ratios, a linear one equal differences, both with their ends."""
-    plan = sweep_of(
-        "[sweep.drive]\namplitude = { log = [0.1, 10], count = 3 }\nfrequency = { linear = [1, 2], count = 5 }"
-    )
-
-    amplitude, frequency = (next(iter(axis.values())) for axis in plan.axes)
-
-    assert amplitude == pytest.approx([0.1, 1.0, 10.0], rel=1e-15)
-    assert frequency == (1.0, 1.25, 1.5, 1.75, 2.0)
 
 
 def test_zipped_keys_vary_together_and_share_a_dimension():
@@ -94,12 +71,6 @@ def test_coordinates_are_numbers_where_they_can_be():
     assert list(coordinate([1, {"first": 3, "count": 2}])) == ["1", '{"first": 3, "count": 2}']
 
 
-def test_a_point_before_pi_is_no_number():
-    """Only digits are a factor of pi: ".5pi" is a number, and ".pi" is a text, which no key with a number takes."""
-    assert coordinate([".5pi", 1.0]).tolist() == [np.pi / 2, 1.0]
-    assert coordinate([".pi", 1.0]).tolist() == [".pi", "1.0"]
-
-
 def test_written_out_and_read_back_it_has_the_same_members():
     """The text of a sweep gives the same members under the same names."""
     plan = sweep_of('[sweep.drive]\nwavenumber = ["2pi/9", "5pi/9"]\namplitude = { log = [0.1, 20.0], count = 7 }')
@@ -120,12 +91,6 @@ def test_one_impossible_member_does_not_spoil_the_others():
     assert "contacts.sites = [99]" in str(members[1].problems[0])
     assert plan.warnings() == [f"members that will fail: {members[1].problems[0]} (1 member)"]
     assert not sweep_of("[sweep.contacts]\nsites = [[10], [20]]").warnings()
-
-
-def test_what_matrices_make_does_not_vary_with_them():
-    """A sweep over matrices, which replace springs, may not vary single springs as well."""
-    with pytest.raises(CaseError, match=r"springs\[2\].stiffness.*lattice.cell.matrices"):
-        sweep_of('[sweep.lattice.cell]\nmatrices = ["a.npz", "b.npz"]\n"springs[2].stiffness" = [1.0, 2.0]').members()
 
 
 def test_names_of_members_are_those_of_their_values():
@@ -154,19 +119,6 @@ def test_a_number_or_a_name_finds_its_member():
     for name in ("6", "-1", "0123456789abcdef"):
         with pytest.raises(CaseError, match="is not a member; ensemble"):
             plan.number(name)
-
-
-@pytest.mark.slow
-def test_many_members_are_cheap_until_one_is_asked_for():
-    """A sweep of 250 000 members has their names in seconds, since no case is resolved until it is asked for."""
-    plan = sweep_of("[sweep.drive]\namplitude = { linear = [0.0, 1.0], count = 250_000 }")
-
-    assert plan.count == 250_000
-    assert len(plan.ids()) == 250_000
-    assert len(plan.members(20)) == 20
-    # No wave has the amplitude 0.
-    assert plan.member(0).case is None
-    assert plan.case(plan.count - 1).drive.amplitude == 1.0
 
 
 @given(
@@ -203,39 +155,6 @@ def test_a_range_meets_decimal_numbers_without_rounding():
     assert values("{ linear = [-0.1, 0.2], count = 4 }") == (-0.1, 0.0, 0.1, 0.2)
     # Small values of a logarithmic range over 16 decades are not taken for 0.
     assert values("{ log = [1e-9, 1e7], count = 3 }") == (1e-9, 0.1, 1e7)
-
-
-def test_a_member_is_resolved_once():
-    """A member is kept once it is resolved, and not passed on to a copy of the sweep, whose cases differ."""
-    plan = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0]")
-
-    members = plan.members()
-
-    assert plan.member(1) is members[1]
-    assert plan.members()[1] is members[1]
-    assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]
-
-
-def test_fewer_members_of_many_sites_are_tried_before_a_sweep_begins(monkeypatch):
-    """The members by which a sweep is checked have a bounded number of sites together, and one is always tried."""
-    # The bound is a hundredth of the program's, since cases with that many sites take seconds.
-    monkeypatch.setattr("vipetsc.case.sweep.MOST_TRIED_SITES", MOST_TRIED_SITES)
-    sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nclearance = 1e-3\nsites = "
-    assert len(sweep_of(sweep + "2").tried()) == 60
-
-    long = BASE.replace("cells = 40", "cells = 3000")
-    some = Sweep.from_table(tomllib.loads(f"{long}{sweep}{MOST_TRIED_SITES // 4}"))
-    assert len(some.tried()) == 4
-    many = Sweep.from_table(tomllib.loads(f"{long}{sweep}{{ first = 1, last = 2900, count = {MOST_TRIED_SITES + 1} }}"))
-    assert len(many.tried()) == 1
-
-
-def test_a_sweep_of_many_sites_that_is_no_case_is_refused_by_one_member(monkeypatch):
-    """A sweep whose members are all wrong is refused as soon as one of many sites has been tried."""
-    monkeypatch.setattr("vipetsc.case.sweep.MOST_TRIED_SITES", MOST_TRIED_SITES)
-    sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nsites = 2500"
-    with pytest.raises(CaseError, match=r"contacts\.sites"):
-        Sweep.from_table(tomllib.loads(BASE + sweep)).tried()
 
 
 @pytest.mark.parametrize(("section", "value"), [("contacts", [0]), ("contacts", "1e9"), ("output", 0)])

@@ -114,22 +114,6 @@ def test_trial_cases_of_records_are_those_that_are_read(record):
     assert_same(trials, trial_values(base, parameters, factor=1.02))
 
 
-def test_sites_may_come_to_have_one_number():
-    """Numbers of sites may become equal and differ again, though a case has another key for equal numbers."""
-    base = base_of("preset")
-    trials = TrialCases(base, sought(base, "restitution", "each"), {})
-    for values in ([0.5, 0.6, 0.7], [0.6, 0.6, 0.6], [0.8, 0.8, 0.8], [0.7, 0.6, 0.5]):
-        assert_same(trials, values)
-
-
-def test_a_part_of_a_spring_may_vanish():
-    """A nonlinear part of a spring may become zero, though the text of a case omits it then."""
-    base = base_of("own cell")
-    trials = TrialCases(base, sought(base, "quadratic", "each"), {})
-    for values in ([1e5, 2e5], [1e5, 0.0]):
-        assert_same(trials, values)
-
-
 @pytest.mark.parametrize(
     ("name", "contacts", "quantity", "valid", "wrong"),
     [

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from tests.conftest import simulated, small_case
-from vipetsc.case import Case, LawCase
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case import Case
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.wave_at_sites import wave_over_clearance
-from vipetsc.dynamics.recorder import Recorder
 from vipetsc.lattice import Contact
 
 SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband-one-site", "packet", "chirp",
@@ -24,14 +19,6 @@ SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband
 def test_cases_that_are_as_they_should_be(name):
     """The cases in ``runs`` give no warning."""
     assert Case.load(f"runs/examples/{name}.toml").warnings() == []
-
-
-@pytest.mark.parametrize("preset", ["four-band", "diatomic"])
-@pytest.mark.parametrize("reading", ["printed", "calibrated"])
-def test_the_built_in_cases(preset, reading):
-    """Presets without further keys give no warning, but for the one whose default wave closes no clearance."""
-    sentences = Case.from_table({"lattice": {"preset": preset, "reading": reading}}).warnings()
-    assert ["closes" in sentence for sentence in sentences] == [True] * ((preset, reading) == ("diatomic", "printed"))
 
 
 def warnings_of(**sections) -> list[str]:
@@ -52,12 +39,6 @@ def test_a_wave_that_cannot_come_back():
     """A ring has no end to return from, and a run may end before the wave is back."""
     assert warnings_of(time={"end": 0.09}, lattice={"ends": "periodic"}) == []
     assert warnings_of(time={"end": 0.079}) == []
-
-
-def test_a_wave_that_comes_back_where_it_is_recorded():
-    """Without sites the warning names the recorded window to which the wave comes back."""
-    sentence, *_ = warnings_of(contacts={"sites": []}, output={"window": [2, 20]}, time={"end": 0.09})
-    assert "returns to the cell 20 at" in sentence
 
 
 def test_a_wave_that_comes_back_from_either_end():
@@ -82,25 +63,6 @@ def test_waves_that_hardly_move():
     assert not any("near an edge" in sentence for sentence in at_frequency(700.0))
 
 
-def test_a_wave_longer_than_the_lattice():
-    """A lattice shorter than the wave is named with both lengths; 130 cells hold four wavelengths."""
-    slow = {"drive": {"frequency": 100.0, "cycles": 1}, "time": {"end": 0.07}}
-
-    sentence, *_ = warnings_of(**slow)
-
-    assert "lattice.cells = 24 contain only 0.741 wavelengths of 32.37 cells" in sentence
-    assert "0.262 rad/cell" in sentence
-    assert not [sentence for sentence in warnings_of(**slow, lattice={"cells": 130}) if "wavelengths" in sentence]
-
-
-def test_a_steady_drive_has_no_wave_that_is_too_long_or_comes_back():
-    """Reflections are part of a steady motion, whatever its wavelength."""
-    steady = {"waveform": "harmonic", "amplitude": 1.0, "frequency": 100.0, "ramp": 0.01}
-    table = {"lattice": {"preset": "four-band", "cells": 24}, "drive": steady, "time": {"end": 0.3}}
-    sentences = Case.from_table(table).warnings()
-    assert not [sentence for sentence in sentences if "returns" in sentence or "wavelengths" in sentence]
-
-
 def test_waves_that_close_no_clearance_or_all_of_them():
     """A warning has the linear wave over the clearance where it is below 1 everywhere, or above 100."""
     case = small_case(time={"end": 0.04})
@@ -110,14 +72,6 @@ def test_waves_that_close_no_clearance_or_all_of_them():
     for factor, word in (0.99, "no contact closes"), (1.01, ""), (99.0, ""), (101.0, "times the clearance"):
         sentences = " ".join(warnings_of(drive={"amplitude": amplitude * factor / ratios.max()}))
         assert (word in sentences) if word else "clearance" not in sentences, factor
-
-
-def test_a_drive_of_many_frequencies_has_no_wave_to_compare():
-    """An impulse and a chirp send waves of many frequencies, none of which tells what closes."""
-    table = {"lattice": {"preset": "four-band", "cells": 24}, "contacts": {"sites": [6]}, "time": {"end": 0.01}}
-    for drive in {"waveform": "impulse", "duration": 1e-3}, {"waveform": "step", "ramp": 1e-3}:
-        sentences = Case.from_table(table | {"drive": {"amplitude": 1e-3} | drive}).warnings()
-        assert not any("clearance" in text for text in sentences)
 
 
 def test_the_wave_at_a_site_is_that_of_a_linear_run():
@@ -191,20 +145,6 @@ def test_the_time_of_a_contact_is_that_of_the_masses_it_joins():
     assert duration() != duration(pair=[0, 3])
 
 
-def test_verbs_warn_of_what_concerns_them():
-    """Recording one cell in two concerns a run and a search; a law and a frequency response curve record nothing."""
-    sparse = ["output.every=2"]
-
-    assert "one cell in 2" in Case.load("runs/examples/law.toml", sparse).warnings()[0]
-    assert LawCase.load("runs/examples/law.toml", sparse).warnings() == []
-    assert NfrcCase.load("runs/examples/nfrc.toml", sparse).warnings() == []
-    search = OptimiseCase.load("runs/examples/optimise-clearances.toml", sparse)
-    assert search.warnings() == search.base.warnings() != []
-
-    (sentence,) = PredictCase.load("runs/examples/predict.toml", ["output.every=2", "time.end=20.0"]).warnings()[:1]
-    assert "before time.end" in sentence
-
-
 def drive_of_samples(folder, unit: float = 1.0, **keys) -> dict:
     """Return a drive of a burst at the four-band lattice's 1020 rad/s, whose file has its times in a ``unit`` (s)."""
     times = np.arange(600) * 1e-4
@@ -225,26 +165,6 @@ def test_times_that_are_not_in_seconds(tmp_path, unit, span):
     assert sentence.endswith("rad/s and they would last 0.0599 s")
 
 
-def test_samples_far_over_the_waves(tmp_path):
-    """Samples far above the frequencies of the waves have a warning, also in a further drive."""
-    drive = {"amplitude": 1.0, "cycles": 5, "more": [drive_of_samples(tmp_path, 1e4, frequency=1020.0)]}
-    case = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive, time={"end": 0.05})
-    (sentence,) = [sentence for sentence in case.warnings() if "samples:" in sentence]
-    assert sentence.startswith("drive.more[1].samples: 95 % of their energy lies above 9")
-    assert "in s, and the lattice in kg and N/m?" in sentence
-
-
-def test_samples_among_the_waves_raise_no_question(tmp_path):
-    """Samples of a burst in a band, and of a slow push as long as waves need, have no warning."""
-    quiet = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive_of_samples(tmp_path), time={"end": 0.1})
-    assert not [sentence for sentence in quiet.warnings() if "samples:" in sentence]
-
-    samples = {"time": [0.0, 0.01, 0.02, 0.03], "value": [0.0, 1.0, 1.0, 0.0]}
-    push = {"waveform": "samples", "samples": samples, "frequency": 100.0}
-    pushed = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=push, time={"end": 0.1})
-    assert not [sentence for sentence in pushed.warnings() if "samples:" in sentence]
-
-
 def test_a_run_that_ends_within_its_burst_or_ramp():
     """A run that ends within a burst has a warning, and with a harmonic drive one that ends within its ramp.
 
@@ -261,21 +181,6 @@ def test_a_run_that_ends_within_its_burst_or_ramp():
 
     assert endless(0.08) == []
     assert endless(0.06) == ["time.end = 0.06 s is before the end of the drive's ramp, at 0.0628319 s"]
-
-
-def test_a_run_that_ends_within_the_drive_of_cells_that_contacts_alone_join():
-    """Grains without waves have the warning too; a run that ends with its pulse has none, and a pulse is no burst."""
-
-    def of_grains(end: float) -> list[str]:
-        return Case(
-            lattice={"cell": {"masses": [1.0]}, "cells": 8},
-            contacts={"stiffness": 1e6, "sites": [1, 2, 3], "clearance": 1e-5, "pair": [1, 1], "next_cell": True},
-            drive={"waveform": "impulse", "amplitude": 1.0, "duration": 0.01},
-            time={"end": end, "sample_interval": 1e-4},
-        ).warnings()
-
-    assert [text for text in of_grains(0.01) if "before" in text] == []
-    assert "time.end = 0.004 s is before the end of the drive, at 0.01 s" in of_grains(0.004)
 
 
 def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
@@ -298,22 +203,3 @@ def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
 
     assert warned(302.5)
     assert not warned(301.5)
-
-
-@pytest.mark.parametrize(
-    ("gaps", "nothing"),
-    [
-        ([1e-3], "nothing reached the site"),
-        ([1e-3, 1e-3], "nothing reached any of the 2 sites"),
-        ([0.0], "nothing pressed the site that touches its stop at rest"),
-        ([0.0, 1e-3, 1e-3], "nothing pressed the site that touches its stop at rest"),
-        ([0.0, 0.0, 1e-3], "nothing pressed any of the 2 sites that touch their stops at rest"),
-    ],
-)
-def test_a_run_without_contact(gaps, nothing):
-    """A run without contact says which sites were not reached; of sites that touch at rest, that none was pressed."""
-    chain = SimpleNamespace(sites=range(len(gaps)))
-    model = SimpleNamespace(chain=chain, gaps=[(gap, np.inf) for gap in gaps])
-    recorder = Recorder()
-    recorder.setup = SimpleNamespace(model=model, case=SimpleNamespace(contact_radius=None))
-    assert recorder.warnings() == [f"no contact: {nothing}"]

@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from tests.conftest import record_of_linear
 from vipetsc.case import Case
-from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import RecordFile
-from vipetsc.studies import backbone
-from vipetsc.studies.backbone import BRANCH, LAYOUT, LEAST_FITTED, align, initiation_of, read_slope, relate_folders
+from vipetsc.studies.backbone import BRANCH, LAYOUT, LEAST_FITTED, align, initiation_of, read_slope
 from vipetsc.studies.linear_run import LinearRun, linear_name
 
 GRAZING = 0.03
@@ -77,12 +75,6 @@ def linear_record(folder, *overrides: str) -> Case:
     return case
 
 
-def test_the_nearer_stop_is_touched_first(tmp_path):
-    """A wave moves a mass in both directions, so that contact begins at the smaller one of two clearances."""
-    case = linear_record(tmp_path, "contacts.side='both'", "contacts.clearance=2e-3", "contacts.clearance_minus=1e-3")
-    assert initiation_of(tmp_path, case).onset == pytest.approx(1e-3 / 2e-4, rel=1e-14)
-
-
 @pytest.mark.parametrize(
     ("override", "reason"),
     [
@@ -115,18 +107,6 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
     assert found.attrs["exponent"] == pytest.approx(exponent, abs=1e-9)
     assert found.attrs["slope_exponent"] == pytest.approx(exponent, abs=1e-9)
     assert found.attrs["r2_adjusted"] == pytest.approx(1.0, abs=1e-12)
-
-
-@pytest.mark.parametrize("floor", [0.0, 1e-4, 1e-2])
-def test_floor_is_part_of_the_divisors_fit(floor):
-    """The divisor of a transfer slope/divisor + floor is found for any given floor."""
-    slope = branch()
-    divisor = 4e3
-    work, transfer = exact_transfer(divisor, floor)
-
-    found = align(work, transfer, INITIATION, floor, slope)
-
-    assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
 
 
 @pytest.mark.parametrize("floor", [0.5, 5.0, 1e3])
@@ -215,25 +195,3 @@ def test_branch_is_read_at_its_regular_points(tmp_path):
     assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)
     assert found.sizes["point"] == slope.sizes["point"] - 1
     assert found.attrs == {"law": "hertz", "reading": "printed"}
-
-
-def test_a_change_in_either_of_two_branches_of_one_name_is_seen(tmp_path):
-    """What was related to folders "a/nnm" and "b/nnm" is stale when either of them has changed."""
-    sweep = tmp_path / "sweep"
-    branches = [tmp_path / parent / "nnm" for parent in "ab"]
-    for folder, name in ((sweep, "ensemble.h5"), *((branch, BRANCH) for branch in branches)):
-        folder.mkdir(parents=True)
-        (folder / name).write_bytes(b"as it was")
-    before = backbone._sources(sweep, branches)
-    assert list(before) == ["sweep", "a/nnm", "b/nnm"]
-    for changed in branches:
-        (changed / BRANCH).write_bytes(b"as it is")
-        after = backbone._sources(sweep, branches)
-        assert after != before
-        before = after
-
-
-def test_folders_without_the_branch_are_refused(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FolderError, match=BRANCH):
-        relate_folders([tmp_path / "empty"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 from xml.etree import ElementTree
 
@@ -17,11 +16,8 @@ import xarray as xr
 import vipetsc as package
 from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.case import Case, Sweep
-from vipetsc.cli.verbs.file_verbs import write_exports
 from vipetsc.dynamics import simulate
 from vipetsc.io import export
-from vipetsc.io.errors import FolderError
-from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies.sweep import run_sweep
 
@@ -81,26 +77,6 @@ def test_every_reference_of_the_mesh_leads_to_its_field(folder):
         assert (origin[0] + spacing[0] * np.arange(len(cells))).tolist() == cells.tolist()
 
 
-def test_long_runs_show_every_nth_sample_to_the_end(folder, monkeypatch, tmp_path):
-    """A long run lists every nth sample from the first on, with the least n for at most MOST_FRAMES frames."""
-    monkeypatch.setattr(export, "MOST_FRAMES", 7)
-    shutil.copy(folder / "run.h5", tmp_path)
-    export.write_xdmf(tmp_path)
-    grids = ElementTree.parse(tmp_path / "run.xdmf").getroot().findall("Domain/Grid/Grid")
-    with open_run(tmp_path / "run.h5") as run:
-        times = run["field_time"].values
-
-    shown = [float(grid.find("Time").get("Value")) for grid in grids]
-
-    assert len(shown) <= 7
-    assert shown == times[:: -(-len(times) // 7)].tolist()
-
-
-def test_a_run_without_fields_has_no_mesh(tmp_path):
-    simulate(small_case(**FAST, output={"fields": []}), tmp_path)
-    assert export.write_xdmf(tmp_path) is None
-
-
 def test_groups_carry_their_time_in_plain_xarray(folder):
     """Plain xarray, which opens one group at a time, finds coordinates of the file, since they are linked into each."""
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf") as run:
@@ -114,23 +90,6 @@ def test_groups_carry_their_time_in_plain_xarray(folder):
         assert impacts.loss.sizes["episode"] > 2
 
 
-def test_links_are_no_variables_and_are_replaced_by_one(tmp_path):
-    """A reader sees no linked coordinates, and no link replaces a group's variable that has a coordinate's name."""
-    data = {
-        "time": variable("time", [0.0, 1.0], "s", "time"),
-        "site": variable("site", [1, 2, 3], "1", "site"),
-        "g/a": variable(["time", "site"], np.ones((2, 3)), "1", "a"),
-        "g/site": variable("time", [5.0, 6.0], "1", "not the coordinate"),
-    }
-    write_netcdf(tmp_path / "x.h5", xr.Dataset(data))
-
-    with open_netcdf(tmp_path / "x.h5", "file") as back:
-        assert set(back.variables) == {"time", "site", "g/a", "g/site"}
-        assert back["g/site"].values.tolist() == [5.0, 6.0]
-        assert back["g/site"].dims == ("time",)
-        assert back["g/a"].dims == ("time", "site")
-
-
 def test_open_gives_units_and_the_case(folder):
     with package.open(folder) as run, package.open(folder / "run.h5") as same:
         assert run["velocity"].attrs["units"] == "m/s"
@@ -139,16 +98,6 @@ def test_open_gives_units_and_the_case(folder):
         assert Case.of(run) == Case.of(same)
         assert Case.of(run).lattice.cells == 16
         assert set(run.variables) == set(datasets(folder / "run.h5"))
-
-
-def test_open_names_what_it_cannot_choose(tmp_path):
-    with pytest.raises(ValueError, match="no results"):
-        package.open(tmp_path)
-
-    for name in ("branch-a.h5", "branch-b.h5"):
-        (tmp_path / name).touch()
-    with pytest.raises(ValueError, match=r"branch-a.h5, branch-b.h5; name a file"):
-        package.open(tmp_path)
 
 
 def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
@@ -189,18 +138,6 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
         assert row["ibtet"].item() == picked["ibtet"].item()
 
 
-def test_a_full_disk_is_no_error_of_the_results(folder, monkeypatch):
-    """A full disk while curves are written is an OSError, not a FolderError, which would blame the run."""
-
-    def fail(path, text):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(export, "write_text", fail)
-    with pytest.raises(OSError, match="No space left") as raised:
-        write_exports(folder)
-    assert not isinstance(raised.value, FolderError)
-
-
 @pytest.mark.parametrize("name", ["missing.h5", "case.toml"])
 def test_a_file_without_results_next_to_a_run_is_refused_before_anything_is_written(folder, in_process, tmp_path, name):
     """Bad input leaves no file: neither a missing file nor one of another kind brings the mesh of the run beside it."""
@@ -210,10 +147,3 @@ def test_a_file_without_results_next_to_a_run_is_refused_before_anything_is_writ
     assert ended.returncode == 2
     assert name in ended.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "run.h5"]
-
-
-def test_what_holds_no_results_is_refused(in_process, tmp_path):
-    ended = in_process("export", tmp_path)
-    assert ended.returncode == 2
-    assert "contains no results" in ended.stderr
-    assert not any(tmp_path.iterdir())

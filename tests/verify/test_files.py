@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
 from mpi4py import MPI
 
@@ -17,7 +16,6 @@ from vipetsc import Case, simulate
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.dynamics.ts import integrator
 from vipetsc.io.lock import FolderError
-from vipetsc.studies import reanalysis
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.analysis_options import is_measured
 from vipetsc.studies.reanalysis import measure_run, reanalyse_folders
@@ -103,26 +101,6 @@ def test_a_stalled_run_states_when_and_where_and_keeps_its_samples(folder, monke
     assert summary["status"] == result.sentence
 
 
-def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
-    """A run ends where a mass's displacement becomes NaN, names the cell, and keeps the samples before."""
-    advance = integrator.Integrator.advance
-
-    def poisoned(self, target):
-        going = advance(self, target)
-        if target > 0.0301:
-            self.state.array[3] = np.nan
-        return going
-
-    monkeypatch.setattr(integrator.Integrator, "advance", poisoned)
-    result = simulate(small_case(time={"end": 0.0302}), folder / "run")
-    assert "not finite" in result.sentence
-    assert "cell 4, nearest site 1 in cell 6" in result.sentence
-
-    run = datasets(folder / "run" / "run.h5")
-    assert run["time"][-1] == pytest.approx(0.03)
-    assert np.isfinite(run["displacement"]).all()
-
-
 @pytest.mark.slow
 def test_another_analysis_of_the_same_run(run_folder, folder):
     """With other keys of [analysis] a run is measured anew, not simulated; any other key makes another case."""
@@ -147,20 +125,6 @@ def test_another_analysis_of_the_same_run(run_folder, folder):
             reanalyse_folders([folder / "run"], MPI.COMM_SELF, overrides)
     with pytest.raises(FolderError, match=r"drive\.amplitude"):
         simulate(small_case(drive={"amplitude": 2.0}), folder / "run")
-
-
-@pytest.mark.parametrize("named", [".", "run.h5", "../run"])
-def test_a_run_is_measured_from_its_own_folder(run_folder, folder, monkeypatch, named):
-    """The linear run of a sweep is looked for in the folder that contains the run's, however the run is named."""
-    shutil.copytree(run_folder, folder / "run")
-    monkeypatch.chdir(folder / "run")
-    asked = []
-    monkeypatch.setattr(reanalysis, "read_linear", lambda sweep, case: asked.append(Path(sweep).resolve()))
-
-    (written,) = reanalyse_folders([Path(named)], MPI.COMM_SELF)
-    measure_run(Path("."))
-    assert written.resolve() == folder.resolve() / "run" / "analysis.h5"
-    assert asked == [folder.resolve()] * 2
 
 
 @pytest.mark.slow

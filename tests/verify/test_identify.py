@@ -11,8 +11,7 @@ from tests.conftest import run_of
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.identification.growing_windows import Fit, GrowingWindows, Window, other_contacts
-from vipetsc.identification.least_squares import Precision
+from vipetsc.identification.growing_windows import other_contacts
 from vipetsc.identification.uncertainty import errors_with_sensor, ljung_box, quantile, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
@@ -148,40 +147,6 @@ def test_samples_of_a_record_need_not_be_those_of_the_engine(tmp_path, begin, la
     assert motion.onset == pytest.approx(onsets[onsets < times[-1]], abs=1e-9)
 
 
-def test_a_force_is_that_of_its_drive_behind_a_wall_of_two_springs(tmp_path):
-    """A wall acts through two springs, and a force sensor of the second drive has that drive's force."""
-    springs = [
-        {"start": 2, "end": 1, "stiffness": 2e4, "next_cell": True},
-        {"start": 2, "end": 2, "stiffness": 1e3, "next_cell": True},
-        {"start": 1, "end": 2, "stiffness": 1e4},
-    ]
-    force = {"waveform": "harmonic", "amplitude": 2.0, "frequency": 700.0, "cell": 3}
-    wall = {"waveform": "harmonic", "end": "left", "amplitude": 1e-5, "frequency": 500.0, "more": [force]}
-    table = {
-        "name": "wall",
-        "lattice": {"cell": {"masses": [0.01, 0.02], "springs": springs}, "cells": 6},
-        "contacts": {"sites": [3], "clearance": 1e-3, "stiffness": 1e6},
-        "drive": wall,
-        "time": {"end": 0.004, "sample_interval": 1e-4},
-    }
-    times = 1e-4 * np.arange(1, 41)
-    path = tmp_path / "wall.csv"
-    np.savetxt(path, np.column_stack([times, np.sin(times), np.cos(times)]), delimiter=",")
-    sensors = [{"quantity": "velocity", "column": 2, "cell": 2}, {"quantity": "force", "column": 3, "drive": 2}]
-    unknowns = [{"quantity": "amplitude", "bounds": [1e-6, 1e-4]}]
-    record = {"file": str(path), "time": 1, "sensors": sensors}
-    work = fits_of(identify_table(table, record, unknowns=unknowns))
-
-    # The amplitude that is sought is that of the wall: it moves the mass, and does not change the other drive's force.
-    misfit = work.windows().misfit
-    values = misfit.predicted(work.starts()[0], 0, 1.0)
-    slopes = slopes_of(misfit, work.starts()[0])
-    assert np.any(slopes, axis=0).tolist() == [[True], [False]]
-    *of_springs, second = work.plan.base.model().drives
-    assert len(of_springs) == 2
-    assert values[:, 1] == pytest.approx(second.waveform.force(times), abs=1e-9)
-
-
 @pytest.mark.slow
 def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     """From starts 30 % off, three sensors determine three clearances, the stiffness and the restitution to 1e-6."""
@@ -197,43 +162,6 @@ def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     # The residuals are rounding errors, whose whiteness is not judged.
     assert found.attrs["warnings"] == "[]"
     assert found["windows/impacts"].values[-1] > 5
-
-
-def test_windows_of_two_records_grow_as_those_of_one(tmp_path, monkeypatch):
-    """Windows grow by the contacts in each record: a record given twice has the windows of the record given once."""
-    monkeypatch.setattr(GrowingWindows, "solve", lambda self, z, *_: z)
-    table = lattice_table()
-    record = measured_table(tmp_path, table)
-    ends = []
-    for records in ([record], [record, record]):
-        identification = fits_of(identify_table(table, records, impacts=1, growth=1.3))
-        fits = identification.windows()
-        truth = [5e-4, 4e-4, 3e-4, 0.7]
-        z = np.array([p.to_coordinate(value) for p, value in zip(identification.plan.parameters, truth, strict=True)])
-        ends.append([window.end for window in fits.fit(z).windows])
-
-    assert len(ends[0]) > 6
-    assert ends[0] == pytest.approx(ends[1], rel=1e-6)
-
-
-def test_a_start_has_the_misfit_of_its_better_pass(tmp_path, monkeypatch):
-    """Of two passes the one with the lower deviance gives the fit its parameters and its misfit."""
-    fits = fits_of(identify_table(lattice_table(), measured_table(tmp_path, lattice_table())))
-    start = fits.starts()[0]
-    passes = iter([(10.0, 1.1), (20.0, 2.2)])
-
-    def one_pass(self, z, windows):
-        deviance, misfit = next(passes)
-        z = start + 0.1 * (misfit > 2)
-        windows.append(Window(end=1.0, impacts=1, most_impacts=1, misfit=misfit, coordinates=z))
-        return Fit(coordinates=z, deviance=deviance, misfit=misfit, windows=windows, noise=self.misfit.noise)
-
-    monkeypatch.setattr(GrowingWindows, "_pass", one_pass)
-    # The last fit, a precise one, begins at the better one.
-    monkeypatch.setattr(GrowingWindows, "solve", lambda self, z, ends, active, precision: z)
-    record = fits.fit(0)
-    assert record["coordinates"] == start.tolist()
-    assert [row["misfit"] for row in record["windows"]] == [1.1, 2.2, record["misfit"]]
 
 
 @pytest.mark.slow
@@ -302,21 +230,6 @@ def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, s
 
 
 @pytest.mark.slow
-def test_a_clearance_out_of_reach_does_not_slow_the_others_down(tmp_path):
-    """A clearance that is never reached has a zero column in the Jacobian; the other parameters converge."""
-    table = lattice_table(contacts={"clearance": [5e-4, 4e-4, 5e-3]}, time={"end": 0.014})
-    unknowns = [
-        {"quantity": "clearance", "of": "each", "bounds": [5e-5, 6e-3], "start": [5.02e-4, 3.98e-4, 5e-3]},
-        {"quantity": "stiffness", "bounds": [1e4, 1e9]},
-        {"quantity": "restitution", "bounds": [0.2, 1.0], "start": 0.71},
-    ]
-    work = fits_of(identify_table(table, measured_table(tmp_path, table), unknowns=unknowns))
-    windows = work.windows()
-    z = windows.minimum(work.starts()[0], windows.last, range(5), Precision(steps=12)).coordinates
-    assert windows.misfit.values(z)[[0, 1, 4]] == pytest.approx([5e-4, 4e-4, 0.7], rel=1e-8)
-
-
-@pytest.mark.slow
 def test_beads_without_springs_determine_their_restitution(tmp_path):
     """Two free beads that collide once, with nothing else between them, have their restitution in the record."""
     beads = {
@@ -335,21 +248,6 @@ def test_beads_without_springs_determine_their_restitution(tmp_path):
     unknowns = [{"quantity": "restitution", "bounds": [0.2, 1.0], "start": 0.6}]
     found = results_of(tmp_path / "out", identify_table(beads, record, unknowns=unknowns))
     assert found["value"].values == pytest.approx([0.85], rel=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("contacts", [{"clearance": 0.0}, {"clearance": 0.0, "precompression": 2e-5}])
-def test_contacts_that_touch_at_rest_determine_their_stiffness(tmp_path, contacts):
-    """Records of a lattice whose stops touch or press at rest give the stiffness of the contacts."""
-    table = lattice_table(
-        contacts=contacts | {"restitution": 1.0, "side": "plus", "sites": [3], "law": "bilinear", "stiffness": 3e4},
-        time={"end": 0.014},
-        drive={"amplitude": 5.0},
-    )
-    unknowns = [{"quantity": "stiffness", "bounds": [1e4, 1e5], "start": 2e4}]
-    record = measured_table(tmp_path, table)
-    found = results_of(tmp_path / "out", identify_table(table, record, unknowns=unknowns))
-    assert found["value"].values == pytest.approx([3e4], rel=1e-6)
 
 
 @pytest.mark.slow

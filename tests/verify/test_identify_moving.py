@@ -91,23 +91,6 @@ def test_a_displaced_lattice_determines_its_stop_and_its_initial_state(tmp_path)
     assert found.attrs["warnings"] == "[]"
 
 
-def test_a_struck_lattice_begins_as_the_case_says(tmp_path):
-    """A record may state that a mass is struck at the offset, in place of the case's [initial].
-
-    The record is used from a time after the strike on, and the first window has one impact after that time.
-    """
-    times = np.arange(0.0, 0.15, 1 / 2000)
-    chain_record(tmp_path / "strike.csv", np.zeros(4), np.array([0.0, 1.1, 0.0, 0.0]), times, clock=-2.0)
-    strike = {"cell": 2, "velocity": 1.1}
-    table = chain_table(tmp_path / "strike.csv", offset=-2.0, begin=-1.92, initial=strike)
-    # The first window has one impact.
-    table["identify"]["impacts"] = 1
-    found = results_of(tmp_path / "out", table)
-    assert found["value"].values == pytest.approx([4e-4, 2e6, 0.8, 3.0], rel=1e-6)
-    # No initial state was estimated, since the record states it.
-    assert found.sizes["moving"] == 0
-
-
 def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
     """The identification of a row of masses, shaken by its left frame, with unlike stops on both sides.
 

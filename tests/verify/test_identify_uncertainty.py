@@ -12,7 +12,6 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.uncertainty import marginal_jacobian, quantile, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
-from vipetsc.studies import further_sensor as further_sensor_module
 from vipetsc.studies.identification import Identification, read_measured_records, run_identification
 
 UNKNOWNS = [
@@ -104,19 +103,6 @@ def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
     assert results["profile/cost"].values[:, 1] == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.slow
-def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
-    """Errors with a further sensor, computed from every third sample to save memory, are about those from all."""
-    plan, z, results = identified
-    windows = Identification(plan, read_measured_records(plan), StopRequest()).windows()
-    known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(3)))
-    samples = len(windows.misfit.records[0].times)
-    monkeypatch.setattr(further_sensor_module, "MOST_NUMBERS", samples * 24 * 4 * 4 // 3 + 1)
-    thinned = further_sensor_module.further_sensor_values(windows, z, known)
-    assert thinned["sensor/relative_error"] == pytest.approx(results["sensor/relative_error"].values, rel=0.5)
-    assert (thinned["sensor/relative_error"] < known.errors).all()
-
-
 def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
     """The marginal Jacobian A has (A^T A)^-1 equal to the parameters' block of the covariance of all coordinates."""
     jacobian = np.random.default_rng(2).standard_normal((30, 7))
@@ -124,19 +110,6 @@ def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
     marginal = marginal_jacobian(jacobian, 3)
     assert np.linalg.inv(marginal.T @ marginal) == pytest.approx(covariance[:3, :3], rel=1e-10)
     assert uncertainty_of(marginal).errors == pytest.approx(uncertainty_of(jacobian).errors[:3], rel=1e-10)
-
-
-def test_fewer_data_than_parameters_leave_some_of_them_undetermined():
-    """A datum that depends on one of two parameters determines that one; three random data determine none of five."""
-    one = uncertainty_of(np.array([[10.0, 0.0]]))
-    assert one.errors == pytest.approx([0.1, 1e11], rel=1e-12)
-    assert one.determined.tolist() == [True, False]
-    assert one.correlation == pytest.approx(np.eye(2), abs=1e-12)
-    assert one.singular == pytest.approx([10.0, 0.0])
-
-    few = uncertainty_of(1e3 * np.random.default_rng(3).standard_normal((3, 5)))
-    assert not few.determined.any()
-    assert few.directions @ few.directions.T == pytest.approx(np.eye(5), abs=1e-12)
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])

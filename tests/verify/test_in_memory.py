@@ -48,12 +48,6 @@ def test_a_run_without_a_folder_is_the_run_with_one(tmp_path):
     assert str(tmp_path / "run") in stored._repr_html_()
 
 
-def test_a_run_without_a_folder_is_not_resumed():
-    """A run without a folder refuses to resume, as nothing is stored from which it could."""
-    with pytest.raises(ValueError, match="a run in memory cannot be resumed"):
-        simulate(small_case(), resume=True)
-
-
 @pytest.mark.slow
 def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
     """A sweep in memory has the ensemble of a sweep in a folder, and removes its temporary folder."""

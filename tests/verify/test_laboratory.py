@@ -9,7 +9,6 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.cli.case_rows import describe_ends
 from vipetsc.lattice.chain import Pair
-from vipetsc.studies.analysis import FULL, analyse
 from vipetsc.studies.velocity_record import VelocityRecord
 
 TWO_DRIVES = {"more": [{"amplitude": 1.0, "frequency": 1500.0, "cycles": 6, "cell": 2}]}
@@ -62,13 +61,6 @@ def test_engines_agree(runs):
     assert damped == pytest.approx(by_propagator["energy/dissipated_by_damping"].values[-1], rel=1e-7)
 
 
-def test_each_site_has_its_effective_restitution(runs):
-    data, result = runs["propagator"]
-    laws = Case.of(data).model().laws
-    assert result.statistics["effective_restitution"] == [law.effective_restitution for law in laws]
-    assert len(set(result.statistics["effective_restitution"])) == 3
-
-
 def test_kinetic_energies_are_of_the_masses_there_are(runs):
     """Kinetic energies over cells, and over wavenumbers, sum to the ledger's if each cell has its own masses.
 
@@ -90,21 +82,6 @@ def test_kinetic_energies_are_of_the_masses_there_are(runs):
 
     unweighted = spectra.kinetic_energy(record.velocity, record.masses).sum(axis=1)
     assert np.abs(unweighted - ledger).max() > 1e-3 * ledger.max()
-
-
-def test_an_analysis_in_blocks_measures_the_same(runs):
-    """An analysis in blocks, for want of memory, has the energies of one as a whole, each with the actual masses."""
-    run, _ = runs["propagator"]
-    ledger = run["energy/kinetic"].values
-    whole = analyse(run, FULL, options=AnalysisTable(memory=1.0))
-    blocks = analyse(run, FULL, options=AnalysisTable(memory=1e-5))
-
-    for measured in (whole, blocks):
-        assert np.abs(measured["bands/total"].values - ledger).max() < 1e-12 * ledger.max()
-        assert measured["kinetic_energy"].values.sum(axis=1) == pytest.approx(ledger, rel=1e-5, abs=1e-12)
-        snapshots = np.searchsorted(run["time"].values, measured["partition/snapshot"].values)
-        assert measured["partition/kinetic"].values == pytest.approx(ledger[snapshots], rel=1e-9, abs=1e-15)
-    np.testing.assert_allclose(whole["bands/energy"], blocks["bands/energy"], rtol=1e-9, atol=1e-15)
 
 
 def test_a_site_is_of_the_masses_of_its_cell():

@@ -9,7 +9,6 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from tests.conftest import run_of
 from tests.one_site import COARSE, LATTICES, law_case
@@ -17,12 +16,11 @@ from vipetsc.case import Case, LawCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
-from vipetsc.lattice.packet import packet_speeds
+from vipetsc.lattice import Chain, ToneBurst, bloch
 from vipetsc.parallel import StopRequest
-from vipetsc.spectra import by_direction, upper_fraction, wave_energies
+from vipetsc.spectra import by_direction, wave_energies
 from vipetsc.studies.one_site import ScatteringRuns, make_law
-from vipetsc.studies.pair_motion import ContactSpan, largest_between
+from vipetsc.studies.pair_motion import largest_between
 from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
 
 
@@ -83,42 +81,11 @@ def test_the_spectrum_of_a_burst_is_its_transform(cycles):
     np.testing.assert_allclose(burst.spectrum(w), expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_speeds_of_a_packet_are_those_of_its_frequency():
-    """The speeds of a packet enclose the group velocity at its frequency, more narrowly the longer its burst is."""
-    cell = four_band("calibrated")
-    ((number, _, speed),) = waves_at(cell, 900.0)
-
-    # A long burst has a narrow spectrum, and therefore a narrow range of speeds.
-    band, slow, fast = packet_speeds(cell, ToneBurst(1.0, 900.0, 2000), 0)
-    assert band == number - 1
-    assert slow < speed < fast
-    assert fast - slow < 0.03 * speed
-
-    assert packet_speeds(cell, ToneBurst(1.0, 900.0, 20), 0)[1] < slow
-
-
 def test_the_largest_value_between_samples():
     """Values and rates at a spacing of half a radian give the peak of a sine with an error of fourth order in it."""
     t = np.linspace(0, 1, 41)
 
     assert largest_between(t, np.sin(20 * t), 20 * np.cos(20 * t)) == pytest.approx(1, abs=2e-5)
-
-
-@pytest.mark.parametrize(
-    ("onset", "separation", "expected"),
-    [
-        ([], [], [np.nan, np.nan]),
-        ([0.2, 0.1], [0.3, 0.15], [0.1, 0.3]),
-        ([0.1, 0.2], [0.15, np.nan], [0.1, 1.0]),
-        ([0.1], [np.nan], [0.1, 1.0]),
-    ],
-)
-def test_a_contact_that_does_not_end_lasts_to_the_end_of_the_run(onset, separation, expected):
-    """The log has no separation for a contact that is closed at the last sample, which an earlier one must not give."""
-    run = xr.Dataset(
-        {"impacts/onset": ("episode", onset), "impacts/separation": ("episode", separation), "time": [0.0, 0.5, 1.0]}
-    )
-    np.testing.assert_array_equal(ContactSpan.of(run), expected)
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
@@ -144,14 +111,6 @@ def test_fractions_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_p
         assert row[reflected] > 1e-3
 
 
-def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
-    """The fractions of a lossy site sum to one with the dissipated one."""
-    (row,) = fractions(make_runs(tmp_path, law_case(contacts={"restitution": 0.6})), 1.5)
-
-    assert row.sum() == pytest.approx(1, abs=1e-7)
-    assert row[-2] > 0.01
-
-
 def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
     """With bilinear stops motions scale with the clearance: fractions depend on amplitude over clearance alone."""
     # With Hertz's law the fractions would differ between clearances of which one is thirty times the other.
@@ -162,18 +121,6 @@ def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
     second = fractions(make_runs(tmp_path / "far", far), 1.2, 2.0)
 
     np.testing.assert_allclose(first, second, atol=1e-6)
-
-
-def test_longer_distances_do_not_change_the_fractions(tmp_path):
-    """Fractions are the same after twice the wait for waves to have passed."""
-    contacts = {"restitution": 0.7}
-    short = make_runs(tmp_path / "short", law_case(law=COARSE | {"settle": 2.0}, contacts=contacts))
-    long = make_runs(tmp_path / "long", law_case(law=COARSE | {"settle": 4.0}, contacts=contacts))
-    # The longer wait needs a longer ring.
-    assert long.setting.cells > 1.5 * short.setting.cells
-
-    # A fraction of 4e-5 has not passed by the end of the shorter wait.
-    np.testing.assert_allclose(fractions(short, 1.2, 2.0), fractions(long, 1.2, 2.0), atol=1e-4)
 
 
 def test_a_site_below_the_drive_is_met_forward(tmp_path):
@@ -320,26 +267,3 @@ def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path
     path = tmp_path / "law.toml"
     path.write_text("[law]\nsamples = 1\n")
     assert [type(case) for case in load_every(path)] == [LawCase]
-
-
-@pytest.mark.slow
-def test_matched_sites_outdo_the_papers(tmp_path):
-    """Ten matched sites, r = 0.9, send more than 0.45 of the work at 24.33 N to upper bands; the paper's send 0.34."""
-    amplitude = 24.33
-    contacts = {"restitution": 0.9, "sites": 10}
-    table = {"contacts": contacts, "law": {"largest": 1.4, "samples": 1, "tolerance": 0.05, "finest": 0.02}}
-    case = LawCase.from_table(table)
-    law = make_law(case, tmp_path, MPI.COMM_SELF)
-
-    # The linear run's envelope is the same at all ten sites within 1 %.
-    linear = SimpleNamespace(envelope=np.full(300, 1.229e-4))
-    sites = np.array(case.contacts.sites)
-    clearance = matched_clearances(law, linear, sites, amplitude)
-
-    contacts |= {"sites": sites.tolist(), "clearance": clearance.tolist()}
-    # Only the last sample of the fields is used.
-    run = run_of(Case.from_table({"contacts": contacts, "time": {"engine": "propagator"}, "output": {"stride": 4420}}))
-    model = Case.of(run).model()
-    u = run["displacement"].values[-1]
-    v = run["velocity"].values[-1]
-    assert upper_fraction(model.chain, model.drive, u, v, float(run["energy/work"][-1])) > 0.45

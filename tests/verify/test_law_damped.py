@@ -12,9 +12,8 @@ import pytest
 
 from tests.one_site import COARSE, law_case
 from vipetsc.case import LawCase
-from vipetsc.figures.registry import draw
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.one_site import LINEAR, ScatteringRuns, make_law
+from vipetsc.studies.one_site import LINEAR, ScatteringRuns
 from vipetsc.studies.scattering_law import BACKWARD, FORWARD
 from vipetsc.studies.site_waves import spectrum_of
 
@@ -60,17 +59,6 @@ def test_without_damping_the_fluxes_are_the_waves_at_the_end(undamped, tmp_path)
 
     for name in FRACTIONS:
         assert weak[name] == pytest.approx(undamped[name], abs=4e-4), name
-
-
-@pytest.mark.slow
-def test_the_law_tends_to_the_undamped_one_as_dashpots_become_weaker(undamped, tmp_path):
-    """With a quarter of the damping, fractions differ less than half as much from those without damping."""
-    strong, weak = (fractions(make_runs(tmp_path / str(c), damped_case({"mass": c})), 1.3) for c in (2.0, 0.5))
-
-    assert strong["dashpots"] > 0.005
-    for name in FRACTIONS:
-        far = abs(strong[name] - undamped[name])
-        assert abs(weak[name] - undamped[name]) < 0.5 * far + 4e-4, name
 
 
 def test_the_wave_decays_over_the_distance_as_by_dashpots_to_ground(tmp_path):
@@ -144,18 +132,3 @@ def test_the_spectrum_at_any_frequency_is_the_transform():
     between = np.array([[100.0, 777.0]])
     expected = step * np.exp(-1j * np.multiply.outer(between, step * np.arange(77))) @ signal
     np.testing.assert_allclose(spectrum_of(signal, step, between), expected, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_the_file_and_the_picture_have_what_dashpots_take(tmp_path):
-    """The fraction that dashpots take completes the sum to one, and is in the summary, the file and the picture."""
-    case = damped_case({"mass": 10.0}, largest=1.3, finest=0.5)
-    law = make_law(case, tmp_path, MPI.COMM_SELF)
-
-    total = law.mean.share.sum(axis=(1, 2)) + law.mean.dissipated + law.mean.contact + law.mean.dashpots
-    np.testing.assert_allclose(total, 1, atol=1e-12)
-    assert law.mean.dashpots[0] == 0  # nothing is touched
-    assert law.mean.dashpots[-1] > 0.01
-    assert law.about["taken_before"] == pytest.approx(0.27, abs=0.02)
-    assert any(name == "dashpots" for name, _ in law.summary())
-    assert [path.name for path in draw("law", [tmp_path])] == ["law.png"]

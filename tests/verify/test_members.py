@@ -14,7 +14,7 @@ from vipetsc.io.read import open_ensemble
 from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
 from vipetsc.studies import sweep_runs
-from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED
+from vipetsc.studies.ensemble import COMPLETE, SCALED
 from vipetsc.studies.linear_run import MEMBERS, linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
 from vipetsc.studies.recorded_runs import RecordPaths
@@ -145,23 +145,6 @@ def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
     assert paths.existing() == [paths.merged]
 
 
-@pytest.mark.slow
-def test_an_unforeseen_linear_run_is_simulated_where_it_is_needed(sweep, tmp_path, monkeypatch):
-    _, ensemble, _ = sweep
-    # Only the first member is examined before the sweep, so that the linear run of the second site list is unforeseen.
-    monkeypatch.setattr("vipetsc.studies.sweep.MOST_SURVEYED", 1)
-    table = TABLE | {"sweep": {"contacts": {"sites": [[8, 13], [13, 15]]}, "drive": {"amplitude": [0.1, 0.2]}}}
-    result = run_sweep(Sweep.from_table(table), tmp_path / "out")
-
-    assert result.complete
-    assert (result.status == SCALED).all()
-
-    found = open_ensemble(tmp_path / "out")["entropy/masked"].values
-    assert (found[:, 0] == found[:, 1]).all()
-    assert found[0, 0] != found[1, 0]
-    assert found[0, 0] == ensemble["entropy/masked"].values[0]
-
-
 def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
     """Modal energies at the end of a member sum to the work less the losses, if no site is in contact then."""
     margins, ensemble, _ = sweep
@@ -231,29 +214,6 @@ def test_members_whose_bands_overlap_differently_keep_their_parts():
     assert ensemble["bands/share"].sum("part").values == pytest.approx(1.0)
     energy = ensemble["bands/modal_energy"].sum("part").values
     assert energy == pytest.approx(ensemble["work"].values * (1 - ensemble["dissipated_fraction"].values), rel=1e-2)
-
-
-NO_SECOND_SITE = """
-from vipetsc import register
-
-
-@register.measure("first-site-only", unit="1", text="a number", power=0.0)
-def first_site_only(record):
-    return [1.0][int(record.run["sites/cell"][0] == 8)]
-"""
-
-
-def test_measures_that_fail_for_one_first_site_fail_its_members_alone(tmp_path):
-    """Members with other first sites share the linear run, which one measure cannot measure from site 8 on."""
-    (tmp_path / "part.py").write_text(NO_SECOND_SITE)
-    table = TABLE | {"plugins": {"modules": [str(tmp_path / "part.py")]}}
-    table["sweep"] = {"measures": ["motion"], "contacts": {"sites": [[8, 15], [13, 15]]}}
-    table["sweep"]["drive"] = {"amplitude": [0.1, 0.2]}
-    table["contacts"] = {"clearance": 2e-4}
-
-    result = run_sweep(Sweep.from_table(table), tmp_path / "out")
-
-    assert result.status.tolist() == [FAILED, FAILED, SCALED, SCALED]
 
 
 SHORT_STEPS = TABLE | {"time": TABLE["time"] | {"sample_interval": 1e-4, "engine": "propagator"}}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import datasets, search_table, simulated, small_case, with_sections
+from tests.conftest import datasets, search_table, simulated, small_case
 from vipetsc.case import Case
 from vipetsc.case.amplitude import amplitude_changes, amplitude_of
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
@@ -97,41 +97,6 @@ def test_the_amplitude_of_a_free_motion_multiplies_the_whole_motion(initial):
 
     motion = simulated(case)[0]["velocity"].values
     assert np.abs(simulated(half)[0]["velocity"].values - 0.5 * motion).max() < 1e-9 * np.abs(motion).max()
-
-
-def test_a_free_motion_is_searched_over_its_amplitude(tmp_path):
-    """A search over a motion at t = 0 runs at its amplitudes, and the best design is a case with the same motion."""
-    options = {"budget": 3, "population": 4, "curve": [5e-4], "variables": {"restitution": [0.3, 0.9]}}
-    options["objective"] = [{"measure": "band_share", "band": 1, "amplitudes": [5e-4, 1e-3]}]
-    plan = OptimiseCase.from_table(free_table(PACKET) | {"optimise": options})
-    summary = optimum_search.run_search(plan, tmp_path).attrs["summary"]
-
-    found = datasets(tmp_path / "optimum.h5")
-    assert "the worst at 0.0005, 0.001 m" in summary
-    assert found["amplitude"].tolist() == [5e-4, 1e-3]
-    best = Case.load(tmp_path / "best.toml")
-    assert best.initial == plan.base.initial
-    worst = [judged(best.varied(initial={"amplitude": a}), plan.options.objective[0])[0] for a in (5e-4, 1e-3)]
-    assert found["value"].max() == min(values["band_share 1"] for values in worst)
-
-
-def test_designs_keep_what_differs_from_site_to_site():
-    """Every design has the laws, restitutions, sides and pairs of the case's sites; only its clearances differ."""
-    each = {
-        "law": ["bilinear", "hertz", "hertz"],
-        "stiffness": [1e5, 1e7, 2e7],
-        "restitution": [0.9, 0.7, 0.5],
-        "side": ["plus", "both", "minus"],
-        "pair": [[1, 2], [0, 3], [3, 4]],
-    }
-    material = dict.fromkeys(("modulus", "radius", "poisson"))
-    plan = OptimiseCase.from_table(with_sections(TABLE, {"contacts": {"each": each, "stiffness": 1.0} | material}))
-    design = plan.design(np.array([1e-4, 2e-4, 3e-4]))
-
-    assert design.contacts.each == plan.base.contacts.each
-    assert design.model().laws == plan.base.model().laws
-    assert design.model().gaps == ((1e-4, np.inf), (2e-4, 2e-4), (np.inf, 3e-4))
-    assert design.model().chain.pairs == plan.base.model().chain.pairs
 
 
 # For a drive at the left end the cells after site 11 are beyond it; for one at the right end those before site 14 are.

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from tests.conftest import datasets, with_sections
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.endings import Ending
-from vipetsc.figures.optimum import compared_curves, convergence
-from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
@@ -155,36 +153,6 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     assert Case.load(folder / "best.toml").lattice.cell.springs[1].damping == found["parameter"][best, 1]
 
 
-def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
-    """A search by responses without runs has pictures of the responses and the objective alone."""
-    _, folder, _ = searched
-    with open_netcdf(folder / "optimum.h5", "search") as file:
-        optimum = file.load()
-    with rc_style():
-        (responses,) = compared_curves(optimum).axes
-    assert responses.get_ylabel() == "peak_displacement/mass (m)"
-    assert [text.get_text() for text in responses.get_legend().get_texts()] == ["case", "best"]
-    assert responses.get_title(loc="left") == "(a) Responses (thin: unstable)"
-    (objective,) = convergence(optimum).axes
-    assert objective.get_ylabel() == "peak_displacement/mass"
-
-
-def test_undecided_states_have_crosses_in_the_picture_of_responses(searched):
-    _, folder, _ = searched
-    with open_netcdf(folder / "optimum.h5", "search") as file:
-        optimum = file.load()
-    # One state of the case's curve, two of that of the best design.
-    of_line = optimum["response/of"].values
-    undecided = [*np.flatnonzero(of_line == 0)[3:4], *np.flatnonzero(of_line == 1)[5:7]]
-    optimum["response/unstable"].values[undecided] = -1
-    with rc_style():
-        (responses,) = compared_curves(optimum).axes
-    crosses = [line for line in responses.lines if line.get_marker() == "x"]
-    drawn = np.concatenate([line.get_xdata() for line in crosses])
-    assert drawn.tolist() == optimum["response/parameter"].values[undecided].tolist()
-    assert responses.get_title(loc="left") == "(a) Responses (thin: unstable; x: undecided)"
-
-
 @pytest.mark.slow
 def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     """A design whose curve ends early fails, with the curve's ending as its reason; its runs are still measured."""
@@ -210,28 +178,3 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
     with pytest.raises(RuntimeError, match=r"r1-1: turned back and closed.*, without states up to 1\.2"):
         measured(case)
-
-
-@pytest.mark.parametrize(
-    ("objective", "nfrc", "key", "sentence"),
-    [
-        ({"measure": "response/peak_velocity/mas"}, {}, "measure", "did you mean 'response/peak_velocity/mass'?"),
-        ({"measure": "response/largest_force"}, {}, "measure", "is not a measure of these responses"),
-        ({"measure": PEAK}, None, "measure", "give their [nfrc]"),
-        ({"measure": PEAK, "amplitudes": [2.0]}, {}, "amplitudes", "are those of [nfrc]"),
-        ({"measure": PEAK, "part": [0.5, 1.0]}, {}, "part", "within nfrc.range, 0.75 to 1.2"),
-        ({"measure": PEAK, "band": 1}, {}, "band", "responses have no bands"),
-        ({"measure": "peak_velocity/mass", "below": 1.0}, {}, "below", "only measures of responses"),
-        ({"measure": PEAK}, {"over": "frequency", "fixed": []}, "", "give the amplitudes of the curves"),
-    ],
-)
-def test_what_is_wrong_with_a_measure_of_responses_is_named(objective, nfrc, key, sentence):
-    table = with_sections(TABLE, {"nfrc": nfrc or {}})
-    if nfrc is None:
-        del table["nfrc"]
-    table["optimise"]["objective"] = [objective]
-    with pytest.raises(CaseError) as raised:
-        OptimiseCase.from_table(table)
-    (problem,) = raised.value.problems
-    assert sentence in str(problem)
-    assert problem.key == (f"optimise.objective[1].{key}" if key else "nfrc.fixed")

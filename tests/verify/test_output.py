@@ -57,11 +57,6 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     assert_same_bits(datasets(folder / "run" / "run.h5"), datasets(folder / "saved.h5"))
 
 
-def test_a_run_in_memory_cannot_be_resumed():
-    with pytest.raises(ValueError, match="cannot be resumed"):
-        simulate(small_case(), RunMemory(), resume=True)
-
-
 def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, monkeypatch):
     """A full disk at the end of a run leaves the old file and all chunks, from which the run can be completed."""
     path = folder / "run"
@@ -85,29 +80,6 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
 
     simulate(case, folder / "straight")
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(path / "run.h5"))
-
-
-def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch):
-    """A run that is killed while its chunks are removed is complete for the next command, which removes the rest."""
-
-    def killed(path, **options):
-        if path.name == ".parts.old" and path.exists():
-            # The signal comes after one of the folder's files has been removed.
-            next(path.iterdir()).unlink()
-            raise InterruptedError
-
-    case = small_case(time={"end": 0.01})
-    with monkeypatch.context() as context:
-        context.setattr("shutil.rmtree", killed)
-        with pytest.raises(InterruptedError):
-            simulate(case, folder / "run")
-
-    assert (folder / "run" / ".parts.old").exists()
-    run = datasets(folder / "run" / "run.h5")
-    for resume in (True, False):
-        assert simulate(case, folder / "run", resume=resume).complete
-    assert_same_bits(run, datasets(folder / "run" / "run.h5"))
-    assert {p.name for p in (folder / "run").iterdir()} == {"run.h5", "case.toml", "summary.json", "end-state"}
 
 
 def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):

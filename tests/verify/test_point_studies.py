@@ -10,7 +10,6 @@ import pytest
 from tests.conftest import run_of, search_table, with_sections
 from vipetsc.case import Case, Sweep
 from vipetsc.case.optimise import OptimiseCase, measures_of_runs
-from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.spectra.measures import MEASURES, RunMeasure, measures_of
@@ -81,36 +80,6 @@ def test_members_have_the_measures_of_single_runs(swept):
     # The comparison would hold trivially if all forces were zero.
     assert ensemble["largest_force"].values.max() > 0.1
     assert ensemble["largest_force"].attrs["units"] == "N"
-
-
-def test_members_too_short_for_a_steady_amplitude_are_named(swept):
-    """A member has no steady amplitude (NaN) if ramp and three windows are longer than its run, here at 300 rad/s.
-
-    One warning names all such members.
-    """
-    _, folder, result = swept
-    ensemble = open_ensemble(folder)
-    is_missing = np.isnan(ensemble["steady_velocity/tip"].transpose("amplitude", "frequency").values)
-    assert is_missing.tolist() == [[True, False]] * 2
-    assert any(text.startswith("2 members: steady amplitude at tip") for text in result.warnings)
-
-
-@pytest.mark.usefixtures("plain_pictures")
-def test_every_measure_of_a_point_has_a_page_of_its_own(swept):
-    """Peaks, steady amplitudes and transmissions have pages by default, other measures where they are asked for."""
-    _, folder, _ = swept
-    stems = {path.stem.partition("-over-")[0] for path in draw("sweep", [folder])}
-    expected = {
-        f"{kind}_{quantity}_{point}"
-        for kind in ("peak", "steady")
-        for quantity in ("displacement", "velocity", "acceleration")
-        for point in ("base", "tip")
-    }
-    expected |= {f"{name}_base-tip" for name in ("transmission", "steady_transmission", "band_transmission")}
-    assert expected | {"largest_force", "contact_episodes", "dissipated_fraction"} == stems
-
-    (page,) = draw("sweep", [folder], ["rms_velocity_tip"])
-    assert page.exists()
 
 
 @pytest.fixture(scope="module")

@@ -12,15 +12,14 @@ from scipy.interpolate import CubicSpline
 
 from tests.conftest import simulated, with_sections
 from tests.one_site import PREDICTION, prediction_case
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.law import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import read_records
-from vipetsc.parallel import StudyError
 from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction import composed, predict, prediction_warnings
-from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, onset_of, site_points
-from vipetsc.studies.response import BINS, DISSIPATED, SiteResponse, SiteResponses, in_contact
+from vipetsc.studies.prediction import predict, prediction_warnings
+from vipetsc.studies.prediction_runs import LINEAR, SITE
+from vipetsc.studies.response import SiteResponse, SiteResponses, in_contact
 
 # The two ramps of this chirp meet, so that its spectrum is smooth and lies within the band.
 CHIRP = {"waveform": "chirp", "bandwidth": 300.0, "duration": 0.09, "ramp": 0.045}
@@ -60,11 +59,6 @@ def prediction(tmp_path_factory) -> Prediction:
     folder = tmp_path_factory.mktemp("prediction")
     case = prediction_case()
     return Prediction(folder, case, predict(case, folder))
-
-
-def composed_from(case: PredictCase, linear: dict[str, Any], site_records: list[dict[str, Any]]) -> xr.Dataset:
-    """The prediction of a case from records of a linear run and of one site, without simulations to compare with."""
-    return composed(case, Records(linear, [site_records], [], site_records[0]["largest"]))
 
 
 @pytest.mark.slow
@@ -142,42 +136,6 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
         assert outcome.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
 
 
-def test_without_loss_nothing_is_lost(prediction):
-    """A prediction composed of records without loss has no loss."""
-    linear, site_records = prediction.records()
-    for record in site_records:
-        record["sums"][DISSIPATED] = [0.0] * BINS
-        record["totals"][0] = 0.0
-
-    data = composed_from(prediction.case, linear, site_records)
-
-    assert float(np.abs(data["predicted/dissipated"]).max()) == 0
-    assert float(data["predicted/upper"].max()) > 0.05
-
-
-def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
-    """The prediction is the same for sites that the case lists in another order."""
-    linear, site_records = prediction.records()
-    # This lattice is the same, with its sites in another order.
-    swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
-
-    first = composed_from(prediction.case, linear, site_records)
-    second = composed_from(swapped, linear | {"reached": linear["reached"][::-1]}, site_records)
-
-    np.testing.assert_allclose(first["predicted/bands"], second["predicted/bands"], atol=2e-4)
-
-
-def test_a_site_that_nothing_reaches_changes_nothing(prediction):
-    """A site with a clearance of a metre leaves the prediction as it is."""
-    linear, site_records = prediction.records()
-    # A clearance of a metre is never closed.
-    more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
-
-    data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, site_records)
-
-    np.testing.assert_allclose(data["predicted/bands"], prediction.data["predicted/bands"], atol=2e-3)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("contacts", "kinds"),
@@ -202,19 +160,6 @@ def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path)
     assert data.attrs["worst_dissipated"] < (0.1 if "side" in contacts else 0.05)
 
 
-def test_equal_values_in_lists_are_one_kind(prediction):
-    """A list of equal values gives the same kind of site, and the same bits, as one value for all sites."""
-    linear, site_records = prediction.records()
-    restitution = prediction.case.contacts.restitution
-    listed = prediction_case(contacts={"each": {"restitution": [restitution] * 2}})
-    assert listed.kinds == prediction.case.kinds
-
-    data = composed_from(listed, linear, site_records)
-
-    # The bits are equal, since a list of equal values describes the same lattice.
-    np.testing.assert_array_equal(data["predicted/bands"], prediction.data["predicted/bands"])
-
-
 def test_contact_goes_on_until_release():
     """Contact begins above z = 1 and ends where z falls below the release, which differs from site to site."""
     # z rises through the onset, falls through both releases, and rises again without reaching the onset.
@@ -237,33 +182,6 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
     z = np.array([record["z"] for record in site_records])
     release = prediction.site().over_bursts(z).release
     np.testing.assert_allclose(release, [record["release"] for record in site_records])
-
-
-def test_amplitudes_and_points_by_default():
-    case = prediction_case(predict={"amplitudes": [], "count": 3, "span": 4.0})
-    # A wave of 1 N reaches a tenth of the first clearance: contacts begin at 10 N.
-    np.testing.assert_allclose(amplitudes_of(case, {"reached": [0.1, 0.05]}), [10, 20, 40])
-
-    points = site_points(case, 50.5)
-    assert points == sorted(points)
-    assert points[0] == 1.0005
-    assert points[-1] == pytest.approx(50)
-
-
-@pytest.mark.parametrize(
-    ("sections", "key"),
-    [
-        ({"contacts": {"sites": [], "clearance": []}}, "contacts.sites"),
-        ({"predict": {"amplitudes": [-1.0]}}, "predict.amplitudes[1]"),
-        ({"predict": {"spam": 1}}, "predict.spam"),
-    ],
-)
-def test_what_cannot_be_predicted_is_refused_before_any_run(sections, key):
-    with pytest.raises(CaseError) as error:
-        prediction_case(**sections)
-
-    assert key in str(error.value)
-    assert error.value.problems
 
 
 @pytest.mark.slow
@@ -301,14 +219,6 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
         w = CubicSpline(run["time"].values, u[:, cell.resonator] - u[:, cell.host])(time)
         predicted = (envelope[network.during] * np.exp(1j * network.om * time)).real
         np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
-
-
-@pytest.mark.slow
-def test_a_chirp_is_predicted_as_simulated(tmp_path):
-    data = predict(pulse_case(CHIRP, contacts={"restitution": 0.7}, predict={"amplitudes": [50.0, 120.0]}), tmp_path)
-
-    assert data.attrs["rms_upper"] < 0.15
-    assert data.attrs["worst_dissipated"] < 0.05
 
 
 @pytest.mark.slow
@@ -354,8 +264,3 @@ def test_each_failure_of_a_prediction_has_its_sentence(name, value, word):
     (warning,) = prediction_warnings(values)
     assert "at 1 of 3 amplitudes" in warning
     assert word in warning
-
-
-def test_a_wave_that_moves_no_site_has_no_onset():
-    with pytest.raises(StudyError, match="moves no site"):
-        onset_of({"reached": [0.0, 0.0]})

@@ -14,7 +14,6 @@ from vipetsc.lattice.ends import absorber
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import predict
 from vipetsc.studies.rays import BINS, Rays
-from vipetsc.studies.wave_losses import SentPowers
 
 AMPLITUDES = {"amplitudes": [5.0, 30.0], "points": 16}
 ABSORBING = {"cells": 30, "strength": 2000.0}
@@ -95,33 +94,6 @@ def test_absorbing_ends_take_the_whole_linear_wave():
     force = network.line.backward(network.losses.driving[0])
     work = 0.5 * (force.conj() * network.line.backward(velocity * network.losses.driving[0])).real.sum() * step
     assert absorbed == pytest.approx(work, rel=2e-3)
-
-
-def test_third_harmonics_in_the_band_of_the_drive_stay_in_it():
-    """Energy that a driven wave gives to its third harmonics in the same band leaves the band's energy as it is.
-
-    The dashpots are weak enough to be neglected.
-    """
-    drive = {"band": None, "at": None, "frequency": 150.0, "cycles": 5}
-    model = prediction_case(lattice={"damping": {"mass": 1e-6}}, drive=drive).model()
-    network = Network(model)
-    losses = network.losses
-    assert losses
-    assert losses.third
-    assert losses.third.band == losses.driven.band == 0
-
-    power = np.where(network.during, 1.0, 0.0) * np.ones((2, 1))
-    for sign in (1, -1):
-        sent = SentPowers(
-            bands=np.zeros((4, *power.shape)),
-            spectrum=np.zeros((2, 4, BINS)),
-            third=sign * power,
-            given=sign * power,
-            force=np.zeros(power.shape),
-        )
-        end = losses.at_end(sent, amplitude=1.0)
-        sums = float(power.sum()) * float(network.time[1])
-        np.testing.assert_allclose(end.remaining, 0, atol=1e-4 * sums)
 
 
 @pytest.fixture(scope="module", params=["dashpots", "absorbing end"])

@@ -65,11 +65,6 @@ def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_pr
     assert_same_bits(datasets(tmp_path / "run/run.h5"), datasets(tmp_path / "again/run.h5"))
 
 
-def test_petsc_options_stand_in_the_origin(petsc_options):
-    petsc_options(ts_monitor="ascii:nowhere.txt")
-    assert "-ts_monitor ascii:nowhere.txt" in io_folder.origin()["petsc_options"]
-
-
 def test_the_revision_is_that_of_git(tmp_path, monkeypatch):
     (tmp_path / "pyproject.toml").touch()
     for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -qm one"):
@@ -81,10 +76,3 @@ def test_the_revision_is_that_of_git(tmp_path, monkeypatch):
 
     (tmp_path / "pyproject.toml").write_text("changed")
     assert io_folder.revision.__wrapped__() == head.stdout[:12] + "+"
-
-
-def test_a_package_in_a_foreign_repository_has_no_revision(tmp_path, monkeypatch):
-    (tmp_path / ".git").mkdir()
-    (tmp_path / "vipetsc").mkdir()
-    monkeypatch.setattr(package, "__file__", str(tmp_path / "vipetsc/__init__.py"))
-    assert io_folder.revision.__wrapped__() == "none"

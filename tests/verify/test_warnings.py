@@ -8,7 +8,6 @@ import h5py
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.case import Case
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.result import Result
@@ -22,11 +21,6 @@ def warnings_of(result: Result) -> list[str]:
     with h5py.File(result.folder / "run.h5") as file:
         assert json.loads(file.attrs["warnings"]) == summary["warnings"] == result.warnings
     return result.warnings
-
-
-def test_a_sound_run_warns_of_nothing(folder):
-    assert warnings_of(simulate(small_case(**HALF), folder / "run")) == []
-    assert warnings_of(simulate(small_case(**HALF, contacts={"sites": []}), folder / "without-sites")) == []
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
@@ -50,13 +44,6 @@ def test_indentations_beyond_the_radius(folder):
     assert "exceeds the contacts' radius of 0.005 m: Hertz" in warning
     assert warnings("larger", radius=1.0) == []
     assert warnings("bilinear", law="bilinear") == []
-
-
-def test_the_radius_stays_with_the_case():
-    case = small_case(contacts={"modulus": 1e4, "radius": 1.0})
-    assert case.contact_radius == Case.from_toml(case.to_toml()).contact_radius == 1.0
-    assert small_case().contact_radius == 0.005
-    assert "radius" not in small_case().to_toml()
 
 
 @pytest.mark.slow
@@ -83,12 +70,3 @@ def test_a_record_that_ends_early(folder, petsc_options):
     assert not result.complete
     warning = warnings_of(result)[-1]
     assert warning.startswith(f"the record ends at sample {result.statistics['samples']} of 251: the energy diverges")
-
-
-def test_what_an_exception_leaves_behind_is_freed(folder, monkeypatch):
-    freed = []
-    monkeypatch.setattr("vipetsc.dynamics.ts.integrator.Integrator.destroy", lambda self: freed.append(self))
-    monkeypatch.setattr("vipetsc.dynamics.run.Run.advance", lambda self: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        simulate(small_case(), folder / "run")
-    assert len(freed) == 1
