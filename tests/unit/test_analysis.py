@@ -14,7 +14,6 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies import velocity_record
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.sweep_runs import first_site_cell
 
 SAMPLES = 400
 INTERVAL = 2e-4  # s
@@ -141,15 +140,6 @@ def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
     assert warning in aliased.attrs["left_out"]
 
 
-def test_cells_too_sparse_for_the_waves_are_named_and_wavenumbers_left_out(run):
-    """A record of every second cell has energies of bands and no measure that needs wavenumbers."""
-    thinned = analyse(run.isel(cell=slice(None, None, 2)))
-    groups = {str(name).partition("/")[0] for name in thinned.variables}
-    assert not groups & {"wavenumber_content", "dispersion", "entropy", "partition"}
-    assert "ibtet" in groups
-    assert "one cell in 2 do not resolve waves shorter than 4 cells" in json.loads(thinned.attrs["warnings"])[0]
-
-
 def test_the_ends_of_a_record_are_not_in_the_means(run):
     """The transfer is the mean fraction of energy above the drive, without the last 2 % of the record."""
     measured = analyse(run, ("bands", "maps"))
@@ -173,25 +163,3 @@ def test_without_a_band_above_the_driven_one_the_transfer_is_left_out_by_name(ru
     assert np.isnan(measured["ibtet"])
     assert "ibtet: no pass band lies above" in measured.attrs["left_out"]
     assert "ibtet" not in analyse(run, ("bands",)).attrs["left_out"]
-
-
-def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
-    """On a ring the first site is the nearest one in either direction; spectra before and after it are left out."""
-    # The drive at cell 3 is 6 cells from cell 9, and 5 cells, across the ends, from cell 22.
-    run["sites/cell"].values[:] = [22, 9]
-    overrides = ["lattice.cells=24", "contacts.sites=[22, 9]", "drive.cell=3", "drive.cycles=3"]
-    ring = Case.load(overrides=[*overrides, "lattice.ends=periodic"])
-    assert first_site_cell(ring) == 22
-    assert first_site_cell(Case.of(run)) == 9
-
-    measured = analyse(run.assign_attrs(case=ring.to_toml()))
-
-    assert "cell 22" in measured["ibtet"].attrs["starts_when"]
-    assert not {"dispersion_before", "dispersion_after"} & set(measured.variables)
-    assert (
-        "dispersion_before, dispersion_after: on a ring the wave travels in both directions"
-        in measured.attrs["left_out"]
-    )
-    model = ring.model()
-    estimate = 0.5 * model.drive.duration + 5 / model.speed
-    assert estimate <= measured.attrs["entropy/start"] < estimate + 2 * INTERVAL

@@ -106,27 +106,6 @@ def test_every_cell_can_be_drawn():
     assert drawing(apart, Pair(0, 1)).count("circle") == 4
 
 
-def test_the_drawing_has_room_for_every_mass_of_the_next_cell():
-    """All circles lie within the drawing, whose two springs to the next cell end at its first and its second mass."""
-    springs = (
-        Spring(start=0, end=1, stiffness=1.0),
-        Spring(start=1, end=2, stiffness=1.0),
-        Spring(start=2, end=0, stiffness=1.0, offset=1),
-        Spring(start=2, end=1, stiffness=1.0, offset=1),
-    )
-    root = ElementTree.fromstring(cell_svg(UnitCell((1.0, 1.0, 1.0), springs, host=0, resonator=1), None))
-
-    left, top, width, height = map(float, root.attrib["viewBox"].split())
-    circles = [element.attrib for element in root.iter() if element.tag.endswith("circle")]
-    assert len(circles) == 5
-    for circle in circles:
-        radius = float(circle["r"])
-        assert left <= float(circle["cx"]) - radius
-        assert float(circle["cx"]) + radius <= left + width
-        assert top <= float(circle["cy"]) - radius
-        assert float(circle["cy"]) + radius <= top + height
-
-
 @pytest.mark.parametrize(
     ("call", "word"),
     [

@@ -85,26 +85,6 @@ def test_branches_on_either_side_of_their_thresholds_decide(tmp_path, change, ex
     assert measure("C15", tmp_path, "printed").verdict == expected
 
 
-def test_the_in_phase_branch_is_held_against_what_it_should_pass(tmp_path):
-    """The reason says that one of the 90 energy folds expected is missing; points above 6e9 J do not count."""
-    for law in ("hertz", "bilinear"):
-        put_branch(tmp_path, law)
-    kind = np.repeat([1, 4, 5, 6, 6], [89, 62, 41, 316, 5])
-    # The folds belong to the tongues 3:1, 5:1, ..., 35:1.
-    tongue = 3 + 2 * (np.arange(len(kind)) % 17)
-    with h5py.File(tmp_path / "nnm-hertz" / "branch-in-phase.h5", "w") as file:
-        file["kind"] = kind
-        file["energy"] = np.repeat([5e9, 7e9], [508, 5])
-        file["resonance"] = np.where(kind == 1, tongue, 0)
-        file["frequency"] = np.full(len(kind), 318.2)
-
-    found = measure("C15", tmp_path, "printed")
-
-    assert found.value["tongues of the in-phase branch, hertz"] == 17
-    assert found.value["largest frequency (Hz) of the in-phase branch, hertz"] == 318.2
-    assert found.reason == "the hertz branch in phase has 89 fold-energy, not 90"
-
-
 def put_backbone(root: Path, exponent: float, scatter: float) -> None:
     """Write a transfer that is a power of the energy with logarithmic ``scatter``, and a branch's slope, a power -1."""
     branch_energy = np.geomspace(0.03, 1e6, 60)

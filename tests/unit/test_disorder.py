@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from dataclasses import replace
 from typing import Any
@@ -10,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import put_members, small_case
+from tests.conftest import put_members
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.disorder import SCATTERED, Deviation, DisorderTable, values_of
-from vipetsc.case.verb_cases import disorder_of
-from vipetsc.cli.verbs.validate_verb import disorder_rows
+from vipetsc.case.disorder import SCATTERED, Deviation, values_of
 from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
@@ -128,16 +125,6 @@ def test_the_clearances_of_the_two_sides_are_drawn_independently():
         draw(TEN_SITES | {"clearance_minus": 1e-6}, clearance={"absolute": 1e-5})
 
 
-def test_a_stop_that_touches_does_not_scatter():
-    """A clearance of 0 stays 0 under a relative deviation, and ``validate`` shows the ratio 1, without a warning."""
-    stops = {"sites": [4, 9], "clearance": [0.0, 3e-5], "side": "plus", "restitution": 1.0}
-    nominal = small_case(contacts=stops)
-    drawn = small_case(contacts=stops, disorder={"clearance": {"relative": 0.01}})
-    [(_, text)] = disorder_rows(DisorderTable(clearance={"relative": 0.01}), nominal, drawn)
-    assert drawn.contacts.clearance[0] == 0
-    assert re.fullmatch(r"normal, deviation 1 %; seed 0: times 1, (1\.0|0\.9)\d+", text)
-
-
 def test_a_cell_with_scattered_springs_keeps_their_nonlinear_parts_and_dashpots():
     table = EVERYTHING
     nominal = Case.from_table(table).lattice.unit_cell()
@@ -196,14 +183,6 @@ def test_a_count_of_seeds_is_an_axis_of_samples():
     table["time"] = {"engine": "auto"}
     table["disorder"] = table["disorder"] | {"seed": 3}
     assert plan.case(3 * 7).contacts == Case.from_table(table).contacts
-
-
-def test_the_disorder_of_a_sweep_is_that_of_its_first_seed():
-    """``disorder_of`` of a sweep yields the disorder with the first seed, the nominal case and the drawn one."""
-    disorder, nominal, drawn = disorder_of(None, ["disorder.clearance.relative=0.02", "sweep.disorder.seed=[7, 1]"])
-    assert disorder.seed == 7
-    assert nominal.contacts.clearance != drawn.contacts.clearance
-    assert disorder_of(None, []) is None
 
 
 def test_one_sample_that_cannot_be_drawn_refuses_the_sweep():

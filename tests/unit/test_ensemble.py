@@ -11,14 +11,14 @@ import xarray as xr
 
 from tests.conftest import put_members, record_of_linear
 from vipetsc.case import Case, Sweep
-from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
+from vipetsc.io.netcdf import variable
 from vipetsc.io.read import open_ensemble, select
 from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.paper.engines import agreement, sampled
 from vipetsc.sources import source_key
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, _fits, fit_curve
-from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell, linear_name, measured, read_linear
+from vipetsc.studies.linear_run import LinearRun, envelope_squares, first_site_cell
 from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {
@@ -158,28 +158,6 @@ def test_a_power_law_is_fitted_from_the_largest_value_on():
     assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])
 
 
-def test_a_member_without_a_drive_is_no_point_of_a_power_law():
-    """A lattice that begins in motion may be swept from A = 0 on, where the largest value may lie: the law has none."""
-    amplitude = np.array([0.0, 1.0, 2.0, 4.0, 8.0])
-    curve = np.array([9.0, 3.0, 1.5, 0.75, 0.375])
-
-    fit = fit_curve(amplitude, curve, normalise=False)
-
-    assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (1.0, 3.0, 4)
-    assert fit["exponent"] == pytest.approx(-1.0)
-
-
-def test_a_single_part_of_the_frequency_axis_has_one_name(tmp_path):
-    """A lattice without bands has one part, "above", whose name is the same from memory and from the file."""
-    energy = variable("bands/part", [1.0], "1", "fraction of a part", parts=["above"])
-    number = variable("bands/part", [1], "1", "part")
-    analysis = xr.Dataset({"bands/part": number, "bands/share": energy})
-    write_netcdf(tmp_path / "analysis.h5", analysis)
-
-    with open_netcdf(tmp_path / "analysis.h5", "analysis") as stored:
-        assert measured(stored)["parts"] == measured(analysis)["parts"] == ["above"]
-
-
 @pytest.mark.parametrize("unit", ["N", "m"])
 def test_a_fit_has_the_unit_of_the_amplitude(unit):
     """A fit has the units of the amplitude, of a force or of a wall that moves by metres, and of the measure."""
@@ -281,22 +259,6 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
     assert wave.envelope == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
     expected = case.drive.amplitude * wave.envelope[[19, 6, 2]] / np.asarray(case.contacts.clearance)
     assert wave.reached(case) == pytest.approx(expected)
-
-
-def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
-    """The linear run of a case is found by the case, and another case has none."""
-    case = Case.load()
-    run = LinearRun(
-        envelope=np.array([1.0, 2.0]),
-        arrival=np.array([0.1, 0.2]),
-        statistics={"work": 3.0},
-        measures={7: {"ibtet": 0.1}},
-    )
-    RecordFile(folder / "members-1.jsonl").append(record_of_linear(run, linear_name(case)))
-    assert read_linear(folder, Sweep.from_table(SWEEP).case(0)) is None
-    again = read_linear(folder, case)
-    assert again.record("") == run.record("")
-    assert again.arrival_at(2) == 0.2
 
 
 def test_the_latest_record_counts_but_no_failure_after_a_success(folder):

@@ -51,10 +51,8 @@ def rows_with(index, row):
         (rows_with(7, "0.0070,nan"), "sensors[1].column", "sample 8 of 20 is not a finite number"),
         (rows_with(7, "0.0070,"), "file", "line 9 has another number of fields"),
         (rows_with(7, "0.0074,1.0"), "time", "uneven: sample 8 is at 0.0074 s instead of 0.007 s"),
-        (rows_with(7, "0.007"), "file", "line 9 has another number of fields"),
         (["0.0,1.0"] * 20, "time", "must rise"),
         ([f"{1e-3 * k},0.0" for k in range(20)], "sensors[1].column", "zero at all times"),
-        ([f"{1e-3 * k},1.0" for k in range(5)], "file", "leaves 5 samples"),
         ([], "file", "has no line of numbers"),
     ],
 )
@@ -71,10 +69,8 @@ def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
         ({"sensors": [SENSOR | {"cell": 7}]}, "sensors[1].cell", "the lattice has the cells 1 to 6"),
         ({"sensors": [SENSOR | {"mass": 5}]}, "sensors[1].mass", "a cell has the masses 1 to 4"),
         ({"sensors": [SENSOR | {"column": "w"}]}, "sensors[1].column", "no column of that name; there are t, v"),
-        ({"sensors": [SENSOR | {"column": 3}]}, "sensors[1].column", "the columns 1 to 2"),
         ({"sensors": [SENSOR | {"quantity": "force"}]}, "sensors[1].cell", "give drive in place of cell"),
         ({"rate": 1e3}, "time", "one of both"),
-        ({"begin": 0.015}, "begin", "leaves 5 samples"),
         ({"begin": 0.005, "end": 0.01}, "end", "leaves 6 samples"),
         ({"initial": {"kind": "velocity", "cell": 9, "velocity": 1.0}}, "initial.cell", "outside the lattice"),
         (
@@ -83,8 +79,6 @@ def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
             "needs a sensor of motion",
         ),
         ({"offset": [1.0, 0.0]}, "offset", "low below high"),
-        ({"drive": {"frequency": -1.0}}, "drive.frequency", ""),
-        ({"file": "nowhere.csv"}, "file", "no such file"),
     ],
 )
 def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
@@ -97,9 +91,6 @@ def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
     [
         ({"quantity": "exponent", "bounds": [1.0, 2.0]}, "quantity", 'only the law "power" has an exponent'),
         ({"quantity": "clearance", "bounds": [-1.0, 1.0]}, "bounds", "must be positive"),
-        ({"quantity": "clearance", "bounds": [2.0, 1.0]}, "bounds", "low below high"),
-        ({"quantity": "clearance", "bounds": [1e-5, np.inf]}, "bounds[2]", "finite number"),
-        ({"quantity": "cubic", "bounds": [-np.inf, 1.0]}, "bounds[1]", "finite number"),
         ({"quantity": "cubic", "bounds": [-1.0, 1.0], "scale": "logarithmic"}, "bounds", "must be positive"),
         ({"quantity": "restitution", "bounds": [0.5, 1.2]}, "bounds", "between 0 and 1"),
         ({"quantity": "clearance", "bounds": [1e-5, 1.0], "of": [[4]]}, "of", "from 1 to 3"),
@@ -107,7 +98,6 @@ def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
         ({"quantity": "clearance", "bounds": [1e-5, 1.0], "start": [1e-3, 1e-3]}, "start", "each of the 1 values"),
         ({"quantity": "clearance", "bounds": [1e-5, 1e-4], "start": 1e-3}, "start", "within the bounds"),
         ({"quantity": "dashpot", "bounds": [1e-3, 1.0]}, "start", "springs without a dashpot"),
-        ({"quantity": "grounding", "bounds": [1e-3, 1.0]}, "start", "masses without a dashpot"),
         ({"quantity": "dashpot", "bounds": [-1.0, 1.0], "scale": "linear", "start": 0.5}, "bounds", "not be negative"),
         ({"quantity": "clearance_minus", "bounds": [1e-3, 1.0]}, "quantity", "set contacts.clearance_minus"),
     ],
@@ -245,7 +235,7 @@ def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
     """Fits within three standard errors of a bottom lie in its valley; a start that failed lies in none."""
     fits = []
     for coordinate, deviance in ((5.0, 40.0), (1.0, 10.0), (None, None), (1.25, 11.0)):
-        fit = {"begin": [0.0], "coordinates": [coordinate], "deviance": deviance}
+        fit = {"begin": [0.1 * deviance] if deviance else None, "coordinates": [coordinate], "deviance": deviance}
         fits.append({"reason": "stuck"} if coordinate is None else fit)
     plan = SimpleNamespace(options=SimpleNamespace(starts=4))
     misfit = SimpleNamespace(plan=plan, values=lambda z: 10 * z)
@@ -254,6 +244,7 @@ def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
     values = _start_values(windows, fits, best=1, errors=np.array([error]))
     assert values["starts/valley"].tolist() == valleys
     assert values["starts/value"][:, 0] == pytest.approx([50.0, 10.0, np.nan, 12.5], nan_ok=True)
+    assert values["starts/begin"][:, 0] == pytest.approx([40.0, 10.0, np.nan, 11.0], nan_ok=True)
     assert values["starts/deviance"] == pytest.approx([30.0, 0.0, np.nan, 1.0], nan_ok=True)
 
 

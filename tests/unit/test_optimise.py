@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import run_of, search_table
-from vipetsc.case import Case, CaseError, case_id
+from tests.conftest import search_table
+from vipetsc.case import CaseError, case_id
 from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond, measured
+from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
 from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
@@ -317,11 +317,3 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
         assert records["stalls"]["reason"] == "stalled"
 
     assert asked == ["stalls", "short", "short"]
-
-
-def test_a_run_that_received_no_energy_has_a_reason():
-    """Fractions of no energy have no value: the reason says so, in place of a division by zero."""
-    run = run_of(Case.load(overrides=["lattice.cells=8", "contacts.sites=[3]", "time.end=0.01"]))
-    run["energy/work"] = 0.0 * run["energy/work"]
-    with pytest.raises(RuntimeError, match="received 0 J"):
-        measured(run, {"episodes": 0, "dissipated": 0.0}, [])

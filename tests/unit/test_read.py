@@ -16,6 +16,7 @@ from vipetsc.io.read import (
     nearest_cell,
     open_ensemble,
     open_run,
+    over_samples,
     select,
     whole_members,
 )
@@ -119,6 +120,8 @@ def test_members_are_selected_by_the_values_of_swept_keys(folder):
     """Members are selected by values of swept keys, single or together; a value that no member has is named."""
     ensemble = open_ensemble(folder)
     assert dict(ensemble["cycles"].sizes) == {"sites": 3}
+    # Without an axis of samples there is nothing to average.
+    assert over_samples(ensemble) is ensemble
     assert "cycles" in ensemble.coords
 
     # Keys that vary together have to meet in one member.

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError
-from vipetsc.case.contacts import describe_stops
 from vipetsc.case.reading import sections_in
 from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.verbs.run_verb import run_rows
@@ -48,11 +47,6 @@ def test_what_follows_in_other_lines_of_an_override_is_refused():
     assert key == "--set" and "--set each" in remedy
 
 
-def test_an_override_may_be_a_list_over_lines():
-    case = Case.from_table(Case.builtin_table, ("contacts.sites=[\n10,\n20]",))
-    assert case.contacts.sites == [10, 20]
-
-
 def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_too():
     """An impulse of the duration T has the frequency pi/T, also in a lattice without springs."""
     case = Case.from_table(unsprung_table())
@@ -71,50 +65,6 @@ def test_a_further_drive_may_stand():
     assert Case.from_table(table).drive.more[0].frequency > 0
     key, remedy = problem_of(table | {"drive": standing})
     assert key == "drive.wavenumber" and "never crosses" in remedy
-
-
-def test_stops_are_described_by_what_they_are():
-    """A stop is described by its clearances, as touching, or by its precompression, with the side."""
-    gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
-    expected = ["touches on side -", "precompressed by 0.002 mm on side +", "0.2 mm on side +, 0.3 mm on side -"]
-    assert describe_stops(gaps) == expected
-    assert describe_stops(((2e-4, 2e-4),)) == ["0.2 mm"]
-
-
-def test_a_drive_without_an_end_is_said_to_go_on():
-    """The table of ``validate`` gives the end of a burst, and says that a harmonic drive has none."""
-    case = small_case(drive={"waveform": "harmonic", "cycles": 30})
-    rows = dict(run_rows(case, 1))
-    assert rows["drive, end"] == "no end, 0.05 s"
-    assert "burst, end" in dict(run_rows(small_case(), 1))
-
-
-def test_a_further_drive_is_shown_where_the_first_is_none():
-    """The table of ``validate``, the display in a notebook and the warnings have a drive beside a motion at t = 0."""
-    further = {"amplitude": 24.0, "frequency": 1000.0, "cycles": 6}
-    struck = {"kind": "velocity", "cell": 5, "velocity": 1e-9}
-    case = small_case(initial=struck, drive={"amplitude": 0.0, "more": [further]})
-    assert "burst, end" in dict(run_rows(case, 1))
-    page = case._repr_html_()
-    assert "24 N, 6 cycles" in page and "0 N, " not in page
-    fast = further | {"frequency": 1e5}
-    coarse = small_case(initial=struck, drive={"amplitude": 0.0, "more": [fast]}, time={"sample_interval": 2e-4})
-    assert any("fields and energies are aliased" in warning for warning in coarse.warnings())
-
-
-def test_a_step_that_only_petsc_reads_is_no_error_of_the_warnings():
-    """PETSc reads hexadecimal numbers; the warning of fixed steps, which needs the number, is then left out."""
-    fixed = {"ts_adapt_type": "none"}
-    assert any("fixed steps of 16 s" in text for text in small_case(petsc=fixed | {"ts_dt": "16"}).warnings())
-    assert not any("fixed steps of 16 s" in text for text in small_case(petsc=fixed | {"ts_dt": "0x10"}).warnings())
-
-
-def test_beads_have_no_bands_and_no_waves():
-    """The table of ``validate`` has no bands, gaps and waves for beads without springs."""
-    rows = dict(run_rows(Case.from_table(unsprung_table()), 1))
-    assert rows["pass bands"].startswith("none")
-    assert not rows["gaps"]
-    assert "waves at Om" not in rows
 
 
 @pytest.mark.parametrize(

@@ -62,16 +62,6 @@ def test_a_name_that_leads_to_no_file_is_refused(tmp_path, monkeypatch, name):
         read_measured(RecordTable.model_validate({"file": name, "rate": 1.0, "sensors": [sensor]}))
 
 
-@pytest.mark.parametrize("name", ["a\0b.py", "loop.py", 300 * "x" + ".py"])
-def test_a_name_of_a_module_that_leads_to_no_file_is_refused(tmp_path, monkeypatch, name):
-    """A name with a NUL, a link to itself and a name that is too long are a problem of the module."""
-    monkeypatch.chdir(tmp_path)
-    Path("loop.py").symlink_to("loop.py")
-    with pytest.raises(CaseError) as error:
-        small_case(plugins={"modules": [name]})
-    assert [problem.key for problem in error.value.problems] == ["plugins.modules[1]"]
-
-
 def test_a_missing_value_in_the_first_row_is_no_line_of_names(tmp_path):
     """A first row of "nan" is one of numbers, which the case refuses; a line of names may begin with a digit."""
     path = tmp_path / "samples.csv"

@@ -18,6 +18,8 @@ from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.io import export
+from vipetsc.io.branch_kinds import RESPONSES
+from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies.sweep import run_sweep
 
@@ -147,3 +149,56 @@ def test_a_file_without_results_next_to_a_run_is_refused_before_anything_is_writ
     assert ended.returncode == 2
     assert name in ended.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "run.h5"]
+
+
+def search_of_two() -> xr.Dataset:
+    """Return the file of a search of two designs over a length and a choice."""
+    labels = {"variable": ["clearance 1", "law"], "objective": ["1: ibtet"], "constraint": ["work"]}
+    data = {label: variable(label, np.array(names, dtype=object), "1", label) for label, names in labels.items()}
+    data["design"] = variable("design", [0, 1], "1", "design")
+    data["unit"] = variable("variable", np.array(["m", "1"], dtype=object), "1", "unit")
+    data["parameter"] = variable(("design", "variable"), [[1e-4, 1.0], [2e-4, 2.0]], "1", "parameter")
+    data["value"] = variable(("design", "objective"), [[0.3], [0.4]], "1", "value")
+    data["constrained"] = variable(("design", "constraint"), [[5.0], [6.0]], "1", "constrained")
+    data["excess"] = variable("design", [0.0, 0.5], "1", "excess")
+    data["other"] = variable(("variable", "objective"), [[7.0], [8.0]], "1", "not of the designs")
+    return xr.Dataset(data, attrs={"case": ""})
+
+
+def response_of_two(kind: str) -> xr.Dataset:
+    """Return a branch of a ``kind`` with two points, and the largest force at two sites in each of them."""
+    data = {
+        "point": variable("point", [0, 1], "1", "point"),
+        "site": variable("site", [1, 2], "1", "site"),
+        "force": variable(("point", "site"), [[1.0, 2.0], [3.0, 4.0]], "N", "largest force"),
+        "shape": variable(("point", "mass"), np.eye(2), "m", "not of the sites"),
+        "mass": variable("mass", [1, 2], "1", "mass"),
+        "energy": variable("point", [5.0, 6.0], "J", "energy"),
+    }
+    return xr.Dataset(data, attrs={"case": "", "branch_kind": kind})
+
+
+@pytest.mark.parametrize(
+    ("data", "file", "columns"),
+    [
+        (
+            search_of_two(),
+            "optimum-design.csv",
+            {"design": [0, 1], "excess": [0, 0.5], "clearance 1 (m)": [1e-4, 2e-4], "law": [1, 2]}
+            | {"1: ibtet": [0.3, 0.4], "work": [5, 6]},
+        ),
+        (
+            response_of_two(RESPONSES),
+            "optimum-point.csv",
+            {"point": [0, 1], "energy (J)": [5, 6], "force/1 (N)": [1, 3], "force/2 (N)": [2, 4]},
+        ),
+        (response_of_two("another"), "optimum-point.csv", {"point": [0, 1], "energy (J)": [5, 6]}),
+    ],
+)
+def test_labels_of_a_second_dimension_are_columns_with_their_units(tmp_path, data, file, columns):
+    """A table has a column for each variable, objective and constraint of a search, and each site of a response."""
+    write_netcdf(tmp_path / "optimum.h5", data)
+    written = export.write_curves(tmp_path / "optimum.h5")
+    assert tmp_path / "curves" / file in written
+    table = pd.read_csv(tmp_path / "curves" / file, float_precision="round_trip")
+    assert table.to_dict("list") == columns
