@@ -115,15 +115,6 @@ def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
     assert fine["bands/kinetic_energy"].dtype == np.float32
 
 
-def test_cells_before_and_after_the_first_site_are_measured_apart(run):
-    """The spectrum before the first site is that of cells 1 to 8, the one after it that of cells 9 to 24."""
-    # The wave moves no cell from cell 9 on: the spectrum behind that site is zero.
-    run["velocity"].values[:, 8:] = 0.0
-    measured = analyse(run, ("wavenumber", "dispersion"))
-    assert measured["dispersion_before"].values.max() > 0
-    assert measured["dispersion_after"].values.max() == 0
-
-
 def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
     """Spectra and bands need pi/interval above the top band; otherwise a warning names them and other measures stay."""
     # The top band ends at 3645 rad/s: a sample every 0.8 ms resolves it, one every 1 ms does not.

@@ -15,7 +15,7 @@ import pytest
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import Claim, FolderError, claimed
-from vipetsc.io.kinds import BRANCHES, KINDS, PAPER, RUN
+from vipetsc.io.kinds import KINDS, PAPER, RUN
 from vipetsc.io.lock import locked
 
 # The case of the results in a folder, and the case of a later command.
@@ -71,19 +71,6 @@ def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
     assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
     # The folder above it was not created either.
     assert not names_in(tmp_path)
-
-
-def test_the_caller_decides_which_cases_differ(tmp_path):
-    """A function of the caller says in which way an earlier case differs; if in none, the new text is written."""
-    folder = tmp_path / "nnm"
-    with claim(folder, BRANCHES, OLD):
-        pass
-    message = "another system: a = 1"
-    assert_refused(message, folder, BRANCHES, NEW, difference=lambda earlier: f"another system: {earlier}")
-
-    with claim(folder, BRANCHES, NEW, resume=True, difference=lambda earlier: None) as work:
-        assert work.going_on
-    assert (folder / "case.toml").read_text() == NEW
 
 
 def test_force_sets_the_earlier_results_aside_until_the_new_ones_are_complete(run, caplog):
@@ -150,18 +137,6 @@ def test_a_folder_of_the_user_with_that_name_is_not_touched(run, is_a_file):
     with claim(run, RUN, OLD) as work:
         work.publish()
     assert backup.exists()
-
-
-def test_the_folder_in_which_one_works_is_replaced_too(run, monkeypatch):
-    """The folder may be named "." or by a link: the earlier results are then beside the folder itself."""
-    link = run.with_name("link")
-    link.symlink_to(run)
-    monkeypatch.chdir(run)
-    for name in (".", link):
-        with claim(name, RUN, NEW, force=True) as work:
-            assert (run.with_name("run.old") / "case.toml").exists()
-            work.publish()
-    assert (run / "case.toml").read_text() == NEW
 
 
 def test_files_that_a_killed_command_leaves_are_removed(tmp_path):

@@ -107,21 +107,6 @@ def test_unknowns_are_checked(tmp_path, unknown, key, part):
     assert part in problems[f"identify.unknowns[1].{key}"]
 
 
-def test_contacts_are_not_sought_in_silence(tmp_path):
-    """Contact parameters are refused for records without contact, and these where a site touches at rest."""
-    record = record_in(written(tmp_path))
-    problems = problems_of(record | {"contact": False})
-    assert "says nothing about its contacts" in problems["identify.unknowns[1].quantity"]
-
-    touching = {"clearance": 0.0, "restitution": 1.0, "side": "plus"}
-    pressed = {"clearance": 1e-4, "precompression": 2e-4, "restitution": 1.0, "side": "plus"}
-    for contacts in (touching, pressed):
-        table = lattice_table(contacts=contacts)
-        unknowns = [{"quantity": "spring", "bounds": [1.0, 1e6]}]
-        with pytest.raises(CaseError, match="touches or is pressed"):
-            IdentifyCase.from_table(identify_table(table, record | {"contact": False}, unknowns=unknowns))
-
-
 def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
     """Columns by name or number, with comments, semicolons, decimal commas, factors or a rate, and datasets of one or
     two dimensions yield the same times and values.
@@ -263,20 +248,6 @@ def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     (problem,) = caught.value.problems
     assert problem.key == "identify.records[1].sensors[2].quantity"
     assert "drive 1 moves a wall" in problem.remedy
-
-
-def test_the_amplitude_that_is_sought_has_the_unit_of_its_drive(tmp_path):
-    """The amplitude of a force is in N, that of a moved wall in m, and that of an impulse in N s."""
-    unknowns = [{"quantity": "amplitude", "bounds": [1e-6, 100.0]}]
-    drives = {
-        "N": {"cycles": 4},
-        "m": {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "frequency": 300.0},
-        "N s": {"waveform": "impulse", "amplitude": 1e-3, "duration": 1e-3},
-    }
-    for unit, drive in drives.items():
-        table = lattice_table() | {"drive": drive}
-        plan = IdentifyCase.from_table(identify_table(table, record_in(written(tmp_path)), unknowns=unknowns))
-        assert [parameter.unit for parameter in plan.parameters] == [unit]
 
 
 def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):

@@ -26,8 +26,8 @@ def load(path, text, *overrides):
 
 @pytest.mark.slow
 def test_spoilt_cases_are_read_or_refused(tmp_path):
-    """Each of 150 case files with random changes is read, or refused by a sentence; both occur often."""
-    spoilt = list(islice(mutations(11, without=SWEEPS), 150))
+    """Each of 60 case files with random changes is read, or refused by a sentence; both occur often."""
+    spoilt = list(islice(mutations(11, without=SWEEPS), 60))
     verdicts = [judge(mutation, tmp_path / "case.toml") for mutation in spoilt]
 
     defects = []
@@ -38,8 +38,8 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
 
     # Both outcomes must occur: of thousands of files one in seven is read. A new key or a new example leads to other
     # random changes.
-    assert sum(bool(verdict.refusal) for verdict in verdicts) > 75
-    assert sum(bool(verdict.cases) for verdict in verdicts) > 8
+    assert sum(bool(verdict.refusal) for verdict in verdicts) > 30
+    assert sum(bool(verdict.cases) for verdict in verdicts) > 3
 
 
 def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):

@@ -17,30 +17,12 @@ from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
-from vipetsc.studies.optimum_file import curves_of
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, Nsga2, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
 TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
-
-
-@pytest.mark.parametrize(("objectives", "sign"), [([{"measure": "transmitted"}], -1), (None, 1)])
-def test_designs_are_compared_at_amplitudes_of_any_sign(objectives, sign):
-    """The case's amplitude may be negative, a phase, next to positive ones of objectives: the curve is log-spaced."""
-    table = TABLE | {"drive": TABLE["drive"] | {"amplitude": -5.0}}
-    one_at_ten = [{"measure": "transmitted", "amplitudes": [10.0]}, {"measure": "transmitted", "goal": "minimise"}]
-    table["optimise"] = BOUNDS | {"objective": objectives or one_at_ten}
-    search_plan = OptimiseCase.from_table(table)
-    design = SimpleNamespace(case=search_plan.base)
-    search = SimpleNamespace(plan=search_plan, compared=lambda: {"case": 0}, designs=[design])
-
-    amplitudes = np.array([run.drive.amplitude for run in curves_of(search)["case"]])
-    curve = amplitudes[(amplitudes != -5.0) & (np.sign(amplitudes) == sign)]
-    assert len(curve) >= 10
-    assert np.abs(amplitudes).min() == pytest.approx(1.25)
-    assert np.abs(amplitudes).max() == pytest.approx(40.0 if sign > 0 else 20.0)
 
 
 @pytest.mark.parametrize(("ends", "beyond"), [("fixed", 9.0), ("periodic", np.nan)])

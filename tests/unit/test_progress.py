@@ -69,18 +69,3 @@ def test_the_time_left_counts_from_the_first_report(written, monkeypatch):
     progress.update(5.0)
     progress.close()
     assert written().splitlines() == ["  5 %  1 of 20 s", " 25 %  5 of 20 s, 30 s left", " 25 %  5 of 20 s in 68.0 s"]
-
-
-def test_the_bar_of_a_resumed_run_begins_where_that_was_stopped(written, monkeypatch):
-    """The rate of a resumed bar is that of the work since the resumption; earlier work does not count."""
-    monkeypatch.setitem(sys.modules, "ipykernel", object())
-    progress = Progress(MPI.COMM_SELF, 100.0, "s")
-    bar = progress._bar
-    progress.start_at(90.0)
-    bar.start_t -= 2.0
-    bar.last_print_t -= 2.0
-    progress.update(92.0)
-    # The work since then is 2 s of 100 in two seconds.
-    assert bar.format_dict["rate"] == pytest.approx(1.0, rel=0.05)
-    assert " 92%|" in written()
-    progress.close()

@@ -84,15 +84,6 @@ def test_a_waveform_without_a_finite_force_is_named_with_its_file(monkeypatch, a
         waveform_record("tap").build(OneDrive())
 
 
-@pytest.mark.parametrize("frequency", [None, "fast", 0.0, np.nan, np.inf, np.complex128(3 + 1j), [3.0]])
-def test_a_frequency_that_is_none_is_named_with_its_file(monkeypatch, frequency):
-    """The frequency of a registered waveform must be a positive number."""
-    part = WaveformPart(name="tap", function=lambda drive: None, frequency=lambda drive: frequency, **ORIGIN)
-    monkeypatch.setitem(PARTS[WAVEFORM], "tap", part)
-    with pytest.raises(PartError, match=r"the .*waveform 'tap' of .*(frequency; a real|positive) number"):
-        waveform_record("tap").frequency(OneDrive(), np.inf)
-
-
 @pytest.mark.parametrize("source", [kind.source for kind in STUDIES])
 def test_registered_figures_are_found_by_every_kind_of_results(source, tmp_path):
     """The case in the one file of a source names the module of the figures."""

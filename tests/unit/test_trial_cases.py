@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from tests.conftest import with_sections
 from tests.identified import lattice_table
 from vipetsc.case import Case, CaseError
 from vipetsc.case.identify import SoughtParameter, TrialCases, UnknownTable, parameters_of, values_of
+from vipetsc.case.quantities import QUANTITIES
 
-QUANTITIES = get_args(UnknownTable.model_fields["quantity"].annotation)
 CELL = {
     "masses": [0.01, 0.02],
     "springs": [
@@ -50,9 +50,9 @@ def quantities_of(name: str) -> list[str]:
     # The clearance on the side w < 0 is sought where the case has one.
     if name != "two sides":
         missing.add("clearance_minus")
-    # A case without a drive has no amplitude.
+    # A case without a drive has no numbers of one.
     if CASES[name].get("drive") is AT_REST:
-        missing.add("amplitude")
+        missing |= {quantity for quantity in QUANTITIES if QUANTITIES[quantity].of == "drive"}
     # Springs to a moved wall must be linear and without dashpots.
     if name == "wall":
         missing |= {"dashpot", "quadratic", "cubic"}

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.keys import json_schema
+from vipetsc.case import Case, CaseError
 from vipetsc.case.units import PREFIXES, SYMBOLS, in_unit
 
 WALL = {"end": "left", "waveform": "harmonic", "frequency": 500.0}
@@ -82,21 +81,3 @@ def test_a_unit_of_another_dimension(sections, key):
         small_case(**sections)
     assert key in str(error.value)
     assert "unit" in str(error.value)
-
-
-def test_a_sweep_over_values_with_units():
-    """Its coordinate has numbers in SI, of a list and of a range."""
-    table = {"lattice": {"preset": "four-band"}, "sweep": {"drive.frequency": ["150 Hz", 900.0]}}
-    (axis,) = Sweep.from_table(table).axes
-    assert axis == {"drive.frequency": (in_unit("150 Hz", "rad/s"), 900.0)}
-    (axis,) = Sweep.from_table(table | {"sweep": {"contacts.clearance": {"linear": ["1 mm", "3 mm"], "count": 3}}}).axes
-    assert axis == {"contacts.clearance": (0.001, 0.002, 0.003)}
-
-
-def test_editors_are_told():
-    """The schema allows a text with a unit where a key with a unit has a number."""
-    schema = json_schema()["$defs"]
-    choices = schema["TimeTable"]["properties"]["rtol"]
-    assert "anyOf" not in choices
-    masses = schema["CellTable"]["properties"]["masses"]["items"]
-    assert {"string", "number"} == {choice["type"] for choice in masses["anyOf"]}

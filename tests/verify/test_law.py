@@ -20,7 +20,6 @@ from vipetsc.lattice import Chain, ToneBurst, bloch
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, wave_energies
 from vipetsc.studies.one_site import ScatteringRuns, make_law
-from vipetsc.studies.pair_motion import largest_between
 from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
 
 
@@ -79,13 +78,6 @@ def test_the_spectrum_of_a_burst_is_its_transform(cycles):
     expected = np.exp(-1j * np.outer(w, t)) @ burst.force(t) * dt
 
     np.testing.assert_allclose(burst.spectrum(w), expected, atol=1e-5 * np.abs(expected).max())
-
-
-def test_the_largest_value_between_samples():
-    """Values and rates at a spacing of half a radian give the peak of a sine with an error of fourth order in it."""
-    t = np.linspace(0, 1, 41)
-
-    assert largest_between(t, np.sin(20 * t), 20 * np.cos(20 * t)) == pytest.approx(1, abs=2e-5)
 
 
 @pytest.mark.parametrize("lattice", LATTICES)

@@ -76,19 +76,6 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
 
 
 @pytest.mark.slow
-def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
-    _, ensemble, _ = sweep
-    # A linear wave recorded coarsely might seem to stay inside the clearance at these amplitudes.
-    amplitudes = ensemble["amplitude"].values[2:5].tolist()
-    table = TABLE | {"sweep": {"drive": {"amplitude": amplitudes}}, "output": {"stride": 10, "every": 2}}
-    assert run_sweep(Sweep.from_table(table), tmp_path / "thin").complete
-
-    thin = open_ensemble(tmp_path / "thin")
-    for name in ("status", "contact_episodes", "ibtet", "entropy/energy_weighted", "entropy/masked", "bands/share"):
-        np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)
-
-
-@pytest.mark.slow
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples.
 
