@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 
 from tests.conftest import datasets, search_table
-from tests.one_site import law_case, prediction_case
+from tests.one_site import law_case
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.export import write_curves
 from vipetsc.studies.one_site import make_law
 from vipetsc.studies.optimum_search import run_search
-from vipetsc.studies.prediction import predict
 
 pytestmark = pytest.mark.slow
 
@@ -65,12 +64,6 @@ def law(folder: Path, **sections: dict[str, Any]) -> Path:
     return folder / "law.h5"
 
 
-def prediction(folder: Path, **sections: dict[str, Any]) -> Path:
-    """Compute a prediction at one amplitude, without simulations to compare with; returns its file."""
-    predict(prediction_case(predict={"points": 16, "amplitudes": [600.0], "simulate": False}, **sections), folder)
-    return folder / "prediction.h5"
-
-
 def search(folder: Path, **sections: dict[str, Any]) -> Path:
     """Search for the clearances of two sites; returns the search's file."""
     run_search(OptimiseCase.from_table(search_table(16, [4, 9], optimise=SEARCH, **sections)), folder, MPI.COMM_SELF)
@@ -99,13 +92,11 @@ def assert_same_to_rounding(shipped: Path, registered: Path) -> None:
             assert second[name] == pytest.approx(values, rel=1e-9, abs=1e-9 * scale, nan_ok=True), name
 
 
-@pytest.mark.parametrize("study", [law, prediction])
-def test_a_registered_law_has_the_response_of_the_shipped_one(study, tmp_path):
-    """The scattering law of one site, and a prediction, are the same with registered copies as with the originals."""
-    shipped, registered = results(study, tmp_path)
+def test_a_registered_law_has_the_response_of_the_shipped_one(tmp_path):
+    """The scattering law of one site is the same with registered copies as with the originals."""
+    shipped, registered = results(law, tmp_path)
     assert_same_to_rounding(shipped, registered)
-    lost = datasets(registered)["dissipated" if study is law else "predicted/dissipated"]
-    assert lost.max() > 0.01
+    assert datasets(registered)["dissipated"].max() > 0.01
 
 
 def test_a_search_has_a_registered_measure_as_its_objective(tmp_path):
