@@ -7,9 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.unit.claim_files import measure, put_sweep
-from vipetsc.case import Sweep
-from vipetsc.io.read import RUN_NEEDS
+from tests.unit.claim_files import measure
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.spectra import power_law
 
@@ -131,63 +129,3 @@ def test_transfer_is_compared_with_the_slope_of_the_branch(tmp_path, exponent, s
     tolerance = 0.3 if scatter else 1e-6
     assert found.value["exponent of the transfer, hertz"] == pytest.approx(exponent, abs=tolerance)
     assert measure("C16", tmp_path, "printed").verdict == UNMEASURED
-
-
-def put_portraits(root: Path, linearity: float) -> None:
-    """Write the motion of one site: out of phase at 2 N, then rough, then both masses together at 1e4 N.
-
-    At 15 N the resonator has the linear motion with the factor ``linearity`` and the rough one with the rest of 1.
-    """
-    amplitudes = [2.0, 15.0, 1e4, 40.0]
-    linearities = {2.0: 1.0, 15.0: linearity, 40.0: 0.0}
-    table = {
-        "lattice": {"preset": "four-band", "cells": 12},
-        "drive": {"band": 2, "at": "max-group-velocity"},
-        "contacts": {"sites": [4]},
-        "sweep": {
-            "fields": True,
-            "lattice": {"reading": ["calibrated"]},
-            "contacts": {"law": ["hertz", "bilinear"]},
-            "drive": {"amplitude": amplitudes},
-        },
-    }
-    folder = root / "interband-one-site"
-    put_sweep(folder, table, content=lambda case: {"ibtet": 0.1}, episodes=lambda case: int(case.drive.amplitude > 2))
-
-    plan = Sweep.from_table(table)
-    for name, member in zip(plan.ids(), plan.members(), strict=True):
-        drive = member.case.drive
-        time = np.arange(4000) * 2e-4
-        host = np.sin(drive.frequency * time)
-        resonator = host
-        if drive.amplitude in linearities:
-            like = linearities[drive.amplitude]
-            # The rough motion has a frequency in rad/s above the driven band.
-            rough = np.sin(2700.0 * time)
-            resonator = -like * host + (1 - like) * rough
-        velocity = np.zeros((len(time), 12, 4))
-        velocity[:, 3, 1] = host
-        velocity[:, 3, 2] = resonator
-        with h5py.File(folder / name / "run.h5", "w") as file:
-            file["time"] = time
-            file["cell"] = np.arange(1, 13)
-            file["velocity"] = velocity
-            # The claim reads motion and site; the rest makes the file a run.
-            file["dof"] = np.arange(1, 5)
-            file["sites/cell"] = [4]
-            for needed in RUN_NEEDS:
-                if needed not in file and needed != "case":
-                    file[needed] = np.zeros(1)
-            file.attrs["case"] = member.case.to_toml()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("linearity", "expected"), [(1.0, HOLDS), (0.0, IN_PART)])
-def test_portraits_pass_the_regimes(tmp_path, linearity, expected):
-    """Claim C17 holds in part if the resonator has left the linear motion at the second amplitude."""
-    put_portraits(tmp_path, linearity)
-    found = measure("C17", tmp_path)
-    assert found.verdict == expected, found
-    assert found.value["I: correlation of host and resonator, hertz"] == pytest.approx(-1.0)
-    if expected == IN_PART:
-        assert "at 15 N the resonator's motion has already left the linear one" in found.reason

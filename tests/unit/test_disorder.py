@@ -12,9 +12,7 @@ import pytest
 from tests.conftest import put_members
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.disorder import SCATTERED, Deviation, values_of
-from vipetsc.figures.sweep_members import Files, Sweeps
-from vipetsc.figures.transfer_curves import transfer_curves
-from vipetsc.io.read import open_ensemble, over_samples
+from vipetsc.io.read import open_ensemble
 from vipetsc.lattice import pass_bands
 
 BASE = {"name": "small", "lattice": {"preset": "four-band", "cells": 40}, "drive": {"cycles": 4}}
@@ -185,16 +183,6 @@ def test_a_count_of_seeds_is_an_axis_of_samples():
     assert plan.case(3 * 7).contacts == Case.from_table(table).contacts
 
 
-def test_one_sample_that_cannot_be_drawn_refuses_the_sweep():
-    """A sweep of which one sample has an impossible clearance is refused, though others could be drawn."""
-    plan = Sweep.from_table(SWEEP | {"disorder": {"clearance": {"relative": 0.8}}})
-    possible = [plan.member(number).case is not None for number in range(0, plan.count, 7)]
-    assert any(possible)
-    assert not all(possible)
-    with pytest.raises(CaseError, match="but its sign must not change"):
-        plan.members()
-
-
 # Members that fail: one of five samples at 8 N, all at 64 N.
 FAILED = (3, 6, 13, 20, 27, 34)
 
@@ -252,20 +240,6 @@ def test_statistics_are_those_of_the_samples_that_came_out(ensemble):
         assert row[:6] == pytest.approx(np.nanquantile(values, quantile, axis=0), rel=1e-14)
     for item in (mean, deviation, quantiles):
         assert np.isnan(item.values[..., 6]).all()
-
-
-def test_fits_and_pictures_have_means_in_place_of_single_samples(ensemble):
-    """Fits of the mean are stored, and curves of pictures are means over the samples."""
-    mean = ensemble["statistics/ibtet/mean"]
-    assert "fits/ibtet/peak" in ensemble
-    assert ensemble["statistics/fits/ibtet/peak"] == np.nanmax(mean)
-
-    means = over_samples(ensemble)
-    assert means["ibtet"].dims == ("amplitude",)
-    assert (means["ibtet"] == mean).sum() == 6
-    with Files() as files:
-        (curve,) = transfer_curves(Sweeps([ensemble], files))
-    assert curve.data["ibtet"].values[:6] == pytest.approx(mean.values[:6])
 
 
 def test_a_modulus_scales_the_stiffness_of_sites_with_radii_of_their_own():

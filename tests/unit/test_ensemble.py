@@ -315,38 +315,3 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tm
     assert ensemble["work"].values.tolist() == [1, 4, 1]
     assert ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
     assert np.isnan(ensemble["entropy/history"].values[1]).all()
-
-
-@pytest.mark.parametrize("step", ["studies.ensemble.Results.merge_files", "studies.sweep.assemble"])
-def test_a_sweep_that_is_assembled_anew_can_be_read_at_any_time(tmp_path, monkeypatch, step):
-    """A failure before any step leaves an ensemble; the next call has the latest records."""
-    sweep = Sweep.from_table(SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0]}}})
-    one, two = sweep.ids()
-    linear = LinearRun(envelope=np.zeros(40), arrival=np.zeros(40), statistics={}, measures={5: {}})
-    file = RecordFile(tmp_path / "members-0.jsonl")
-    file.append(record_of_linear(linear, "wave"))
-    file.append(scaled_record(one, site=5, work=1.0, warnings=[]))
-    status, _ = conclude(Results(sweep, tmp_path))
-    assert (status == MISSING).sum() == 1
-    assert not (tmp_path / "ensemble.h5").exists()
-
-    file.append(scaled_record(two, site=5, work=4.0, warnings=[]))
-    file.close()
-    conclude(Results(sweep, tmp_path))
-
-    def fill_the_disk(*arguments: object) -> None:
-        raise OSError("No space left on device")
-
-    # As `analyse` appends records of members that it has measured again.
-    file = RecordFile(tmp_path / "members-0.jsonl")
-    file.append(scaled_record(two, site=5, work=9.0, warnings=[]))
-    file.close()
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(f"vipetsc.{step}", fill_the_disk)
-        conclude(Results(sweep, tmp_path), afresh=True)
-    with open_ensemble(tmp_path) as ensemble:
-        assert ensemble.sizes["amplitude"] == 2
-
-    conclude(Results(sweep, tmp_path))
-    with open_ensemble(tmp_path) as ensemble:
-        assert ensemble["work"].values.tolist() == [1.0, 9.0]

@@ -60,19 +60,6 @@ def test_a_new_folder_gets_its_marker(tmp_path, kind):
     assert (folder / kind.marker).read_text() == OLD
 
 
-@pytest.mark.parametrize("resume", [False, True])
-def test_another_case_is_refused_with_the_difference(run, resume):
-    message = "contains another run: a = 1 there, 2 here; replace it with --force, or choose another folder with --out"
-    assert_refused(message, run, RUN, NEW, resume=resume)
-
-
-def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
-    message = "contains no run to resume; omit --resume"
-    assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
-    # The folder above it was not created either.
-    assert not names_in(tmp_path)
-
-
 def test_force_sets_the_earlier_results_aside_until_the_new_ones_are_complete(run, caplog):
     """Earlier results wait in NAME.old, which a line names; files of the user stay where they are."""
     old = run.with_name("run.old")

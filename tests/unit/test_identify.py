@@ -250,18 +250,6 @@ def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     assert "drive 1 moves a wall" in problem.remedy
 
 
-def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):
-    """A force sensor may name a drive that the record adds to those of the case."""
-    path = written(tmp_path, [f"{1e-3 * k:.4f},{np.sin(k):.6f},{np.cos(k):.6f}" for k in range(20)], "t,v,f")
-    sensors = [SENSOR, {"quantity": "force", "column": "f", "drive": 2}]
-    second = {"more": [{"frequency": 1000.0, "cycles": 4, "cell": 3}]}
-    case = IdentifyCase.from_table(identify_table(lattice_table(), record_in(path, sensors=sensors, drive=second)))
-    assert len(case.trials(0).base.drive.every) == 2
-
-    problems = problems_of(record_in(path, sensors=sensors))
-    assert problems == {"identify.records[1].sensors[2].drive": "2: the case has 1 drive"}
-
-
 @pytest.mark.parametrize(("outliers", "is_said"), [(0, False), (1, True), (3, True), (10, True), (40, False)])
 def test_a_misfit_of_few_samples_is_said(outliers, is_said):
     """Samples within an impact that the model has of another duration make the misfit, and the others the noise."""

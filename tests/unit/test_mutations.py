@@ -42,13 +42,6 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
     assert sum(bool(verdict.cases) for verdict in verdicts) > 3
 
 
-def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):
-    """A given end of the run is accepted at kappa = pi, where no end follows from the group velocity, 0."""
-    (case,) = load(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
-    # The frequency is the upper edge of band 2, (k2/m)^(1/2) = (1e4/0.005)^(1/2).
-    assert case.drive.frequency == pytest.approx(1414.2136)
-
-
 def test_a_key_can_be_taken_out(tmp_path):
     """``--set key=`` removes a key, so that another one can take its place; a key that is not there is refused."""
     text = "[drive]\nband = 2\nwavenumber = 1.0\n"
@@ -57,12 +50,6 @@ def test_a_key_can_be_taken_out(tmp_path):
 
     with pytest.raises(CaseError, match=r"--set drive\.bnad: is not in the case"):
         load(tmp_path / "case.toml", text, "drive.bnad=")
-
-
-def test_a_cell_of_ones_own_needs_no_contacts(tmp_path):
-    """A lattice with a cell of its own needs no section [contacts] and has no sites then; tests/verify runs one."""
-    (case,) = load(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
-    assert case.model().chain.sites == ()
 
 
 def test_a_sweep_may_give_what_a_run_lacks(tmp_path):

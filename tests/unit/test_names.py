@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.steady_states import nfrc_case
 from vipetsc.wording import distinct
 
 
@@ -21,10 +20,3 @@ from vipetsc.wording import distinct
 def test_numbers_that_differ_have_names_that_differ(numbers, names):
     """Each number is written with six digits, or with as many as distinguish it from the others."""
     assert distinct(numbers) == names
-
-
-def test_curves_that_agree_in_six_digits_have_files_of_their_own():
-    """Curves whose frequencies and restitutions agree in six digits have different names."""
-    curves = nfrc_case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
-    assert len({name for name, *_ in curves}) == 4
-    assert curves[0] == ("r0.7-1023.27", 0.7, 1023.27)

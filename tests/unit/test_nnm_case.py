@@ -84,35 +84,3 @@ def test_a_contact_pressed_to_ground_holds_a_lattice():
         "contacts": [{"host": 0, "resonator": 1, "clearance": 0.0}],
     }
     NnmCase.from_table({"contacts": contacts, "nnm": {"system": "own", "modes": [1], "own": own}})
-
-
-def test_disorder_is_drawn_for_normal_modes():
-    """A case with disorder has drawn clearances and masses, and is the same case when read back."""
-    table = {
-        "lattice": {"preset": "four-band", "cells": 8},
-        "contacts": {"sites": [2, 5], "clearance": 1e-3},
-        "disorder": {"seed": 3, "clearance": {"relative": 0.05}, "cells": {"masses[1]": {"relative": 0.01}}},
-        "nnm": {"system": "chain", "modes": [5]},
-    }
-    case = NnmCase.from_table(table)
-
-    (first, _), (second, _) = case.gaps()
-    assert first != second
-    # The bound is four standard deviations.
-    assert first == pytest.approx(1e-3, rel=0.2)
-    # The masses were drawn, too.
-    assert not case.chain().is_uniform()
-    assert NnmCase.from_toml(case.to_toml()) == case
-
-
-def test_beads_between_ends_without_walls_move_as_a_rigid_body():
-    """Mode 1 of beads that no spring joins to a wall has the frequency 0 and is refused, also with fixed ends."""
-    pressed = {"sites": [1, 2], "next_cell": True, "side": "minus", "clearance": 0.0, "precompression": 1e-6}
-    table: dict[str, Any] = {
-        "lattice": {"cells": 3, "ends": "fixed", "cell": {"masses": [1e-3]}},
-        "contacts": pressed | {"stiffness": 1e9},
-        "nnm": {"system": "chain", "modes": [1, 2]},
-    }
-    with pytest.raises(CaseError, match=r"nnm\.modes = \[1\]: the system can move as a rigid body"):
-        NnmCase.from_table(table)
-    NnmCase.from_table(table | {"nnm": {"system": "chain", "modes": [2]}})

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,10 +13,8 @@ from tests.conftest import search_table
 from vipetsc.case import CaseError, case_id
 from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judgement, ObjectiveRuns, _energy_beyond
 from vipetsc.studies.optimum_search import OptimumSearch
-from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, Nsga2, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
@@ -274,28 +270,3 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
     losses, _, _, reason = GivenRecords(small, records).judge(small.base)
     assert np.isnan(losses).all()
     assert reason == "5 N: stalled"
-
-
-@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 1.00 TiB"), OSError(28, "full"), CaseError([])])
-def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
-    """A run that lacked memory or disk has no record and is repeated; a run that fails otherwise is recorded."""
-    asked = []
-
-    def work(key):
-        asked.append(key)
-        raise {"stalls": RuntimeError("stalled"), "short": error}[key]
-
-    def recorded() -> RecordedRuns:
-        return RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read()
-
-    # The second call stands for the command after memory or disk was freed.
-    for _ in range(2):
-        # All three errors become an OSError, which ends the study.
-        with pytest.raises(OSError, match=r"Unable|full|0 problem"):
-            recorded().make(["stalls", "short"], work, allow_failures=True)
-
-        records = recorded().records
-        assert [*records] == ["stalls"]
-        assert records["stalls"]["reason"] == "stalled"
-
-    assert asked == ["stalls", "short", "short"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 
 from mpi4py import MPI
@@ -40,15 +39,6 @@ def test_a_script_has_lines_and_an_end(written, monkeypatch):
 
     lines = written().splitlines()
     assert lines == [" 25 %  5 of 20 s, 15 s left", " 50 %  10 of 20 s, 10 s left", " 60 %  12 of 20 s in 12.0 s"]
-
-
-def test_a_notebook_has_a_bar(written, monkeypatch):
-    """The kernel of a notebook, whose stderr is no terminal, gets a bar from tqdm.auto."""
-    monkeypatch.setitem(sys.modules, "ipykernel", object())
-    progress = Progress(MPI.COMM_SELF, 2.0, "runs")
-    progress.update(1.0)
-    progress.close()
-    assert " 50%|" in written()
 
 
 class Clock:

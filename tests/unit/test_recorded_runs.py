@@ -4,21 +4,17 @@ import errno
 import os
 import pickle
 from pathlib import Path
-from types import SimpleNamespace
 
 from mpi4py import MPI
 
 import pytest
 
-from vipetsc.case.law import LawCase
 from vipetsc.io.atomic import unwritten
 from vipetsc.io.errors import is_of_file_system
 from vipetsc.io.records import Record, RecordFile
 from vipetsc.parallel import StopRequest
 from vipetsc.sources import hash_of, source_key
 from vipetsc.studies.recorded_runs import Key, RecordedRuns, RecordPaths
-from vipetsc.studies.ring import Ring
-from vipetsc.wording import of_system
 
 
 def recorded_runs(folder) -> RecordedRuns:
@@ -73,34 +69,6 @@ def test_the_key_follows_from_sources_with_numbers(tmp_path, path, counts):
     assert len({first, second, hash_of(tmp_path)}) == (3 if counts else 1)
 
 
-def test_the_ring_is_endless_and_has_one_site_or_none():
-    """Runs with and without a site differ in the site alone: same ring, same drive, same time."""
-    table = {"lattice": {"cells": 40}, "contacts": {"sites": [9, 12], "clearance": [1e-3, 2e-3]}}
-    asked = []
-
-    def run_in_memory(case):
-        asked.append(case)
-        return None, None
-
-    ring = Ring(LawCase.from_table(table), SimpleNamespace(run_in_memory=run_in_memory))
-    ring.run_to_end(2.0, with_site=True)
-    ring.run_at_site(1.0, with_site=False)
-
-    setting = ring.setting
-    for run in asked:
-        assert run.lattice.ends == "periodic"
-        assert run.lattice.cells == setting.cells > 40
-        assert run.drive.cell == 1
-        assert run.time.end == pytest.approx(setting.end)
-
-    with_site, without = asked
-    assert with_site.contacts.sites == [setting.site + 1]
-    assert with_site.contacts.clearance == [setting.clearance]
-    assert with_site.drive.amplitude == 2.0
-    assert without.contacts.sites == []
-    assert without.output.window == [setting.site + 1, setting.site + 1]
-
-
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ESTALE, errno.EMFILE, errno.ENOSPC])
 @pytest.mark.parametrize("message", ["", "law.h5 could not be written"])
 def test_an_error_of_the_file_system_ends_all_runs_and_is_no_failure_of_one(tmp_path, number, message):
@@ -115,17 +83,6 @@ def test_an_error_of_the_file_system_ends_all_runs_and_is_no_failure_of_one(tmp_
         runs.compute(["a"], work)
     assert message or "the same command continues" in str(caught.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_message_of_the_system_gets_its_file_and_a_remedy(tmp_path):
-    """Both names of a renaming are in it; messages of the package stay as they are, without a number."""
-    with pytest.raises(OSError, match="No such file") as caught:
-        os.replace(tmp_path / "a", tmp_path / "b")
-    message = of_system(caught.value)
-    assert all(word in message for word in (f"{tmp_path}/a", f"{tmp_path}/b", "No such file", "the same command"))
-    assert "[" not in message
-    assert of_system(unwritten(Path("x.h5"), OSError(errno.EIO, "I/O"))).startswith("x.h5 could not be written")
-    assert of_system(OSError("no ffmpeg")) == "no ffmpeg"
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])

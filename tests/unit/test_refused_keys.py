@@ -53,36 +53,6 @@ def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_t
     assert case.drive.frequency == pytest.approx(3.141592653589793e5)
 
 
-def test_a_further_drive_may_stand():
-    """A run lasts until the wave of the first drive has crossed the lattice: that of a further one need not travel."""
-    standing = {"wavenumber": "pi", "band": 1}
-    table = {
-        "lattice": {"preset": "diatomic", "cells": 24},
-        "contacts": {"sites": 0},
-        "drive": {"more": [standing]},
-        "time": {"sample_interval": 1e-5},
-    }
-    assert Case.from_table(table).drive.more[0].frequency > 0
-    key, remedy = problem_of(table | {"drive": standing})
-    assert key == "drive.wavenumber" and "never crosses" in remedy
-
-
-@pytest.mark.parametrize(
-    ("cells", "frequency", "reason"),
-    [(3, 500.0, "3 cells, fewer than the 9"), (60, 2e5, "is too long for 3e+05 rad/s")],
-)
-def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, reason):
-    """The propagator refuses lattices shorter than its reach and sample intervals too long for their frequencies."""
-    springs = [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}]
-    case = Case.from_table({
-        "lattice": {"cell": {"masses": [1e-3], "springs": springs}, "cells": cells},
-        "contacts": {"sites": []},
-        "drive": {"frequency": frequency, "cycles": 2},
-        "time": {"end": 0.01, "sample_interval": 2e-4},
-    })  # fmt: skip
-    assert reason in str(refusal(case.model()))
-
-
 def test_every_union_is_read_by_the_shape_of_its_value():
     """A union without the mark would give the errors of all of its types, with pydantic's own names in their paths."""
     waiting = list(SECTIONS.values())

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import h5py
 import numpy as np
 import pytest
 
 from vipetsc.case.registered import check_factors, check_law
 from vipetsc.case.waveforms import OneDrive, waveform_record
-from vipetsc.figures.registered import registered_figures
-from vipetsc.io.kinds import KIND_OF, STUDIES
 from vipetsc.lattice.drive import impulse
-from vipetsc.register import DISSIPATION, FIGURE, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
+from vipetsc.register import DISSIPATION, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -82,19 +79,3 @@ def test_a_waveform_without_a_finite_force_is_named_with_its_file(monkeypatch, a
     monkeypatch.setitem(PARTS[WAVEFORM], "tap", part)
     with pytest.raises(PartError, match=r"the waveform 'tap' of .* not a finite number"):
         waveform_record("tap").build(OneDrive())
-
-
-@pytest.mark.parametrize("source", [kind.source for kind in STUDIES])
-def test_registered_figures_are_found_by_every_kind_of_results(source, tmp_path):
-    """The case in the one file of a source names the module of the figures."""
-    module = tmp_path / "pictures.py"
-    code = f"from vipetsc import register\n\n\n@register.figure('mine', source='{source}')\ndef mine(data):\n    pass\n"
-    module.write_text(code)
-    with h5py.File(tmp_path / KIND_OF[source].file, "w") as file:
-        file.attrs["case"] = f"[plugins]\nmodules = ['{module}']\n"
-    try:
-        figures, message = registered_figures(source, [tmp_path])
-    finally:
-        # Parts stay registered in this process.
-        PARTS[FIGURE].pop("mine", None)
-    assert (set(figures), message) == ({"mine"}, "")

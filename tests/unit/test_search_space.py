@@ -167,42 +167,6 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
 
 
 @pytest.mark.parametrize(
-    ("variables", "key"),
-    [
-        ({"clearance": [1e-8, 1e-5]}, "clearance"),
-        ({"profile": [1e-8, 1e-5]}, "profile"),
-        ({"contacts": {"clearance": {"log": [1e-8, 1e-5]}}}, "contacts.clearance"),
-        ({"contacts": {"clearance": {"first": {"log": [1e-8, 1e-5]}}}}, "contacts.clearance.first"),
-    ],
-)
-@pytest.mark.parametrize(
-    ("pressed", "path"),
-    [
-        ({"precompression": 1e-6}, "contacts.precompression"),
-        ({"each": {"precompression": [0.0, 1e-6, 1e-7]}}, "contacts.each.precompression"),
-        ({}, ""),
-    ],
-)
-def test_clearances_that_vary_at_pressed_sites_are_warned_of(variables, key, pressed, path):
-    """A clearance is taken from the precompression, of which one sentence with both keys tells."""
-    clearance = {"first": 1e-7, "last": 1e-7} if "first" in str(variables) else 1e-7
-    contacts = {"clearance": clearance, "side": "minus", "restitution": 1.0} | pressed
-    plan = plan_of(variables, contacts=contacts)
-
-    found = [sentence for sentence in plan.warnings() if "precompression" in sentence]
-
-    if not path:
-        assert not found
-        return
-    (sentence,) = found
-    assert sentence.startswith(f"optimise.variables.{key}: ")
-    assert f"({path}, up to 1e-06 m)" in sentence
-    # What the sentence says: the stop of a design is pressed by the difference of the two.
-    design = plan.design(plan.begin())
-    assert min(gap for stops in design.model().gaps for gap in stops) == pytest.approx(1e-7 - 1e-6)
-
-
-@pytest.mark.parametrize(
     "path, value", [("drive.more.first.cell", None), ("name.first.second", 1), ("a.b.c[2].d.e", 1)]
 )
 def test_a_key_that_cannot_be_set_leaves_the_table_as_it_was(path, value):

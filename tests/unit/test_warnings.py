@@ -129,22 +129,6 @@ def test_contacts_that_are_brief():
     assert warnings_of(petsc={"ts_adapt_type": "none", "ts_dt": "1e-5"}) == []
 
 
-def test_the_time_of_a_contact_is_that_of_the_masses_it_joins():
-    """The warning of a brief contact has the time for the mass at a stop to ground, or the reduced mass of a pair."""
-
-    def duration(**join) -> str:
-        """Return the duration that the warning names, of a case with brief contacts."""
-        case = small_case(time={"end": 0.04}, contacts={"modulus": 1e12, "side": "plus"} | join)
-        (sentence,) = [text for text in case.warnings() if "of a sample interval" in text]
-        model = case.model()
-        speed = model.scale * model.drive.frequency
-        (mass,) = set(model.chain.reduced_masses())
-        assert f"lasts {model.contact.impact_time(speed, mass):.3g} s" in sentence
-        return sentence
-
-    assert duration() != duration(pair=[0, 3])
-
-
 def drive_of_samples(folder, unit: float = 1.0, **keys) -> dict:
     """Return a drive of a burst at the four-band lattice's 1020 rad/s, whose file has its times in a ``unit`` (s)."""
     times = np.arange(600) * 1e-4

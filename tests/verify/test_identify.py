@@ -230,27 +230,6 @@ def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, s
 
 
 @pytest.mark.slow
-def test_beads_without_springs_determine_their_restitution(tmp_path):
-    """Two free beads that collide once, with nothing else between them, have their restitution in the record."""
-    beads = {
-        "name": "beads",
-        "lattice": {"cells": 2, "ends": "free", "cell": {"masses": [2e-3]}},
-        "contacts": {"law": "hertz", "stiffness": 7e9, "sites": [1], "next_cell": True, "side": "minus"},
-        "initial": {"kind": "velocity", "cell": 1, "velocity": 1.0},
-        "time": {"end": 2e-3, "samples": 201},
-        "output": {"points": [{"name": "p", "cell": 2}]},
-    }
-    beads["contacts"] |= {"clearance": 1e-3, "restitution": 0.85, "damping": "exact"}
-    run = run_of(Case.from_table(beads))
-    np.savetxt(tmp_path / "r.csv", np.column_stack([run["time"], run["points/velocity"]]), delimiter=",", fmt="%.17g")
-    sensor = {"quantity": "velocity", "column": 2, "cell": 2}
-    record = {"file": str(tmp_path / "r.csv"), "time": 1, "sensors": [sensor]}
-    unknowns = [{"quantity": "restitution", "bounds": [0.2, 1.0], "start": 0.6}]
-    found = results_of(tmp_path / "out", identify_table(beads, record, unknowns=unknowns))
-    assert found["value"].values == pytest.approx([0.85], rel=1e-6)
-
-
-@pytest.mark.slow
 def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
     """A bilinear model fitted to data of Hertz's law leaves residuals that are not white; Hertz's law does not."""
     table = lattice_table(time={"end": 0.014})

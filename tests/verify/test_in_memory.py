@@ -11,10 +11,9 @@ import pytest
 import xarray as xr
 
 from tests.conftest import small_case
-from vipetsc.case import CaseError, Sweep
+from vipetsc.case import Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.parallel import StopRequest
-from vipetsc.studies import sweep as sweeps
 from vipetsc.studies.sweep import run_sweep
 
 pytestmark = pytest.mark.parallel(1)
@@ -83,17 +82,3 @@ def test_a_sweep_that_is_stopped_stays_where_it_is(tmp_path, monkeypatch):
     assert Path(stopped.folder).parent == tmp_path
 
     assert run_sweep(small_sweep(), stopped.folder).complete
-
-
-def test_fields_of_members_need_a_folder():
-    """A sweep that keeps the runs of its members is refused without a folder, before anything is simulated."""
-    with pytest.raises(CaseError, match=r"sweep\.fields = True: stores files of every member: give a folder"):
-        run_sweep(small_sweep(fields=True))
-
-
-def test_ranks_of_several_machines_need_a_folder(monkeypatch):
-    """A sweep in memory on several machines is refused: each sees only its own temporary folders."""
-    # The test runs on one machine, and pretends that there are several.
-    monkeypatch.setattr(sweeps, "on_one_machine", lambda comm: False)
-    with pytest.raises(ValueError, match="ranks on several machines need a folder that all of them see"):
-        run_sweep(small_sweep())

@@ -13,7 +13,6 @@ import pytest
 from tests.conftest import run_of
 from tests.one_site import COARSE, LATTICES, law_case
 from vipetsc.case import Case, LawCase
-from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import Chain, ToneBurst, bloch
@@ -244,18 +243,3 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     law.mean.upper[:] = 0
     with pytest.raises(ValueError, match="no energy to bands above"):
         law.matched()
-
-
-def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path):
-    bare = LawCase.from_table({"contacts": {"sites": 0, "clearance": {"first": 1e-3, "last": 4e-3}}})
-    assert bare.law.clearance == pytest.approx(2e-3)
-    assert bare.law.distance == 78
-    assert LawCase.from_toml(bare.to_toml()).to_toml() == bare.to_toml()
-
-    five = LawCase.load()
-    assert five.law.distance == 74
-    assert five.law.clearance == pytest.approx(10**-2.7)
-
-    path = tmp_path / "law.toml"
-    path.write_text("[law]\nsamples = 1\n")
-    assert [type(case) for case in load_every(path)] == [LawCase]

@@ -11,9 +11,7 @@ from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.io.read import open_ensemble
-from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
-from vipetsc.studies import sweep_runs
 from vipetsc.studies.ensemble import COMPLETE, SCALED
 from vipetsc.studies.linear_run import MEMBERS, linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
@@ -110,28 +108,6 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     assert_same_bits(found, datasets(kept / "run.h5"))
 
 
-def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
-    """Measures of a new analysis replace those in records of ranks that were not merged, as after a kill."""
-    folder = tmp_path / "sweep"
-    table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
-    assert run_sweep(Sweep.from_table(table), folder).complete
-    right = open_ensemble(folder)["ibtet"].item()
-
-    paths = RecordPaths(folder, MEMBERS)
-    records = [record for record, _ in read_records(paths.merged, pytest.fail)]
-    paths.merged.unlink()
-    file = RecordFile(paths.for_rank(1))
-    for record in records:
-        if record["kind"] == "member":
-            record["measures"]["ibtet"] = 2 * right
-        file.append(record)
-    file.close()
-
-    reanalyse_folders([folder], MPI.COMM_SELF)
-    assert open_ensemble(folder)["ibtet"].item() == right
-    assert paths.existing() == [paths.merged]
-
-
 def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
     """Modal energies at the end of a member sum to the work less the losses, if no site is in contact then."""
     margins, ensemble, _ = sweep
@@ -147,19 +123,6 @@ def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
 
     upper = energy.values[:, [4, 6]].sum(axis=1) / work
     assert ensemble["upper_share_at_end"].values == pytest.approx(upper, rel=1e-12)
-
-
-def test_all_members_say_alike_why_their_linear_run_failed(tmp_path, monkeypatch):
-    """All members have the reason for which their linear run failed, with the error's type: memory was too small."""
-
-    def fail(*arguments):
-        raise MemoryError("Unable to allocate 1.00 TiB")
-
-    monkeypatch.setattr(sweep_runs, "simulate_linear", fail)
-    table = TABLE | {"sweep": {"drive": {"amplitude": [1e-3, 2e-3, 3e-3]}}}
-    result = run_sweep(Sweep.from_table(table), tmp_path / "out")
-
-    assert [row["reason"] for row in result.failures] == ["MemoryError: Unable to allocate 1.00 TiB"] * 3
 
 
 OVERLAPPING = {

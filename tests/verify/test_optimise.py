@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from vipetsc.case.amplitude import amplitude_changes, amplitude_of
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.lattice import gaps, pass_bands
 from vipetsc.studies import optimum_search
-from vipetsc.studies.linear_run import LinearRun, linear_case
 from vipetsc.studies.objective import measured
 
 SEARCH = {"budget": 30, "curve": [12.0], "variables": {"clearance": [3e-5, 3e-3]}}
@@ -146,42 +144,6 @@ def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     assert found["curve/value"][1, searched, 0] == value[best]
     assert found["curve/value"][0, searched, 0] == value[0]
     assert found["upper_share_at_end"].tolist() == value.tolist()
-
-
-@pytest.mark.slow
-def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, monkeypatch):
-    """A search begins with clearances A env(s_k) sqrt(T^k)/z*, k in the order of the wave's path."""
-    requests = []
-
-    class Law:
-        """A law whose best z is 1.25, where 0.64 of the energy is transmitted."""
-
-        def matched(self):
-            return 1.25, 0.64
-
-    def make_law(*arguments, **options):
-        requests.append(arguments)
-        return Law()
-
-    monkeypatch.setattr(optimum_search, "make_law", make_law)
-    table = copy.deepcopy(TABLE)
-    table["optimise"] |= {"start": "matched", "budget": 2}
-    # The sites are not in the order of their cells.
-    table["contacts"]["sites"] = [12, 6, 13]
-
-    optimum_search.run_search(OptimiseCase.from_table(table), tmp_path)
-
-    ((law, folder, _),) = requests
-    assert law.drive.amplitude == 24.33
-    assert folder == tmp_path / "law"
-
-    run, result = simulated(linear_case(small_case()))
-    envelope = LinearRun.of(run, result.statistics, (), ()).envelope
-    # The factors are sqrt(0.64^k) for k = 0, 1 and 2.
-    matched = 24.33 * envelope[np.array([6, 12, 13]) - 1] / 1.25 * [1, 0.8, 0.64]
-    first, second = datasets(tmp_path / "optimum.h5")["parameter"]
-    assert first == pytest.approx(2e-4)
-    assert second[[1, 0, 2]] == pytest.approx(matched, rel=1e-3)
 
 
 def test_a_search_of_grains_has_no_bands():
