@@ -1,8 +1,7 @@
-"""The program with coarse pictures, for tests that look at files only: ``python -m tests.coarse ARGUMENTS``."""
+"""Coarse pictures, for tests that look at files only."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 
 
@@ -13,16 +12,3 @@ def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
 
     replace(style, "SCREEN", 80)
     replace(style, "_lay_out", remove_engine)
-
-
-def main() -> int:
-    """Call the program with coarse pictures; returns its exit code."""
-    coarse_pictures(setattr)
-
-    from vipetsc.__main__ import main as vipetsc
-
-    return vipetsc()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

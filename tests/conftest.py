@@ -251,22 +251,6 @@ def modified(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-# With 0 ranks the program is called without mpirun, in a serial test.
-alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
-
-
-def on_two(*values: object) -> list:
-    """Parameters for which ``scripts/test`` runs a test on one rank and on two, but not on more.
-
-    More ranks would show nothing new. A value may be a tuple of arguments.
-    """
-    parameters = []
-    for value in values:
-        arguments = value if isinstance(value, tuple) else (value,)
-        parameters.append(pytest.param(*arguments, marks=pytest.mark.on_two))
-    return parameters
-
-
 class StopAt(StopRequest):
     """A request to stop that is granted after it has been looked at ``looks`` times."""
 
@@ -277,6 +261,13 @@ class StopAt(StopRequest):
     def requested(self) -> bool:
         self.left -= 1
         return self.left < 0
+
+
+class InParts(Observer):
+    """An observer of blocks of ten samples: a run can stop after each block."""
+
+    name = "in-parts"
+    longest = 10
 
 
 # Environment variables by which Open MPI's mpirun says which rank a process is; since Open MPI 5 its layers PMIx and
@@ -340,24 +331,6 @@ def in_process(capsys, monkeypatch):
             except SystemExit as end:
                 code = end.code
         return subprocess.CompletedProcess(words, code, *capsys.readouterr())
-
-    return call
-
-
-@pytest.fixture
-def on_ranks(request, vipetsc, in_process):
-    """Call the program on ranks of mpirun, or in this process if ``ranks`` is 0: ``on_ranks(ranks, "run", ...)``.
-
-    If the test has the fixture ``plain_pictures``, the ranks draw coarse pictures as well.
-    """
-    options: dict[str, Any] = {}
-    if "plain_pictures" in request.fixturenames:
-        options = {"module": "tests.coarse", "env": clean_environment() | {"PYTHONPATH": str(ROOT)}}
-
-    def call(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
-        if ranks:
-            return vipetsc(ranks, *arguments, **options)
-        return in_process(*arguments)
 
     return call
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import clean_environment, set_words
+from tests.conftest import set_words
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 # Few cells and a short burst, with a clearance so small that there are contacts.
@@ -21,14 +18,6 @@ TINY = (
     "drive.cycles=3",
     "time.end=0.018",
 )  # fmt: skip
-
-
-def bench(*arguments: object) -> subprocess.CompletedProcess:
-    """Call ``scripts/bench.py`` in a process of its own."""
-    command = [sys.executable, SCRIPTS / "bench.py", *arguments]
-    return subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, timeout=600, check=False, env=clean_environment()
-    )
 
 
 def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, capsys):
@@ -49,18 +38,8 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, c
         assert row["seconds"] > 0, row
         errors.setdefault(row["solver"], []).append(row["error"])
 
-    # A machine may lack some solvers: those that it can run must be among the results.
-    wanted = {"vipetsc ts", "DOP853 numba", "DOP853 numpy"}
-    has_compiler = bool(shutil.which("c++"))
-    if has_compiler and bench_peers.petsc_flags():
-        wanted |= {"TSRK 5dp", "TSRK 8vr"}
-    if has_compiler and Path("/usr/include/boost/numeric/odeint.hpp").exists():
-        wanted |= {"odeint dopri5", "odeint fehlberg78"}
-    if has_compiler and Path("/usr/include/arkode/arkode_erkstep.h").exists():
-        wanted.add("ARKODE dopri5")
-    if (SCRIPTS.parent / ".venv-diffrax" / "bin" / "python").exists():
-        wanted.add("diffrax Dopri8")
-    assert wanted <= errors.keys()
+    # Which peers there are depends on the machine.
+    assert {"vipetsc ts", "DOP853 numba", "DOP853 numpy"} <= errors.keys()
 
     for solver, falling in errors.items():
         # Fehlberg's error estimate overlooks some kinks of the force, and the error falls unevenly with the tolerance.
@@ -70,17 +49,15 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, c
     assert max(found["reference"]["separation"].values()) < 1e-9
     assert min(found["ratios"].values()) > 0
 
-    # An empty picture takes fewer bytes.
-    assert (tmp_path / "work-precision.png").stat().st_size > 5000
     assert main(["--table", "--out", str(tmp_path)]) == 0
     assert "| DOP853 numpy |" in capsys.readouterr().out
 
 
 @pytest.mark.mpirun
-def test_what_two_ranks_do_is_timed_beside_memory_and_files(monkeypatch):
-    """Intervals on two ranks have times and memory; a build has its files and times."""
+def test_what_two_ranks_do_is_timed_beside_memory(monkeypatch):
+    """Intervals on two ranks have times and memory."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    from bench_scaling import builds, on_ranks
+    from bench_scaling import on_ranks
 
     row = on_ranks(2, "intervals", engine="ts", cells=30, intervals=3)
 
@@ -90,11 +67,6 @@ def test_what_two_ranks_do_is_timed_beside_memory_and_files(monkeypatch):
     assert 0.01 < row["peak_gib_a_rank"] < 4
     # These times come from events of PETSc's log.
     assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0
-
-    alone, together = builds([(200, 3)])
-    assert together["ranks"] == 2
-    assert together["file_gb"] == pytest.approx(alone["file_gb"], rel=0.2)
-    assert min(together["set_up_s"], together["write_s"], together["seconds"]["step"]) > 0
 
 
 @pytest.mark.parametrize(
@@ -107,39 +79,6 @@ def test_what_cannot_be_measured_is_refused(tmp_path, monkeypatch, arguments):
 
     assert main([*arguments, "--out", str(tmp_path / "none")]) == 2
     assert not (tmp_path / "none").exists()
-
-
-def test_programs_run_beside_an_earlier_version(tmp_path, monkeypatch):
-    """A call of two versions gives positive times and their ratio; a call that fails, and no such commit, are named."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import bench_programs
-
-    # The test makes a repository of its own, because these sources may come from an archive without history.
-    sources = tmp_path / "sources"
-    shutil.copytree(SCRIPTS.parent / "vipetsc", sources / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
-    git = ["git", "-C", str(sources), "-c", "user.name=bench", "-c", "user.email=bench@example.org"]
-    for words in (["init", "--quiet"], ["add", "vipetsc"], ["commit", "--quiet", "--message", "earlier"]):
-        subprocess.run([*git, *words], check=True)
-    (sources / "vipetsc" / "added_since.py").touch()
-    monkeypatch.setattr(bench_programs, "ROOT", sources)
-
-    calls = {"help": bench_programs.Program("--help"), "none": bench_programs.Program("validate {folder}/none.toml")}
-    monkeypatch.setattr(bench_programs, "PROGRAMS", calls)
-    helped, failed = bench_programs.programs(tmp_path, rounds=1, commit="HEAD", names=calls)
-
-    assert min(helped["wall_now"], helped["cpu_now"], helped["cpu_before"]) > 0.02
-    assert helped["wall_ratio"] == pytest.approx(helped["wall_now"] / helped["wall_before"])
-    assert "none.toml" in failed["failure"]
-    # The package of the commit was unpacked, not the present one.
-    unpacked = tmp_path / "baseline" / "HEAD" / "vipetsc"
-    assert (unpacked / "__init__.py").exists()
-    assert not (unpacked / "added_since.py").exists()
-
-    table = bench_programs.programs_table([helped, failed])
-    assert "| help | 1 | " in table
-    assert "| none | 1 | failed |" in table
-    with pytest.raises(RuntimeError, match="not a valid object name"):
-        bench_programs.programs(tmp_path, rounds=1, commit="nocommit", names=calls)
 
 
 def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):

@@ -1,4 +1,4 @@
-"""The verb design as a user types it: files, table, refusal, pictures from the file alone."""
+"""The verb design as a user types it: files, table, a search without a good cell."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ import pytest
 import xarray
 
 from tests.conftest import datasets, set_words
-from vipetsc.case import Case
 from vipetsc.case.design import DesignCase
-from vipetsc.case.nnm import NnmCase
-from vipetsc.figures import registry
 from vipetsc.lattice import bloch, four_band
 
 CASE = """
@@ -74,36 +71,6 @@ def test_search_leaves_its_file_its_pictures_and_a_table(in_process, case, tmp_p
     assert DesignCase.load(out / "case.toml").to_toml() == (out / "case.toml").read_text()
 
 
-def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_path):
-    """The file alone gives the pictures of the search; unknown figures and a broken file are refused."""
-    out = tmp_path / "out"
-    bare = tmp_path / "bare"
-    with monkeypatch.context() as context:
-        # The search draws only the picture that is compared below.
-        context.setattr(registry, "FIGURES", {"cost_maps": registry.FIGURES["cost_maps"]})
-        assert in_process("design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
-    bare.mkdir()
-    (out / "design.h5").rename(bare / "design.h5")
-
-    done = in_process("plot", bare, "--format", "png", "--format", "pdf")
-    assert done.returncode == 0, done.stderr
-    drawn = {p.name for p in (bare / "figures").iterdir()}
-    assert drawn == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
-    assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
-
-    one = in_process("plot", bare / "design.h5", "--fig", "cost_maps")
-    assert one.stdout.split() == [str(bare / "figures" / "cost_maps.png")]
-
-    wrong = in_process("plot", bare, "--fig", "ledger")
-    assert wrong.returncode == 2
-    assert "cost_maps" in wrong.stderr
-
-    (bare / "design.h5").write_bytes(b"nothing")
-    broken = in_process("plot", bare)
-    assert broken.returncode == 2
-    assert "cannot be opened as a design" in broken.stderr
-
-
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     """A search without a cell whose masses move out of phase ends with 0, says so and has no optimum."""
     # The resonators' springs are at least fifty times as stiff as the paper's.
@@ -114,11 +81,3 @@ def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     # There are three costs in each of two readings.
     assert done.stdout.count("none is out of phase") == 6
     assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
-
-
-def test_the_section_may_stand_beside_those_of_other_verbs():
-    """Each verb reads its own section of a table with sections of several verbs."""
-    table = {"design": {"wavenumbers": 5}, "lattice": {"preset": "four-band"}, "nnm": {"modes": [1]}}
-    assert DesignCase.from_table(table).design.wavenumbers == 5
-    assert Case.from_table(table).lattice.cells == 300
-    assert NnmCase.from_table(table).nnm.modes == [1]

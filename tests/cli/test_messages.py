@@ -76,14 +76,6 @@ def test_the_log_holds_all_messages_with_their_times(in_process, tmp_path):
     assert not logging.getLogger("vipetsc").handlers
 
 
-def test_a_log_that_cannot_be_written_is_bad_input(in_process, tmp_path):
-    """A log in a folder that does not exist ends with exit code 2 before anything is written."""
-    ended = in_process("run", *TINY, "--out", tmp_path / "run", "--log", tmp_path / "no" / "run.log")
-    assert ended.returncode == 2
-    assert ended.stderr.startswith(f"vipetsc: --log {tmp_path / 'no' / 'run.log'}: No such file")
-    assert not any(tmp_path.iterdir())
-
-
 def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
     """An exception that ends a verb is in the log with the level CRITICAL."""
 

@@ -27,22 +27,6 @@ def names(folder):
 
 
 @pytest.mark.slow
-def test_a_search_leaves_its_files_and_a_case_that_can_be_run(in_process, case, tmp_path):
-    """Records, the results, the best design as a case, and pictures."""
-    out = tmp_path / "out"
-    done = in_process("optimise", case, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "14 designs, 14 runs; 0 designs failed" in done.stdout
-    assert "maximise upper_share_at_end" in done.stdout
-    files = {"case.toml", "best.toml", "optimum.h5", "optimum-runs.jsonl"}
-    assert names(out) == files | {f"figures/{name}.png" for name in FIGURES}
-
-    # The best design is a case that can be run.
-    run = in_process("run", out / "best.toml", "--out", tmp_path / "run", "--set", "output.figures=false")
-    assert run.returncode == 0, run.stderr
-
-
-@pytest.mark.slow
 def test_two_objectives_leave_a_front_with_its_ends_and_its_knee(in_process, case, tmp_path):
     """Along the Pareto front one objective improves while the other worsens; its ends are the best designs of each."""
     out = tmp_path / "out"

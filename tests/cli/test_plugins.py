@@ -183,9 +183,7 @@ def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
         Case.from_table(table)
 
 
-@pytest.mark.parametrize(
-    ("file", "needed"), [("stops.py", True), ("pulses.py", True), ("durations.py", False), ("pictures.py", False)]
-)
+@pytest.mark.parametrize(("file", "needed"), [("stops.py", True), ("durations.py", False)])
 def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
     """Results are not read without the module of their law or waveform; one of a measure or figure may be missing."""
     # The path is changed in the text of the case, because other tests need the file.
@@ -234,8 +232,6 @@ def test_the_schema_of_a_case_has_the_names_of_its_modules(folder, in_process):
     [
         (None, "there is no file"),
         ("x = 1 / 0\n", r"cannot be imported: ZeroDivisionError: division by zero \(\S+part.py, line 1\)"),
-        ("raise SystemExit(3)\n", "cannot be imported: SystemExit: 3"),
-        ("import no_such_module\n", "ModuleNotFoundError: No module named 'no_such_module'"),
         ("x = 1\n", "registers nothing"),
         ("from vipetsc import register\nregister.figure('printed')(print)\n", "is no function written in Python"),
         (
@@ -275,15 +271,9 @@ def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
     ("change", "sentence"),
     [
         ("plugins={}", "plugins.modules: missing"),
-        ("plugins.modules=stops.py", "must be a valid list"),
-        ("plugins.module=['stops.py']", "unknown key; did you mean plugins.modules"),
         ("contacts.parameters.b=", r'contacts.parameters.b: missing; needed for the law "hardening" \(1/m\^2\)'),
         ("contacts.parameters.b=-1.0", r"parameters.b = -1.0: must be from 0 to 1e\+50 \(1/m\^2\)"),
-        ("contacts.parameters.c=1.0", 'contacts.parameters.c = 1.0: the law "hardening" takes b'),
         ("contacts.law=bilinear", 'contacts.parameters.b = 400000.0: the law "bilinear" takes no parameters'),
-        ("drive.parameters=", 'drive.parameters.delay: missing; needed for the waveform "ricker"'),
-        ("drive.waveform=harmonic", "drive.parameters: does not apply to the waveform 'harmonic'"),
-        ("drive.duration=1.0", "drive.duration: does not apply to the waveform 'ricker'"),
         ("nfrc.range=[0.5,2.0]", "a steady state repeats itself under a sine"),
     ],
 )
@@ -334,18 +324,12 @@ register.elastic_law("plain", force, slope, energy, onset_exponent=1.0)
 def abrupt(run):
     os._exit(9)
 """
-# What the program reports before it calls code of these modules, which ends the process.
-REPORTED = {
-    "import os\n\nos._exit(9)\n": ["importing {file}"],
-    PLAIN: ["importing {file}", "compiling the law 'plain' of {file}", "calling the measure 'abrupt' of {file}"],
-}
 
 
-@pytest.mark.parametrize("source", REPORTED)
-def test_a_part_that_ends_the_process_is_named_before(source, tmp_path, vipetsc):
+def test_a_part_that_ends_the_process_is_named_before(tmp_path, vipetsc):
     """Whatever a module does, the last line says which of its parts does it."""
     file = tmp_path / "part.py"
-    file.write_text(source)
+    file.write_text(PLAIN)
     case = tmp_path / "case.toml"
     case.write_text(
         '[plugins]\nmodules = ["part.py"]\n[lattice]\npreset = "four-band"\ncells = 12\n'
@@ -354,7 +338,7 @@ def test_a_part_that_ends_the_process_is_named_before(source, tmp_path, vipetsc)
     )
     ended = vipetsc(0, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 9
-    lines = ended.stderr.splitlines()
-    expected = ["vipetsc: " + line.format(file=file) for line in REPORTED[source]]
-    assert [line for line in lines if str(file) in line] == expected
-    assert lines[-1] == expected[-1]
+    lines = [line for line in ended.stderr.splitlines() if str(file) in line]
+    reported = ["importing", "compiling the law 'plain' of", "calling the measure 'abrupt' of"]
+    assert lines == [f"vipetsc: {what} {file}" for what in reported]
+    assert ended.stderr.endswith(f"{lines[-1]}\n")

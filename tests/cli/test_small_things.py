@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import clean_environment, modified
-from tests.faults.scenarios import BRANCHES, DESIGN, RUN
+from tests.faults.scenarios import DESIGN, RUN
 from vipetsc.case import NnmCase
 from vipetsc.case.design import DesignCase
 from vipetsc.cli.verbs.bands_verb import damping_report, damping_table
@@ -32,15 +32,13 @@ def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
-@pytest.mark.parametrize(("verb", "text"), [("nnm", BRANCHES), ("design", DESIGN)])
-def test_branches_and_searches_need_not_be_drawn(in_process, with_figures, tmp_path, verb, text):
+def test_searches_need_not_be_drawn(in_process, with_figures, tmp_path):
     """With output.figures=false there are no pictures; the same command without it draws them."""
-    # One picture of a search is enough.
-    with_figures("branch", "deflections")
+    with_figures("deflections")
     case = tmp_path / "case.toml"
-    case.write_text(text)
+    case.write_text(DESIGN)
     out = tmp_path / "out"
-    words = [verb, case, "--out", out]
+    words = ["design", case, "--out", out]
     ended = in_process(*words, "--set", "output.figures=false")
     assert ended.returncode == 0, ended.stderr
     assert not (out / "figures").exists()

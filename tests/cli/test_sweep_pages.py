@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import set_words
-from vipetsc.cli.drawing import sentences_on
 from vipetsc.cli.main import main
-from vipetsc.cli.verbs.sweep_verb import PICTURES
-from vipetsc.figures.registry import draw
-from vipetsc.figures.style import LeftOut
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -45,19 +41,6 @@ measures = ["transfer"]
 [sweep.contacts]
 clearance = [5e-4, 1e-3, 2e-3]
 restitution = [0.3, 0.6, 0.9]
-"""
-HARMONIC = """
-[drive]
-waveform = "harmonic"
-amplitude = 12.0
-[time]
-end = 0.05
-rtol = 1e-6
-[sweep]
-measures = ["transfer"]
-fields = true
-[sweep.drive]
-frequency = [800.0, 1000.0]
 """
 # The pages that a sweep with the measure transfer has by default.
 PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "largest_force", "upper_share_at_end")
@@ -114,19 +97,6 @@ def test_a_figure_that_cannot_be_drawn_is_refused(burst, name, message, capsys):
 
 
 @pytest.mark.slow
-def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_path):
-    """Pages are named by the frequencies of the drive, and by no reading or cycles, which the case does not have."""
-    out = sweep(tmp_path, HARMONIC)
-    assert main(["plot", str(out)]) == 0
-    names = drawn(out)
-    assert {"ibtet-over-drive.frequency.png", "contact_episodes-over-drive.frequency.png"} <= names
-    # Members with fields have pages of their own, named by their case.
-    for frequency in (800, 1000):
-        assert f"transfer-hertz-2-sites-drive-frequency-{frequency}-rad-s-12N.png" in names
-    assert not [name for name in names if "calibrated" in name or "cycles" in name]
-
-
-@pytest.mark.slow
 def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
     """A measure that is zero for every member is named instead of drawn; ``--fig`` draws it nevertheless."""
     # With clearances of metres there are no contacts.
@@ -138,16 +108,3 @@ def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, ca
     )
     assert main(["plot", str(out), "--fig", "contact_episodes"]) == 0
     assert "contact_episodes-over-contacts.clearance-contacts.restitution.png" in drawn(out)
-
-
-@pytest.mark.slow
-def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
-    """A sentence names branches that a figure does not show, or the reason why a figure with branches is left out."""
-    # An empty folder stands for one with branches.
-    (sentence,) = sentences_on(PICTURES, [burst, tmp_path], LeftOut(), ["ibtet"])
-    assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"
-
-    left_out = LeftOut()
-    draw("sweep", [burst, tmp_path], newest=0.0, left_out=left_out)
-    (sentence,) = sentences_on(PICTURES, [burst, tmp_path], left_out, None)
-    assert sentence.startswith("no picture of ibtet_backbone: needs branches of the same law")

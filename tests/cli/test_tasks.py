@@ -359,19 +359,6 @@ def test_the_best_clearances(typed, put, tmp_path):
     assert len(case["contacts"]["clearance"]) == 2
 
 
-@pytest.mark.slow
-def test_a_movie_and_tables(typed, put, tmp_path):
-    """A run is drawn as a movie, and exported as tables whose numbers are those of the run."""
-    put("mine.toml", my_lattice(), PLAIN)
-    movie = "plot runs/mine --movie --format gif --width 320 --rate 2 --from 0.05 --to 0.06"
-    typed(f"run mine.toml\n{movie}\nexport runs/mine")
-    assert (tmp_path / "runs/mine/figures/movie-energy.gif").read_bytes()[:4] == b"GIF8"
-
-    rows = table(tmp_path / "runs/mine/curves/run-time.csv")
-    with vipetsc.open(tmp_path / "runs/mine") as run:
-        assert [float(row["energy/work (J)"]) for row in rows] == run["energy/work"].values.tolist()
-
-
 IMPACTING = (
     "--set output.lyapunov=true --set time.end=150.0 --set sweep.drive.frequency=[2.5,2.88] --set output.figures=false"
 )

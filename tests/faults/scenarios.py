@@ -255,7 +255,7 @@ class Scenario:
     """A call of the program: ``words`` with the places {case} and {out} for paths.
 
     ``before`` are the words of an earlier call without a fault; at its step ``stop``, if not 0, it is asked to stop.
-    ``ranks`` is the number of ranks on which the short test causes faults; with 0 only the campaign does.
+    The short test causes faults in a call that ``is_short``; only the campaign does in others.
     """
 
     name: str
@@ -263,7 +263,7 @@ class Scenario:
     words: str
     before: str = ""
     stop: int = 0
-    ranks: int = 0
+    is_short: bool = False
 
     @property
     def verb(self) -> Verb:
@@ -276,33 +276,33 @@ PLAIN = "--set output.figures=false"
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
-        Scenario("run", RUN, f"run {OUT}", ranks=3),
-        Scenario("run-ts", TS, f"run {OUT}", ranks=2),
+        Scenario("run", RUN, f"run {OUT}", is_short=True),
+        Scenario("run-ts", TS, f"run {OUT}", is_short=True),
         Scenario("run-resumed", TS, f"run {OUT}", before=f"run {OUT}", stop=70),
         Scenario(
             "run-force",
             RUN,
             f"run {OUT} {PLAIN} --force",
             before=f"run {OUT} {PLAIN} --set drive.amplitude=9.0",
-            ranks=2,
+            is_short=True,
         ),
         Scenario("sweep", SWEEP, f"sweep {OUT}"),
-        Scenario("sweep-follow", FOLLOW, f"sweep {OUT}", ranks=2),
-        Scenario("sweep-team", TEAM, f"sweep {OUT}", ranks=3),
-        Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
+        Scenario("sweep-follow", FOLLOW, f"sweep {OUT}", is_short=True),
+        Scenario("sweep-team", TEAM, f"sweep {OUT}", is_short=True),
+        Scenario("nnm", BRANCHES, f"nnm {OUT}", is_short=True),
         Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
         Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
-        Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
+        Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", is_short=True),
         Scenario("nfrc-family", FAMILY, f"nfrc {OUT} {PLAIN}"),
         Scenario("nfrc-over-key", OVER_KEY, f"nfrc {OUT} {PLAIN}"),
-        Scenario("design", DESIGN, f"design {OUT}", ranks=2),
-        Scenario("law", LAW, f"law {OUT} {PLAIN}", ranks=2),
-        Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}", ranks=2),
-        Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}", ranks=3),
+        Scenario("design", DESIGN, f"design {OUT}", is_short=True),
+        Scenario("law", LAW, f"law {OUT} {PLAIN}", is_short=True),
+        Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}", is_short=True),
+        Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}", is_short=True),
         Scenario("optimise-front", FRONT, f"optimise {OUT} {PLAIN}"),
         Scenario("optimise-team", OPTIMISE.replace("[optimise]", "[optimise]\nranks = 2"), f"optimise {OUT} {PLAIN}"),
         Scenario("optimise-responses", ABSORBER, f"optimise {OUT} {PLAIN}"),
-        Scenario("identify", IDENTIFY, f"identify {OUT} {PLAIN}", ranks=2),
+        Scenario("identify", IDENTIFY, f"identify {OUT} {PLAIN}", is_short=True),
         Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", before=f"sweep {OUT}"),
         Scenario("plot", RUN, "plot {out}", before=f"run {OUT} {PLAIN}"),
         Scenario("movie", RUN, "plot {out} --movie --format gif --width 320", before=f"run {OUT} {PLAIN}"),
@@ -312,7 +312,7 @@ SCENARIOS = {
         Scenario("validate", SWEEP, "validate {case}"),
         Scenario("schema", RUN, "schema {case}"),
         Scenario("examples", "", "examples waveform own-law --out {out}"),
-        Scenario("paper", "", "paper --quick --out {out}", ranks=2),
+        Scenario("paper", "", "paper --quick --out {out}", is_short=True),
     )
 }
 

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import json
-import time
 import tomllib
-from contextlib import ExitStack
 from typing import get_args
 
 import h5py
@@ -26,11 +24,8 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.dynamics import simulate
 
-# Names of scenarios by the number of ranks on which each has faults here; together they reach all phases.
-ON_RANKS: dict[int, list[str]] = {}
-for scenario in SCENARIOS.values():
-    if scenario.ranks:
-        ON_RANKS.setdefault(scenario.ranks, []).append(scenario.name)
+# Names of scenarios that have faults here; together they reach all phases.
+SHORT = [scenario.name for scenario in SCENARIOS.values() if scenario.is_short]
 # The reduced system passes through the same phases as a system of one's own.
 ONE_CELL = {"reduced"}
 # The number of kills: each ends a worker, and a new one takes seconds.
@@ -41,7 +36,7 @@ def test_every_verb_that_leaves_results_meets_faults_and_kills():
     """Every verb with results has a scenario with faults in this module, and one with kills in the campaign."""
     leaving = {verb.name for verb in VERBS.values() if verb.results}
     assert {verb.name for verb in study_verbs()} < leaving
-    assert {scenario.verb.name for scenario in SCENARIOS.values() if scenario.ranks} == leaving
+    assert {SCENARIOS[name].verb.name for name in SHORT} == leaving
     assert {SCENARIOS[name].verb.name for name in KILLED} == leaving
 
 
@@ -63,8 +58,7 @@ def test_every_system_of_normal_modes_meets_faults():
     assert systems == {*get_args(NnmTable.model_fields["system"].annotation)} - ONE_CELL
 
 
-@pytest.mark.parametrize("place", ["/", "bands", "bands/energy"])
-@pytest.mark.parametrize("value", ["ended", 2.0, np.array([1.0, 2.0]), None])
+@pytest.mark.parametrize(("place", "value"), [("/", "ended"), ("bands", np.array([1.0, 2.0])), ("bands/energy", None)])
 def test_attributes_of_files_groups_and_datasets_are_compared(tmp_path, place, value):
     """Two outcomes differ by one attribute that has another value or is missing, unless it belongs to one call."""
     paths = [outcome_file(tmp_path / name) for name in ("wanted", "found")]
@@ -120,41 +114,32 @@ def outcome_file(folder):
 @pytest.mark.mpirun
 def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
     """A fault at each phase ends all ranks with the right code; the same command then leaves undisturbed results."""
-    with ExitStack() as leaving:
-        crews = {}
-        tasks = []
-        for ranks, names in ON_RANKS.items():
-            crews[ranks] = leaving.enter_context(Crew(tmp_path / str(ranks), ranks))
-            tasks += [task | {"ranks": ranks} for task in matrix(references(crews[ranks], names))]
+    found = {}
+    rows = []
+    with Crew(tmp_path, 2) as crew:
+        tasks = list(matrix(references(crew, SHORT)))
         assert phases() - {task["phase"] for task in tasks} == set(), "phases that no scenario reaches"
 
-        chosen = one_of_each(tasks)
-        found = {}
-        rows = []
-        for ranks, crew in crews.items():
-            for task, stages in crew.do([task for task in chosen if task["ranks"] == ranks]):
-                wrong = judge(task, stages, allowed=crew.patience)
-                rows.append(task | {"wrong": wrong, "came": stages["ended"]["fired"]})
-                if wrong:
-                    found[task["id"]] = (*wrong, last_words(stages))
-            crew.dismiss()
+        for task, stages in crew.do(one_of_each(tasks)):
+            wrong = judge(task, stages, allowed=crew.patience)
+            rows.append(task | {"ranks": crew.ranks, "wrong": wrong, "came": stages["ended"]["fired"]})
+            if wrong:
+                found[task["id"]] = (*wrong, last_words(stages))
 
     # Pytest shows the table if the test fails.
-    print(fault_table(rows, KINDS, list(ON_RANKS)))
+    print(fault_table(rows, KINDS, [crew.ranks]))
     assert found == {}
     assert processes_of(tmp_path) == []
 
 
 def one_of_each(tasks):
-    """Choose one of ``tasks`` for every phase, with ranks, verbs and kinds in turn, and at most ``KILLS`` kills."""
+    """Choose one of ``tasks`` for every phase, with verbs and kinds in turn, and at most ``KILLS`` kills."""
     chosen = []
     kills = 0
     for turn, phase in enumerate(sorted({task["phase"] for task in tasks})):
         here = [task for task in tasks if task["phase"] == phase]
         if kills == KILLS:
             here = [task for task in here if task["kind"] != "sigkill"]
-        numbers = sorted({task["ranks"] for task in here})
-        here = [task for task in here if task["ranks"] == numbers[turn % len(numbers)]]
 
         # The kind whose turn it is may be missing, as kills are after ``KILLS`` of them.
         begin = turn % len(here)
@@ -167,9 +152,8 @@ def one_of_each(tasks):
 
 
 @pytest.mark.mpirun
-@pytest.mark.parametrize(("kind", "code"), [("sigterm", 75), ("sigkill", 137)])
-def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
-    """A signal to one rank of a user's command ends it with its code; the same command then leaves the same bits."""
+def test_a_request_by_the_front_door(vipetsc, in_process, tmp_path):
+    """A signal to one rank of a user's command ends it with 75; the same command then leaves the same bits."""
     case = prepare(SCENARIOS["run-ts"], tmp_path)
     whole = tmp_path / "whole"
     out = tmp_path / "out"
@@ -177,16 +161,12 @@ def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
 
     # The command has processes of its own from beginning to end, which the trials of a worker do not have. The fault
     # meets rank 1 at its 60th step.
-    fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
-    assert fault.returncode == code, fault.stderr
+    words = ("step", "60", "1", "sigterm", "--", "run", case, "--out", out)
+    fault = vipetsc(2, *words, module="tests.faults.inject", cwd=ROOT)
+    assert fault.returncode == 75, fault.stderr
     assert "Traceback" not in fault.stderr
     assert not (out / "run.h5").exists()
 
-    # After a kill mpirun returns a moment before the other rank, which holds the folder's lock, is gone.
-    for _ in range(100):
-        resumed = in_process("run", case, "--out", out)
-        if "is working in it" not in resumed.stderr:
-            break
-        time.sleep(0.1)
+    resumed = in_process("run", case, "--out", out)
     assert resumed.returncode == 0, resumed.stderr
     assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))

@@ -1,60 +1,47 @@
-"""Runs of the propagator that fail end in the same way on any number of ranks: samples, log, sentence and counts."""
+"""Runs that fail end in the same way on any number of ranks: samples, log, sentence and counts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits
-from tests.mpi.test_partition import Spoiler
+from tests.conftest import small_case
+from tests.mpi.alike import COMM, as_alone
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.observers import Observer
-from vipetsc.dynamics.result import Result
+from vipetsc.dynamics.propagator import engine
 from vipetsc.io.store import RunMemory
-from vipetsc.parallel import on_root
+from vipetsc.lattice.topology import Topology
 
 STALLING = 1e45  # N/m
 
 
-def ends_as_alone(case: Case, states_every: int | None = None, observers: Sequence[type[Observer]] = ()) -> Result:
-    """Simulate ``case``, which fails, on all ranks and on rank 0 alone, and assert that both end in the same way."""
-    memory = RunMemory(MPI.COMM_WORLD, states_every)
-    together = simulate(case, memory, observers=observers)
-    assert not together.complete
+class Spoiler(Observer):
+    """An observer that makes one number of cell 36 of the state NaN after the first block of samples."""
 
-    def compare() -> None:
-        memory_alone = RunMemory(MPI.COMM_SELF, states_every)
-        alone = simulate(case, memory_alone, observers=observers)
+    name = "test-spoiler"
+    # A block has so many samples. Checkpoints are written as often: engines may go back to the last one.
+    longest = 61
+    cell = 35
 
-        assert together.sentence == alone.sentence
-        assert together.warnings == alone.warnings
-        assert counts(together) == counts(alone)
-        assert_same_bits(arrays(memory), arrays(memory_alone))
-
-    on_root(MPI.COMM_WORLD, compare)
-    return together
-
-
-def counts(result: Result) -> dict[str, object]:
-    """The statistics of a run without its times."""
-    return {name: value for name, value in result.statistics.items() if not name.endswith("_seconds")}
-
-
-def arrays(memory: RunMemory) -> dict[str, np.ndarray]:
-    """Every array of the run in ``memory``, by its name."""
-    assert memory.dataset is not None
-    return {str(name): variable.values for name, variable in memory.dataset.variables.items()}
+    def observe(self, block):
+        layout = self.setup.layout
+        if block.first == 0 and layout.start <= self.cell < layout.stop:
+            block.state.array[self.cell - layout.start] = np.nan
 
 
 def struck_case(
     stiffness: list[float],
     sites: Sequence[int] = (5, 20, 35),
     struck: Sequence[int] = (5, 20, 35),
+    name: str = "propagator",
     interval: float = 2e-4,
     **lattice: object,
 ) -> Case:
@@ -68,45 +55,85 @@ def struck_case(
         "lattice": {"preset": "diatomic", "cells": 40, "ends": "free", **lattice},
         "contacts": {"law": "bilinear", "sites": list(sites), "clearance": 1e-5, "each": each},
         "initial": {"kind": "velocity", **first, "more": others},
-        "time": {"end": 0.02, "engine": "propagator", "rtol": 1e-8, "sample_interval": interval},
+        "time": {"end": 0.02, "engine": name, "rtol": 1e-8, "sample_interval": interval},
     }
     return Case.from_table(table)
 
 
-@pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize("stiffness", [[STALLING, 1e6, 1e6], [1e6, 1e6, STALLING]])
-def test_contacts_of_the_step_that_stalls_are_logged(stiffness):
-    """All sites close in the step in which one of them stalls: the others are followed to its end."""
-    result = ends_as_alone(struck_case(stiffness))
-    assert "stalled" in result.sentence
-    assert result.statistics["episodes"] == 3
+# All sites close in the step in which one of them stalls: the others are followed to its end.
+AT_ONCE = struck_case([1e6, 1e6, STALLING])
+# Other contacts have ended before a site stalls, and would go on after it. With samples 0.8 ms apart, several steps,
+# the stall lies between two samples; with checkpoints some contacts were logged at one.
+LATE = struck_case([1e6, 1e6, STALLING], struck=[5, 20, 31])
+BETWEEN = struck_case([1e6, 1e6, STALLING], struck=[5, 20, 31], interval=8e-4, damping={"mass": 10.0})
+# Sites in cells 40 and 30 of a ring stall at one time. Rank 0 feels the first one, but not the other.
+RING = struck_case([STALLING, STALLING], sites=[40, 30], struck=[40, 30], ends="periodic")
+# Contacts of ranks whose cells are still finite are followed up to the sample at which one is not.
+FINITE = struck_case([1e6, 1e6, 1e6], sites=[5, 12, 20])
+BY_TS = struck_case([1e6, 1e6, 1e6], sites=[5, 12, 20], name="ts")
+# The forces of this stop do not reach another rank within a step of ts.
+DRIVEN = Case.from_table({
+    "lattice": {"preset": "diatomic", "cells": 40},
+    "contacts": {"law": "bilinear", "stiffness": 1e30, "sites": [5], "clearance": 1e-5},
+    "drive": {"amplitude": 20.0},
+    "time": {"end": 0.02, "engine": "ts", "rtol": 1e-8},
+})  # fmt: skip
+FAILING = {
+    "at once": (AT_ONCE, (), None, "stalled: the contacts of sites 3", 3),
+    "late": (LATE, (), 5, "stalled: the contacts of sites 3 at 0.0029", 19),
+    "between samples": (BETWEEN, (), 2, "stalled: the contacts of sites 3 at 0.0029", 19),
+    "on a ring": (RING, (), None, "stalled: the contacts of sites 2 at", 0),
+    "not finite": (FINITE, (Spoiler,), Spoiler.longest, "the state is not finite", 5),
+    "not finite, by ts": (BY_TS, (Spoiler,), Spoiler.longest, "the state is not finite", 5),
+    "by ts": (DRIVEN, (), None, "stalled: the step fell to", 0),
+}
 
 
-@pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize(
-    ("states_every", "interval", "damping"), [(None, 2e-4, None), (5, 2e-4, None), (2, 8e-4, {"mass": 10.0})]
-)
-def test_contacts_after_the_stall_are_not_logged(states_every, interval, damping):
-    """Other contacts have ended before a site stalls, and would go on after it; some were logged at a checkpoint.
-
-    With samples 0.8 ms apart, several steps, the stall lies between two samples.
-    """
-    case = struck_case([1e6, 1e6, STALLING], struck=[5, 20, 31], interval=interval, damping=damping)
-    result = ends_as_alone(case, states_every)
-    assert "stalled: the contacts of sites 3 at 0.0029" in result.sentence
-    assert result.statistics["episodes"] == 19
+def assert_ends_as_alone(name: str) -> None:
+    """Assert that a run fails for its reason after at least some contacts, on all ranks as on one."""
+    case, observers, states_every, reason, episodes = FAILING[name]
+    result = as_alone(case, observers, states_every)
+    assert not result.complete
+    assert not result.resumable
+    assert result.sentence.startswith(reason)
+    assert result.statistics["episodes"] >= episodes
 
 
-@pytest.mark.parallel([2, 3])
-def test_of_sites_that_stall_at_once_the_first_is_named():
-    """Sites in cells 40 and 30 of a ring stall at one time. Rank 0 feels the first one, but not the other."""
-    result = ends_as_alone(struck_case([STALLING, STALLING], sites=[40, 30], struck=[40, 30], ends="periodic"))
-    assert "stalled: the contacts of sites 2 at" in result.sentence
+@pytest.mark.parallel([2])
+@pytest.mark.parametrize("name", FAILING)
+def test_a_run_that_fails_ends_as_on_one_rank(name):
+    assert_ends_as_alone(name)
 
 
-@pytest.mark.parallel([2, 3])
-def test_a_state_that_is_not_finite_ends_the_log():
-    """Contacts of ranks whose cells are still finite are followed up to the sample at which one is not."""
-    result = ends_as_alone(struck_case([1e6, 1e6, 1e6], sites=[5, 12, 20]), Spoiler.longest, [Spoiler])
-    assert result.sentence.startswith("the state is not finite")
-    assert result.statistics["episodes"] > 5
+@pytest.mark.parallel([3])
+def test_a_run_that_fails_on_one_of_three_ranks_ends_as_on_one():
+    assert_ends_as_alone("between samples")
+
+
+@pytest.mark.parallel(2)
+def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
+    """An error of one rank in the set-up of the propagator is raised on all ranks."""
+    forces = engine.Forces
+
+    def fail_on_rank_1(*arguments):
+        if COMM.rank == 1:
+            raise ValueError("no room")
+        return forces(*arguments)
+
+    monkeypatch.setattr(engine, "Forces", fail_on_rank_1)
+    case = small_case(contacts={"sites": [5]}, time={"engine": "propagator"})
+    with pytest.raises(ValueError, match="no room"):
+        simulate(case, RunMemory(MPI.COMM_WORLD))
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize(("ends", "site"), [("fixed", "site 1 in cell 6"), ("periodic", "site 2 in cell 20")])
+def test_of_cells_that_move_equally_fast_the_first_is_named(ends, site):
+    """Many cells of several ranks may be not finite. On a ring the last cell is next to the first."""
+    layout = SimpleNamespace(comm=COMM, dofs=1, owned=3, start=3 * COMM.rank)
+    engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
+    model = SimpleNamespace(
+        chain=SimpleNamespace(sites=(5, 19), topology=Topology(20, ends), cell=SimpleNamespace(springs=()))
+    )
+    place = failing_place(SimpleNamespace(layout=layout, engine=engine, model=model))
+    assert place == f"cell 2, nearest {site}"

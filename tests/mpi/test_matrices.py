@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 from scipy.linalg import eigvalsh
 
-from tests.conftest import on_two, small_case
+from tests.conftest import small_case
 from vipetsc.case import CaseError
 from vipetsc.dynamics import eigen
 from vipetsc.dynamics.eigen import modes_near
@@ -46,8 +46,7 @@ def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
-@pytest.mark.parametrize("cells", [2, 3, 25])
+@pytest.mark.parametrize(("ends", "cells"), [("fixed", 25), ("free", 3), ("periodic", 2), ("periodic", 25)])
 @pytest.mark.parametrize(("cell", "rounding"), [(WHOLE, 0), (four_band(), 1e-10)], ids=["whole", "four-band"])
 def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, rounding):
     """K u by the matrix is -M u'' by the right-hand side: exactly in whole numbers, otherwise to rounding errors."""
@@ -70,16 +69,15 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, roundin
     matrices.destroy()
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize(
     ("ends", "cells", "near", "count"),
     [
-        *on_two(("fixed", 60, 2034.0, 4), ("free", 40, 0.0, 3)),
+        ("free", 40, 0.0, 3),
         ("periodic", 60, 1000.0, 7),
         ("fixed", 3, 900.0, 12),
         # The mode at 445 rad/s is nearer in the squared frequency, and another one in the frequency.
         ("fixed", 1, 668.0, 1),
-        ("fixed", 60, 1850.0, 3),
         # Modes of a ring come in pairs of one frequency; at the edge of a band the solver needs many restarts for them.
         ("periodic", 60, 1850.0, 3),
     ],
@@ -126,7 +124,7 @@ def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
     matrices.destroy()
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel([3])
 def test_modes_of_one_frequency_span_the_same_motions_on_any_number_of_ranks():
     """On a ring, waves in both directions have one frequency: their modes span the motions that those of one rank do.
 
@@ -189,7 +187,7 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
     assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parallel([1, 2])
+@pytest.mark.parallel([1])
 def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
     """A pressed Hertzian contact is a spring of the slope 3/2 k d^(1/2) at the indentation d; an open one is none.
 
@@ -206,8 +204,6 @@ def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
     }
     case = small_case(lattice={"cells": 12, "ends": "periodic"}, contacts=contacts)
     data = find_modes(case, 48, 900.0, folder, COMM)
-    if COMM.rank:
-        return
 
     stiffness = case.model().chain.stiffness_matrix().toarray()
     spring = 1.5 * case.contacts.stiffness * np.sqrt(pressed)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.conftest import StopAt, assert_same_bits, datasets, run_of, simulated, with_sections
-from tests.mpi.test_drives import InParts
+from tests.conftest import InParts, StopAt, assert_same_bits, datasets, run_of, simulated, with_sections
 from tests.units import HUGE, TINY, assert_same_motion
 from tests.zoo import ZOO
 from vipetsc.case import Case

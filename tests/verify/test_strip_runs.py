@@ -1,15 +1,12 @@
-"""Runs of a strip: the mirror image, both engines, and the same bits on any number of ranks."""
+"""Runs of a strip: the mirror image and both engines."""
 
 from __future__ import annotations
-
-from mpi4py import MPI
 
 import numpy as np
 import pytest
 
+from tests.conftest import simulated
 from vipetsc.case import Case
-from vipetsc.dynamics import simulate
-from vipetsc.io.store import RunMemory
 
 ROWS = 5
 
@@ -34,19 +31,18 @@ def table(engine, mirrored=False, ends="fixed"):
     }
 
 
-def run(case_table, comm):
-    """The dataset of a run on the ranks of ``comm``; None except on rank 0."""
-    memory = RunMemory(comm)
-    result = simulate(Case.from_table(case_table), memory)
-    assert result.complete and result.statistics["episodes"] > 5, result.sentence
+def run(case_table):
+    """The displacement of a run with impacts."""
+    dataset, result = simulated(Case.from_table(case_table))
+    assert result.statistics["episodes"] > 5, result.sentence
     assert result.statistics["engine"] == case_table["time"]["engine"]
-    return memory.dataset if comm.rank == 0 else None
+    return dataset["displacement"].values
 
 
 @pytest.mark.parametrize("ends", ["fixed", "periodic"])
 def test_engines_and_mirror_images_agree(ends):
     runs = {
-        (engine, mirrored): run(table(engine, mirrored, ends), MPI.COMM_SELF)["displacement"].values
+        (engine, mirrored): run(table(engine, mirrored, ends))
         for engine in ("ts", "propagator")
         for mirrored in (False, True)
     }
@@ -54,13 +50,3 @@ def test_engines_and_mirror_images_agree(ends):
     for engine in ("ts", "propagator"):
         np.testing.assert_allclose(runs[engine, True][..., ::-1], runs[engine, False], rtol=0, atol=1e-11 * size)
     np.testing.assert_allclose(runs["ts", False], runs["propagator", False], rtol=0, atol=1e-8 * size)
-
-
-@pytest.mark.parallel([1, 2])
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_ranks_share_a_strip_with_the_bits_of_one(engine):
-    together = run(table(engine), MPI.COMM_WORLD)
-    if MPI.COMM_WORLD.rank == 0:
-        alone = run(table(engine), MPI.COMM_SELF)
-        for name in ("displacement", "velocity", "impacts/onset", "energy/kinetic"):
-            np.testing.assert_array_equal(together[name].values, alone[name].values)
