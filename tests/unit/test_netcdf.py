@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vipetsc.io.errors import UnreadableFileError
-from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
+from vipetsc.io.errors import ResultFileError, UnreadableFileError
+from vipetsc.io.netcdf import naming_spoilt, open_netcdf, variable, write_netcdf
 
 
 def measured() -> xr.Dataset:
@@ -156,3 +156,30 @@ def test_a_file_is_one_that_xarray_opens_as_a_tree(tmp_path, below, above):
         write_netcdf(path, data)
     with xr.open_datatree(path, engine="h5netcdf"):
         pass
+
+
+@pytest.mark.parametrize(
+    ("error", "is_spoilt", "is_blamed"),
+    [
+        (ValueError, False, False),
+        (np.linalg.LinAlgError, True, True),
+        (IndexError, True, True),
+        (ZeroDivisionError, True, True),
+        (MemoryError, True, False),
+        (RuntimeError, True, False),
+        (OSError, True, False),
+    ],
+)
+def test_errors_of_numbers_are_blamed_on_numbers_that_are_no_longer_finite(tmp_path, error, is_spoilt, is_blamed):
+    """Numbers that were missing by right when they were written, as the end of a gap, are no cause."""
+    path = tmp_path / "a.h5"
+    edges = variable("edge", [0.0, 1.0, np.inf], "rad/s", "edges")
+    write_netcdf(path, xr.Dataset({"edge": variable("edge", [1, 2, 3], "1", "edge"), "edges": edges}))
+    if is_spoilt:
+        with h5py.File(path, "r+") as file:
+            file["edges"][1] = np.nan
+
+    expected = ResultFileError if is_blamed else error
+    with open_netcdf(path, "run") as data, pytest.raises(expected) as raised, naming_spoilt(lambda: [data]):
+        raise error("of a picture")
+    assert ("a.h5 holds numbers that are not finite in edges" in str(raised.value)) == is_blamed

@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from vipetsc.io.atomic import atomic_write
-from vipetsc.io.errors import ResultFileError, UnreadableFileError
+from vipetsc.io.errors import FolderError, ResultFileError, UnreadableFileError
 from vipetsc.io.hdf5 import hdf5_file
 from vipetsc.register import PartError
 from vipetsc.wording import shortened, system_number, system_reason
@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     import xarray as xr
     from xarray.backends import CachingFileManager
 
+# An attribute: how many numbers of a variable were NaN or infinite by right when it was written, such as the end of a
+# contact that is closed at the end of a run.
+NOT_FINITE = "not_finite"
+# Errors of calculations with numbers that are not finite, or with none.
+OF_NUMBERS = (ValueError, IndexError, ArithmeticError, np.linalg.LinAlgError)
 MAY_BE_EMPTY = ("site", "episode")  # dimensions of runs without sites, or without contact
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
@@ -85,7 +90,9 @@ def put_dataset(file: h5py.File, data: xr.Dataset) -> None:
         if dtype.kind in "UO":
             values = values.astype(object)
             dtype = h5py.string_dtype()
-        dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
+        attributes = {key: value for key, value in item.attrs.items() if key != NOT_FINITE}
+        attributes |= not_finite_in(values)
+        dataset = add_variable(file, name, item.dims, values.shape, dtype, attributes)
         if values.size:
             dataset[...] = values
 
@@ -95,6 +102,14 @@ def put_dataset(file: h5py.File, data: xr.Dataset) -> None:
         if isinstance(value, dict | list):
             value = json.dumps(value)
         file.require_group(group or "/").attrs[key] = value
+
+
+def not_finite_in(values: np.ndarray) -> dict[str, int]:
+    """Return the attribute of a variable that counts those of its ``values`` that are NaN or infinite, if any are."""
+    if values.dtype.kind not in "fc":
+        return {}
+    count = values.size - int(np.count_nonzero(np.isfinite(values)))
+    return {NOT_FINITE: count} if count else {}
 
 
 def _check_dimensions(data: xr.Dataset) -> None:
@@ -148,8 +163,8 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     """Open a file as a flat dataset, a context manager; values are read when they are used.
 
     Messages call the file a ``kind``, as "run" or "branch"; ``needs`` are the variables (by path), groups and root
-    attributes that a file of this kind must have. Raises UnreadableFileError, an OSError, if the file cannot be opened
-    as HDF5, ResultFileError, a ValueError, if it is not of this kind.
+    attributes that a file of this kind must have. ``encoding["source"]`` is the path. Raises UnreadableFileError, an
+    OSError, if the file cannot be opened as HDF5, ResultFileError, a ValueError, if it is not of this kind.
     """
     import xarray as xr
     from xarray.backends import CachingFileManager
@@ -165,6 +180,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
         files.close()
         raise _unreadable(path, kind, error) from error
     data.set_close(files.close)
+    data.encoding["source"] = str(path)
 
     # Variables, and the groups that hold any.
     present: set[str] = set()
@@ -210,27 +226,28 @@ def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFile
 def naming_spoilt(opened: Callable[[], Iterable[xr.Dataset]]) -> Iterator[None]:
     """Name what is not finite in results, or empty, where an error in the block may come from it.
 
-    ``opened`` returns the results that the block has opened. Raises ResultFileError then; errors about files, names of
-    figures and users' modules stay as they are, and so does any other where all results are finite.
+    ``opened`` returns the results that the block has opened. Raises ResultFileError then. Errors that numbers do not
+    cause stay as they are, as of files, memory and users' modules, and so does any other where all results are finite.
     """
     try:
         yield
-    except (OSError, KeyError, ResultFileError, PartError):
+    except (FolderError, PartError):
         raise
-    except Exception as error:
+    except OF_NUMBERS as error:
         reasons = [text for data in opened() for text in _spoilt(data)]
         if not reasons:
             raise
-        # Some numbers may be missing by right, as the end of a contact that is closed at the end of a run.
         cause = f"{'; '.join(reasons)}, which may be the cause: compute the results again"
         raise ResultFileError(f"{type(error).__name__}: {error}; {cause}") from error
 
 
 def _spoilt(data: xr.Dataset) -> list[str]:
-    """Return sentences on variables of ``data`` with numbers that are not finite, and on empty dimensions."""
+    """Return sentences on variables of ``data`` with numbers that are no longer finite, and on empty dimensions."""
     file = data.encoding.get("source", "the file")
-    floats = [(name, values) for name, values in data.variables.items() if values.dtype.kind in "fc"]
-    infinite = [str(name) for name, values in floats if not np.isfinite(values).all()]
+    infinite = []
+    for name, item in data.variables.items():
+        if not_finite_in(item.values).get(NOT_FINITE, 0) != item.attrs.get(NOT_FINITE, 0):
+            infinite.append(str(name))
     empty = [str(name) for name, size in data.sizes.items() if size == 0 and name not in MAY_BE_EMPTY]
     sentences = []
     if infinite:

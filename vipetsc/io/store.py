@@ -31,7 +31,7 @@ from vipetsc.io.atomic import atomic_write, discard, write_text
 from vipetsc.io.chunks import Recording
 from vipetsc.io.hdf5 import Arrays, StoredArrays, hdf5_file, read_arrays, save_arrays
 from vipetsc.io.lock import FolderError
-from vipetsc.io.netcdf import add_variable, put_dataset
+from vipetsc.io.netcdf import add_variable, not_finite_in, put_dataset
 from vipetsc.io.read import open_run, with_point_names
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.process import say
@@ -279,9 +279,10 @@ class RunFolder:
         for name in (*columns, *self.recording.of_sites, *self.recording.fields):
             description = chunks.described(name, small)
             dtype = np.dtype(float)
+            about: dict[str, Any] = description.attributes | chunks.coordinates(name)
             if name in columns:
                 dtype = columns[name].dtype
-            about = description.attributes | chunks.coordinates(name)
+                about |= not_finite_in(columns[name])
             shape = [sizes[dim] for dim in description.dims]
             dataset = add_variable(file, name, description.dims, shape, dtype, about)
             if name not in columns:
