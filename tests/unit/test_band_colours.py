@@ -32,7 +32,7 @@ def prediction(level: float = 0.2, onset: float = 1.0) -> Figure:
 def law() -> Figure:
     share = np.full((3, 4, 2), 0.1)
     data = {"share": (("z", "band", "direction"), share), "share_scatter": (("z", "band", "direction"), share)}
-    for name in law_panels.ENERGIES:
+    for name in law_panels.LABELS:
         data |= {name: ("z", share[:, 0, 0]), f"{name}_scatter": ("z", share[:, 0, 0])}
     data |= {"efficiency": ("z", X)}
     coords = {"z": X, "band": [*BANDS], "direction": ["forward", "backward"]}

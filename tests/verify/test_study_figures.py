@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 
 from vipetsc.case import Case, Sweep
+from vipetsc.figures import style as house
 from vipetsc.figures import sweep_members
 from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, ROWS, amplitudes
@@ -19,7 +20,7 @@ from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, series_of
 from vipetsc.figures.wavenumber_bins import FIELD, bin_colours, partition, partition_explained, shown_bins
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
-from vipetsc.paper.entropy_pages import AVERAGES, COLOURS
+from vipetsc.paper.entropy_pages import AVERAGES
 from vipetsc.paper.pages import PAGES
 from vipetsc.spectra import filter_bank, normalised, transform
 from vipetsc.studies.sweep import run_sweep
@@ -361,7 +362,7 @@ def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures
         line, _, (sticks,) = bars.lines
         np.testing.assert_allclose(line.get_xdata(), curves["amplitude"].values)
         np.testing.assert_allclose(line.get_ydata(), normalised(raw))
-        assert to_rgba(line.get_color()) == to_rgba(COLOURS[average])
+        assert to_rgba(line.get_color()) == to_rgba(house.CURVES[f"entropy/{average}"]["color"])
         # A bar extends by the error in either direction.
         halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
         np.testing.assert_allclose(halves, 0.99 * error / np.ptp(raw))
@@ -371,7 +372,7 @@ def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures
     np.testing.assert_allclose(grey[0].get_ydata(), normalised(printed))
 
     faint = {line.get_color() for line in upper.lines if line.get_alpha() == 0.5}
-    assert faint == {colour for name, colour in COLOURS.items() if name != average}
+    assert faint == {house.CURVES[f"entropy/{name}"]["color"] for name in AVERAGES if name != average}
 
 
 @pytest.mark.slow

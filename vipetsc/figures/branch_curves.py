@@ -104,27 +104,25 @@ def lowest(branch: xr.Dataset) -> np.ndarray:
 
 
 def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
-    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where no multiplier was computed.
+    """Draw the whole branch as stable; over it what is unstable, and where no multiplier was computed.
 
     A point is unstable if its largest multiplier is beyond the threshold that the file has with it. A step between a
-    stable and an unstable point is blue.
+    stable and an unstable point is drawn as stable.
     """
     energy, frequency = smooth(branch)
     multiplier = branch["multiplier_max"].values
     unstable_beyond = branch["multiplier_max"].attrs["unstable_beyond"]
     stable_label = "stable" if np.any(multiplier <= unstable_beyond) else None
     # The whole branch first, so that no gap opens between a stable part and an unstable one.
-    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=stable_label)
+    axes.plot(energy, frequency, lw=width, zorder=2, label=stable_label, **style.CURVES["stable"])
 
-    parts = (
-        (multiplier > unstable_beyond, style.VERMILION, "unstable"),
-        (np.isnan(multiplier), style.GREY, "not computed"),
-    )
-    for is_part, colour, label in parts:
+    parts = ((multiplier > unstable_beyond, "unstable"), (np.isnan(multiplier), "not computed"))
+    for is_part, label in parts:
         if len(energy) > len(is_part):
             # The curve has been smoothed: the points of a step, and the one at its end, belong to the part if both ends
             # of the step do.
             step_is_part = np.repeat(is_part[:-1] & is_part[1:], FINE)
             is_part = np.append(step_is_part, False) | np.append(False, step_is_part)
         if is_part.any():
-            axes.plot(energy, np.where(is_part, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)
+            look = {"lw": 1.3 * width, "zorder": 3, "label": label, **style.CURVES[label]}
+            axes.plot(energy, np.where(is_part, frequency, np.nan), **look)

@@ -26,7 +26,7 @@ def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
     marker = "." if len(energy) == 1 else ""
 
     ratio = branch["damping_ratio"].values
-    axes.plot(energy, ratio, color=style.BLUE, lw=1.0, marker=marker, label="damping ratio")
+    axes.plot(energy, ratio, lw=1.0, marker=marker, label="damping ratio", **style.CURVES["damping_ratio"])
     axes.set(xscale="log", ylabel="damping ratio")
     room = max(ROOM * float(np.ptp(ratio)), LEAST_ROOM * float(ratio.max()))
     if np.isfinite(room) and room > 0:
@@ -35,8 +35,8 @@ def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
         return
 
     force_axes = axes.twinx()
-    force_axes.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
+    force_axes.plot(energy, branch["force"].values, lw=1.0, marker=marker, **style.CURVES["force"])
     force_axes.set(yscale="log", ylabel="force in resonance (N)")
     # An empty curve for the legend, which is one for both axes.
-    axes.plot([], [], color=style.VERMILION, lw=1.0, ls="--", label="force")
+    axes.plot([], [], lw=1.0, label="force", **style.CURVES["force"])
     axes.legend(fontsize=5.5)

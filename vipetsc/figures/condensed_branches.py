@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -20,9 +19,6 @@ from vipetsc.io.branch_kinds import kind_names
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import wave_bands
 
-# Of contacts and of stored motions. More of them have the same colours again, with other dashes.
-COLOURS = style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE
-DASHES = "-", style.DASHED, style.DOTTED
 # Smallest displacement that is drawn, over the largest: localised motions decay to rounding, 1e-16.
 SMALLEST = 1e-12
 # Ratios of the largest to the smallest energy. Below the first an axis is linear, since a logarithmic one would have
@@ -75,12 +71,6 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     return figure
 
 
-def _look(number: int) -> dict[str, Any]:
-    """Return colour and dashes of a contact's or a motion's curve; ``number`` counts from 0."""
-    dashes = DASHES[number // len(COLOURS) % len(DASHES)]
-    return {"color": COLOURS[number % len(COLOURS)], "ls": dashes}
-
-
 def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
     """Draw frequency over energy with its stability, the special points, and crosses for the stored motions."""
     energy = branch["energy"].values
@@ -98,7 +88,7 @@ def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
     if "states/number" in branch:
         stored = zip(branch["states/energy"].values, branch["states/period"].values, strict=True)
         for number, (state_energy, period) in enumerate(stored):
-            axes.plot(state_energy, 1 / period, "x", color=_look(number)["color"], ms=5, mew=1.2)
+            axes.plot(state_energy, 1 / period, "x", color=style.numbered_look(number)["color"], ms=5, mew=1.2)
     axes.set_ylabel("frequency (Hz)")
 
 
@@ -116,7 +106,7 @@ def _draw_elongation(axes: Axes, branch: xr.Dataset) -> None:
     energy = branch["energy"].values
     places = zip(branch["place"].values, branch["elongation"].values.T, strict=True)
     for number, (place, values) in enumerate(places):
-        axes.plot(energy, 1e3 * values, lw=1.0, label=f"place {place}", **_look(number))
+        axes.plot(energy, 1e3 * values, lw=1.0, label=f"place {place}", **style.numbered_look(number))
     axes.set_ylabel("elongation at rest (mm)")
     if branch.sizes["place"] > 1:
         axes.legend(fontsize=5.5)
@@ -159,4 +149,4 @@ def _draw_shapes(axes: Axes, x: np.ndarray, shapes: np.ndarray, branch: xr.Datas
     for number, (values, period) in enumerate(zip(shapes, branch["states/period"].values, strict=True)):
         relative = values / values.max()
         visible = np.where(relative > SMALLEST, relative, np.nan)
-        axes.semilogy(x, visible, marker=".", ms=3, lw=0.8, label=f"{1 / period:.4g} Hz", **_look(number))
+        axes.semilogy(x, visible, marker=".", ms=3, lw=0.8, label=f"{1 / period:.4g} Hz", **style.numbered_look(number))

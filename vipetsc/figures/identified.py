@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
+from vipetsc.figures.series import Series
 from vipetsc.figures.style import NoPicture
 
 MOST_CHANNELS = 8  # on a page, which is 15 inches high then; a note says that there are more
@@ -37,13 +38,13 @@ def record_and_model(identified: xr.Dataset) -> Figure:
         model = identified["data/model"].values[chosen]
 
         unit = channel["channels/unit"].item()
-        motion.plot(time, measured, ".", color=style.GREY, ms=2.5, label="measured")
-        motion.plot(time, model, color=style.BLUE, lw=0.8, label="model")
+        motion.plot(time, measured, ".", ms=2.5, label="measured", **style.CURVES["measured"])
+        motion.plot(time, model, lw=0.8, label="model", **style.CURVES["model"])
         motion.set(xlabel="Time (ms)", ylabel=f"({unit})", title=str(channel["channel"].values))
 
         noise = float(channel["channels/noise"])
         residual.axhspan(-noise, noise, color=style.PALE, lw=0)
-        residual.plot(time, measured - model, ".", color=style.VERMILION, ms=2)
+        residual.plot(time, measured - model, ".", ms=2, **style.CURVES["residual"])
         probability = float(channel["channels/probability"])
         residual.set(xlabel="Time (ms)", ylabel=f"({unit})", title=f"Measured - model; white: p = {probability:.2g}")
     rows[0, 0].legend(loc="best", fontsize=6)
@@ -196,8 +197,8 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     for number, parameter in enumerate(plan.parameters):
         last = parameter.to_coordinate(float(identified["value"].values[number]))
         path = [parameter.to_coordinate(value) - last for value in values[:, number]]
-        dashes = style.BAND_DASHES[number // len(style.BAND_COLOURS) % len(style.BAND_DASHES)]
-        course.plot(windows, path, marker="o", ls=dashes, ms=2, lw=0.7, label=parameter.name)
+        look = {"marker": "o", "ms": 2, "lw": 0.7, **style.numbered_look(number)}
+        Series(windows, np.array(path), look, parameter.name).draw(course)
     course.set(xlabel="window", ylabel="distance from the end", title="Coordinates")
     if len(plan.parameters) <= MOST_NAMES:
         course.legend(loc="best", fontsize=5)

@@ -1,7 +1,7 @@
 """The scattering law of one site: energies over z, energies by band and direction, and the onset enlarged."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,28 +10,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.figures import panels, style
+from vipetsc.figures.series import Series
 
-# Colours, and the line by which curves differ in grey.
-ENERGIES: dict[str, dict[str, Any]] = {
-    "transmitted": {"label": "T, transmitted", "color": style.BLUE, "ls": "-"},
-    "reflected": {"label": "R, reflected", "color": style.SKY, "ls": style.DASHED},
-    "upper": {"label": "U, upper bands", "color": style.VERMILION, "ls": style.DOTTED},
-    "dissipated": {"label": "L, dissipated", "color": style.ORANGE, "ls": "-."},
+LABELS = {
+    "transmitted": "T, transmitted",
+    "reflected": "R, reflected",
+    "upper": "U, upper bands",
+    "dissipated": "L, dissipated",
+    "dashpots": "D, dashpots",
 }
-DASHPOTS: dict[str, Any] = {"label": "D, dashpots", "color": style.GREEN, "ls": style.DASHED}
 FLOOR = 1e-5  # smallest fraction of the incident energy that a logarithmic axis shows
 MARKS: dict[str, dict[str, Any]] = {
     "forward": {},
     "backward": {"marker": "o", "ms": 3, "mfc": "white", "mew": 0.7, "markevery": 0.1},
 }
 LABELS_TO = 20  # largest z of an axis that has labels at 2 and 5 too: on a longer one they would touch
-
-
-class LawCurve(NamedTuple):
-    """A fraction of the incident energy over z, and its standard deviation over the runs at each z; both (z,)."""
-
-    value: np.ndarray
-    scatter: np.ndarray
 
 
 def law(data: xr.Dataset) -> Figure:
@@ -44,16 +37,16 @@ def law(data: xr.Dataset) -> Figure:
     z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)
     all_energies, by_band, onset = figure.subplots(1, 3)
-    for name, look in ENERGIES.items():
-        _draw_curve(all_energies, z, _curve(data, name), look)
+    for name in LABELS:
+        if name in data:
+            _draw_energy(all_energies, z, data, name)
     sums_to_one = "T + R + U + L + other bands = 1"
     if "dashpots" in data:
-        _draw_curve(all_energies, z, _curve(data, "dashpots"), DASHPOTS)
         sums_to_one = "T + R + U + L + D + rest = 1"
     _draw_bands(by_band, data)
     for name in ("transmitted", "upper"):
         # Over z - 1, since over z the onset is a vertical line.
-        _draw_curve(onset, z - 1, _curve(data, name), ENERGIES[name])
+        _draw_energy(onset, z - 1, data, name)
     efficiency = data["efficiency"].values
     positive = np.where(efficiency > 0, efficiency, np.nan)
     onset.plot(z - 1, positive, color=style.BLACK, lw=1.2, ls=style.DASHED, label="U/(1 - T)")
@@ -83,8 +76,10 @@ def law(data: xr.Dataset) -> Figure:
     return figure
 
 
-def _curve(data: xr.Dataset, name: str) -> LawCurve:
-    return LawCurve(data[name].values, data[f"{name}_scatter"].values)
+def _draw_energy(axes: Axes, x: np.ndarray, data: xr.Dataset, name: str) -> None:
+    """Draw a fraction of the incident energy with its scatter over ``x`` (z,)."""
+    scatter = data[f"{name}_scatter"].values
+    _with_scatter(x, data[name].values, scatter, style.CURVES[name], LABELS[name]).draw(axes)
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
@@ -97,14 +92,14 @@ def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
             j = directions.index(direction)
             value = data["share"].values[:, i, j]
             # Below the floor a curve would be a line of noise across the panel.
-            curve = LawCurve(np.where(value > FLOOR, value, np.nan), data["share_scatter"].values[:, i, j])
+            value = np.where(value > FLOOR, value, np.nan)
             label = f"band {number}" if direction == "forward" else None
-            _draw_curve(axes, z, curve, {"label": label, **style.band_look(number), **marks})
+            look = style.band_look(number) | marks
+            _with_scatter(z, value, data["share_scatter"].values[:, i, j], look, label).draw(axes)
 
 
-def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, look: Mapping[str, Any]) -> None:
-    """Draw a curve with its scatter, one deviation up and down."""
-    axes.plot(x, curve.value, lw=1.0, **look)
-    low = curve.value - curve.scatter
-    high = curve.value + curve.scatter
-    axes.fill_between(x, low, high, color=look["color"], alpha=0.25, lw=0)
+def _with_scatter(
+    x: np.ndarray, value: np.ndarray, scatter: np.ndarray, look: Mapping[str, Any], label: str | None
+) -> Series:
+    """Return a curve with its scatter over the runs at each z, one deviation up and down; all are (z,)."""
+    return Series(x, value, {"lw": 1.0, **look}, label, band=(value - scatter, value + scatter))

@@ -16,6 +16,7 @@ from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 from vipetsc.figures import style
 from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
 from vipetsc.figures.panels import colour_bar
+from vipetsc.figures.series import Series
 from vipetsc.figures.swept_axes import SweptAxis
 from vipetsc.wording import key_name
 
@@ -203,25 +204,14 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
         positions = x.positions[order] + shift
         # Thinner from curve to curve: those that coincide are seen under one another.
         look = curve.look | {"ls": line, "lw": 0.9 + 0.7 * (len(curves) - 1 - place)}
-        axes.plot(positions, curve.values[order], label=curve.label, **look)
-        if curve.band:
-            _draw_band(axes, x, positions, *(end[order] for end in curve.band), colour=curve.look["color"])
+        band = (curve.band[0][order], curve.band[1][order]) if curve.band else None
+        Series(positions, curve.values[order], look, curve.label, band=band).draw(axes)
         # Of the curves the ring belongs to the one that has this value.
         if ring and curve.values[ring[0]] == ring[1]:
             at = x.positions[ring[0]] + shift, ring[1]
             axes.plot(*at, "o", mfc="none", mec=style.BLACK, ms=8, mew=0.8)
     if x.scale == "log":
         axes.set_xscale("log")
-
-
-def _draw_band(
-    axes: Axes, x: SweptAxis, positions: np.ndarray, low: np.ndarray, high: np.ndarray, *, colour: str
-) -> None:
-    """Draw the band between ``low`` and ``high`` (position,): an area, or over categories a bar at each."""
-    if x.is_number:
-        axes.fill_between(positions, low, high, color=colour, alpha=0.25, lw=0)
-    else:
-        axes.vlines(positions, low, high, color=colour, lw=2.5, alpha=0.35)
 
 
 class LargestOnMap(NamedTuple):

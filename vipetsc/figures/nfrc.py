@@ -5,6 +5,7 @@ A curve is a list of steady states under a harmonic drive, over its amplitude or
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,17 +14,17 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
-from vipetsc.figures.stability import StabilityLook, draw_states, draw_undecided
+from vipetsc.figures.series import Series
 from vipetsc.io.branch_kinds import CHOSEN, kind_names
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.wording import with_unit
 
-# Label, colour and line of each fraction of the energy, by its name in the file; in greyscale print the lines differ.
+# Label of each fraction of the energy, by its name in the file, and the name of its look.
 ENERGIES = {
-    "transmitted": ("T, transmitted", style.BLUE, "-"),
-    "reflected": ("R, reflected", style.SKY, style.DASHED),
-    "upper": ("U, other harmonics", style.VERMILION, style.DOTTED),
-    "lost": ("L, dissipated in contacts", style.ORANGE, "-."),
+    "transmitted": ("T, transmitted", "transmitted"),
+    "reflected": ("R, reflected", "reflected"),
+    "upper": ("U, other harmonics", "upper"),
+    "lost": ("L, dissipated in contacts", "dissipated"),
 }
 # Marks of special points, by the names of their kinds: label, marker, size.
 SPECIAL = {
@@ -72,7 +73,8 @@ def draw_linear(axes: Axes, branch: xr.Dataset, name: str, number: int, scale: f
         return
     curve = np.where(np.isfinite(values[:, number]), values[:, number], np.nan)
     low, high = axes.get_ylim()
-    axes.plot(branch["linear"], scale * curve, color=style.GREY, lw=1.6, alpha=0.5, zorder=0.5, label="linear")
+    look = {"lw": 1.6, "alpha": 0.5, "zorder": 0.5, "label": "linear", **style.CURVES["linear"]}
+    axes.plot(branch["linear"], scale * curve, **look)
     # A resonance without contacts may be far higher than all states: these are what the panel shows.
     axes.set_ylim(low, high)
 
@@ -176,7 +178,6 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     """
     parameter = parameter_of(branch)
     unstable = branch["unstable"].values
-    stable = unstable == 0
     largest = largest_motions(branch)
     clearance = branch["clearance"].values
     # Springs and contacts that touch at rest have no clearance to compare with, and along a curve over another key the
@@ -202,26 +203,17 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         others = None
 
     # Sweeps lie beneath the curve, the one down narrower than the one up: all are seen where they coincide.
-    for name, colour, width in (("up", style.GREEN, 6.0), ("down", style.PURPLE, 3.0)):
+    for name, width in (("up", 6.0), ("down", 3.0)):
         points = branch[f"{name}_point"].values
         if points.size > 1:
-            look = {"color": colour, "lw": width, "alpha": 0.35, "solid_capstyle": "butt"}
+            look = {"lw": width, "alpha": 0.35, "solid_capstyle": "butt", **style.CURVES[f"sweep {name}"]}
             axes.plot(parameter[points], size[points], label=f"sweep {name}", **look)
 
-    stable_label = None
-    if stable.any():
-        stable_label = "stable"
-    axes.plot(parameter, np.where(stable, size, np.nan), color=style.BLACK, lw=1.3, label=stable_label)
-    if not stable.all():
-        # The stable points next to unstable ones too, so that the dashed line meets the full one.
-        after = np.insert(~stable[:-1], 0, False)
-        before = np.append(~stable[1:], False)
-        dashed = np.where(~stable | before | after, size, np.nan)
-        dashed_label = None
-        if np.any(unstable > 0):
-            dashed_label = "unstable"
-        axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label=dashed_label)
-    draw_undecided(axes, parameter, size, unstable, style.BLACK)
+    thin: dict[str, Any] = {"lw": 0.9}
+    if np.any(unstable > 0):
+        thin["label"] = "unstable"
+    label = "stable" if np.any(unstable == 0) else None
+    Series(parameter, size, style.CURVES["response"], label, unstable=unstable, thin=thin).draw(axes)
 
     draw_special(axes, branch, size, labelled=True)
     name = "largest" if branch.sizes["site"] else "largest_elongation"
@@ -249,7 +241,7 @@ def _draw_plane(axes: Axes, branch: xr.Dataset) -> None:
     frequency = parameter_of(branch)
     amplitude = branch["amplitude"].values
     label = next(label for kind, (label, *_) in SPECIAL.items() if kind == branch.attrs["special"])
-    axes.plot(frequency, amplitude, color=style.BLACK, label=label)
+    axes.plot(frequency, amplitude, label=label, **style.CURVES["response"])
     names = np.array(branch["kind"].attrs["flag_meanings"].split())[branch["kind"].values]
     for kind, marker in (("cusp", "*"), ("extreme-amplitude", "v")):
         at = names == kind
@@ -263,8 +255,14 @@ def _draw_plane(axes: Axes, branch: xr.Dataset) -> None:
 
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the phase of the first site's fundamental behind the drive."""
-    look = StabilityLook(style.BLACK, thin=0.6)
-    draw_states(axes, parameter_of(branch), lag_of(branch), branch["unstable"].values, look)
+    lag = Series(
+        parameter_of(branch),
+        lag_of(branch),
+        style.CURVES["response"],
+        unstable=branch["unstable"].values,
+        thin={"lw": 0.6},
+    )
+    lag.draw(axes)
     axes.set_ylabel("phase lag (degrees)")
     panels.mark_degrees(axes)
 
@@ -274,12 +272,12 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     parameter = parameter_of(branch)
     unstable = branch["unstable"].values
     for i, name in enumerate(branch["way"].values.astype(str)):
-        label, colour, line = ENERGIES[name]
+        label, look = ENERGIES[name]
         fraction = branch["share"].values[:, i]
         # No wave leaves a finite lattice: of its fractions only the losses are finite.
         if np.isfinite(fraction).any():
-            look = StabilityLook(colour, broad=1.4, thin_dashes=line, broad_dashes=line)
-            draw_states(axes, parameter, fraction, unstable, look, label)
+            line = {"lw": 1.4, **style.CURVES[look]}
+            Series(parameter, fraction, line, label, unstable=unstable, thin={"ls": line["ls"]}).draw(axes)
 
     axes.set(ylabel="fraction of the energy")
     # Losses alone may be small; what is transmitted and reflected adds up to nearly 1.

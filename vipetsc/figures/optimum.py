@@ -11,12 +11,11 @@ from matplotlib.ticker import MaxNLocator
 from vipetsc.case.nfrc import RESPONSE
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.figures import panels, style
-from vipetsc.figures.stability import StabilityLook, draw_states
+from vipetsc.figures.series import Series
 from vipetsc.spectra.measures import row_of
 from vipetsc.wording import with_unit
 
-# The names of compared designs, in the order of drawing.
-COLOURS = {"case": style.GREY, "best-1": style.VERMILION, "best": style.BLUE, "best-2": style.GREEN}
+# Markers of compared designs, in the order of drawing.
 MARKERS = {"case": "s", "best-1": "^", "best": "o", "best-2": "v"}
 SYMBOLS = {
     "upper_share_at_end": "upper bands at the end / work",
@@ -63,7 +62,7 @@ def _compared(optimum: xr.Dataset) -> list[ComparedDesign]:
     numbers = dict(zip(optimum["compared"].values, optimum["comparison/number"].values.tolist(), strict=True))
     best = numbers.get("best")
     compared = []
-    for name in COLOURS:
+    for name in MARKERS:
         # A design that has two names, as the case has if no design is better, is shown as "best".
         if name in numbers and (name == "best" or numbers[name] != best):
             compared.append(ComparedDesign(name, numbers[name]))
@@ -97,8 +96,9 @@ def convergence(optimum: xr.Dataset) -> Figure:
 def _draw_fractions(axes: Axes, optimum: xr.Dataset) -> None:
     """Draw the energies of the upper bands and the losses of all designs."""
     number = optimum["design"].values
-    for name, colour in (("upper_share_at_end", style.PURPLE), ("dissipated", style.ORANGE)):
-        axes.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
+    for name in ("upper_share_at_end", "dissipated"):
+        look = {"ms": 3, "label": name.replace("_", " "), **style.CURVES[f"designs/{name}"]}
+        axes.plot(number, optimum[name].values, ".", **look)
     axes.set(xlabel="Design", ylabel="fraction of the work, mean", ylim=(0, None), title="All designs")
     axes.legend(loc="best")
 
@@ -151,7 +151,7 @@ def _draw_two_objectives(axes: Axes, optimum: xr.Dataset, first: ObjectiveTable,
 
 def _mark(axes: Axes, design: ComparedDesign, x: float, y: float) -> None:
     """Draw the marker of a compared design at ``x`` and ``y``; the legend has its name and number."""
-    look = {"color": COLOURS[design.name], "mec": "white", "mew": 0.5, "ms": 6}
+    look = {**style.CURVES[design.name], "mec": "white", "mew": 0.5, "ms": 6}
     axes.plot(x, y, MARKERS[design.name], label=f"{design.name} ({design.number})", **look)
 
 
@@ -162,16 +162,13 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
     sites, variables = figure.subplots(1, 2)
     for i, design in enumerate(_compared(optimum)):
         row = optimum.sel(compared=design.name)
-        colour = COLOURS[design.name]
-        marker = MARKERS[design.name]
+        look = {"marker": MARKERS[design.name], **style.CURVES[design.name]}
         clearance = 1e3 * row["comparison/clearance"].values
-        sites.plot(
-            row["comparison/cell"].values, clearance, f"{marker}-", color=colour, lw=0.5, ms=4, label=design.name
-        )
+        Series(row["comparison/cell"].values, clearance, {"lw": 0.5, "ms": 4, **look}, design.name).draw(sites)
 
         # A little apart, so that designs of equal values are all seen.
         position = plan.space.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
-        variables.plot(position, np.arange(len(position)) + 0.12 * i, marker, color=colour, ms=3.5)
+        variables.plot(position, np.arange(len(position)) + 0.12 * i, ls="", ms=3.5, **look)
     sites.set(xlabel="Cell", ylabel="Clearance (mm)", ylim=(0, None), title="Sites")
     sites.xaxis.set_major_locator(MaxNLocator(integer=True))
     sites.legend(loc="best")
@@ -216,8 +213,8 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
             parameter = optimum["response/parameter"].values[points]
             value = optimum["response/value"].values[points, index]
             unstable = optimum["response/unstable"].values[points]
-            look = StabilityLook(COLOURS[design.name], thin=0.4, broad=1.2, thin_dashes="-")
-            draw_states(axes, parameter, value, unstable, look, label)
+            look = {"lw": 1.2, **style.CURVES[design.name]}
+            Series(parameter, value, look, label, unstable=unstable, thin={"lw": 0.4, "ls": "-"}).draw(axes)
             # Of several curves of a design the first one is named.
             label = "_"
 
@@ -248,8 +245,8 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
     order = np.argsort(sizes, kind="stable")
     for design in _compared(optimum):
         values = optimum["curve/value"].sel(compared=design.name).values[:, index]
-        look = {"color": COLOURS[design.name], "lw": 0.8, "ms": 3}
-        axes.plot(sizes[order], values[order], f"{MARKERS[design.name]}-", label=design.name, **look)
+        look = {"marker": MARKERS[design.name], "lw": 0.8, "ms": 3, **style.CURVES[design.name]}
+        Series(sizes[order], values[order], look, design.name).draw(axes)
 
     searched = set()
     for other in objectives:
@@ -278,6 +275,6 @@ def _draw_energies(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase) -> None:
         row = optimum.sel(compared=design.name)
         energies = [*row["curve/bands"].values[nearest], row["curve/dissipated"].values[nearest]]
         x = np.arange(len(energies)) + (i - (len(designs) - 1) / 2) * width
-        axes.bar(x, energies, width, color=COLOURS[design.name])
+        axes.bar(x, energies, width, **style.CURVES[design.name])
     axes.set_xticks(np.arange(len(labels)), labels)
     axes.set(ylabel="fraction of the work at the end", title=f"At {amplitudes[nearest]:.4g} {plan.amplitude_unit}")

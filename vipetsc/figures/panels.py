@@ -16,6 +16,7 @@ from vipetsc import spectra
 from vipetsc.case import Model
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
+from vipetsc.spectra.measures import MOTIONS
 
 DECADES = 5  # decades of energy that a map shows: each then has 50 of the map's 256 colours
 # Most rows and columns of a map. A page of maps takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
@@ -28,6 +29,8 @@ REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by numbe
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 ROUNDING = 1e-6  # degrees by which equal phases may differ
 LEAST_RATIO = 0.02  # of the range of a vertical axis over its largest value
+# Units of a motion in labels, by its quantity.
+MOTION_UNITS = {quantity: unit.replace("2", "²") for quantity, unit in MOTIONS.items()}
 LEAST_SPAN = 1.0  # degrees of an axis of phases
 # Of the cells in a map: fewer would take less than 20 of its 400 pixels.
 LEAST_PART = 0.05

@@ -15,12 +15,11 @@ from vipetsc.figures import panels, style
 from vipetsc.figures.style import NoPicture, Shown
 from vipetsc.io.tables import ColumnError, column_names, is_hdf5
 from vipetsc.spectra.fourier import amplitude_spectrum, spectrogram
+from vipetsc.spectra.measures import MOTIONS
 
 MOST_POINTS = 8  # on a page; a note says that there are more
 SLOW = 1e3  # rad/s: frequencies up to it are in rad/s, others in krad/s
 DECADES = 4  # of amplitudes in a spectrum, below its largest
-# Quantities of points: their names in labels, their units, and what a figure of each is called.
-QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 
 
 class PointRecord(NamedTuple):
@@ -64,10 +63,10 @@ def points(runs: Sequence[Shown], records: Sequence[str] = (), quantity: str = "
     unit = _frequency_unit(first["time"].values)
     for row, point in zip(grid, shown_names, strict=True):
         lines = _lines(named, measured, point, variable)
-        _draw_history(row[0], lines, f"{point}: {quantity} ({QUANTITIES[quantity]})")
-        _draw_spectrum(row[1], lines, f"Amplitude ({QUANTITIES[quantity]})", unit)
+        _draw_history(row[0], lines, f"{point}: {quantity} ({panels.MOTION_UNITS[quantity]})")
+        _draw_spectrum(row[1], lines, f"Amplitude ({panels.MOTION_UNITS[quantity]})", unit)
         if has_map:
-            _draw_spectrogram(row[2], lines[0], f"Amplitude ({QUANTITIES[quantity]})", unit)
+            _draw_spectrogram(row[2], lines[0], f"Amplitude ({panels.MOTION_UNITS[quantity]})", unit)
     for axes, title in zip(grid[0], ("History", "Spectrum", "Spectrogram"), strict=False):
         axes.set_title(title)
     panels.label_panels(grid)
@@ -96,7 +95,7 @@ def _lines(
     for number, (name, run) in enumerate(runs):
         # Thinner from run to run: curves that coincide are then seen under one another.
         width = 0.6 + 1.4 * (len(runs) - 1 - number) / max(len(runs), 2)
-        look = {"color": style.BAND_COLOURS[number % 6], "lw": width, "label": name or "run"}
+        look = {"color": style.band_colour(number + 1), "lw": width, "label": name or "run"}
         values = run[variable].sel(point=point).values
         lines.append(PointCurve(run["time"].values, values, look))
     for record in records:
@@ -168,7 +167,7 @@ def read_records(text: str, names: Sequence[str], quantity: str) -> list[PointRe
             raise NoPicture(f"--record {file}: {error}") from None
         for number, head in enumerate(heads, 1):
             word, _, what = head.partition(" ")
-            if word in names and (quantity in what or not any(other in what for other in QUANTITIES)):
+            if word in names and (quantity in what or not any(other in what for other in MOTIONS)):
                 wanted.append((head if is_hdf5(Path(file)) else number, word))
         if not wanted:
             remedy = f"no column is named after a point ({', '.join(names)}); write FILE:COLUMN=POINT"

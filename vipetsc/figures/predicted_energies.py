@@ -13,11 +13,7 @@ LEAST = 1e-4  # smallest energy shown, over the work
 WHOLE = 1.5  # upper limit of an axis on which an energy may be as large as the work
 MOST_SITES = 6  # sites that have a name in the legend: as many as there are dashes
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
-LOSSES: dict[str, dict[str, Any]] = {
-    "dissipated": {"label": "contacts", "color": style.BLACK, "ls": "-"},
-    "dashpots": {"label": "dashpots", "color": style.GREEN, "ls": style.DASHED},
-    "absorbed": {"label": "those of the ends", "color": style.ORANGE, "ls": style.DOTTED},
-}
+LOSSES = {"dissipated": "contacts", "dashpots": "dashpots", "absorbed": "those of the ends"}
 MARKERS = "os^Dvp"  # of the simulated energies of bands, so that they too can be told apart in greyscale print
 ROW = 0.075  # height of a legend's row, as a fraction of the height of the axes
 SIDES = 0.04  # left and right of all amplitudes, as a fraction of their range in logarithms
@@ -78,22 +74,22 @@ def prediction(data: xr.Dataset) -> Figure:
     return figure
 
 
-def _draw_total(axes: Axes, data: xr.Dataset, name: str, color: str = style.BLACK, line: str = "-") -> None:
-    """Draw one energy in a ``color``, predicted with a ``line`` and simulated."""
+def _draw_total(axes: Axes, data: xr.Dataset, name: str) -> None:
+    """Draw one energy, predicted with a line and simulated."""
     for kind, look in LOOKS.items():
         if f"{kind}/{name}" in data:
             values = data[f"{kind}/{name}"].values
-            axes.plot(data["amplitude"].values, values, **{"color": color, "ls": line, "label": kind} | look)
+            axes.plot(data["amplitude"].values, values, label=kind, **{**style.CURVES[f"predicted/{name}"], **look})
 
 
 def _draw_losses(axes: Axes, data: xr.Dataset) -> None:
     """Draw what contacts dissipate, what dashpots do if there are any, and those of absorbing ends alone."""
     losses = [name for name in LOSSES if f"predicted/{name}" in data]
     for name in losses:
-        _draw_total(axes, data, name, LOSSES[name]["color"], LOSSES[name]["ls"])
+        _draw_total(axes, data, name)
     if len(losses) > 1:
         # One entry for each loss; the first panel explains lines and points.
-        handles = [axes.plot([], [], **LOSSES[name])[0] for name in losses]
+        handles = [axes.plot([], [], label=LOSSES[name], **style.CURVES[f"predicted/{name}"])[0] for name in losses]
         axes.set_ylim(0, 1.25)
         axes.legend(handles=handles, loc="upper left", ncols=len(losses), columnspacing=0.8)
 

@@ -43,7 +43,6 @@ from vipetsc.figures.style import Drawing, LeftOut, Shown, draw_each, rc_style, 
 from vipetsc.figures.sweep_members import Files, Sweeps, in_file_name, table
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
-from vipetsc.io.errors import ResultFileError
 from vipetsc.io.kinds import BRANCHES, IDENTIFIED, KIND_OF, LAW, OPTIMUM, PREDICTION, RUN, SEARCH, SWEEP, ResultKind
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
@@ -102,25 +101,6 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
 
 BRANCH = "branch"  # the figure of branches
 OVER_BRANCHES = "ibtet_backbone"  # the figure of sweeps that shows branches too
-
-# What every run holds, and pictures take for granted.
-RUN_NEEDS = (
-    "site",
-    "episode",
-    "energy/kinetic",
-    "energy/spring",
-    "energy/contact",
-    "energy/work",
-    "energy/dissipated",
-    "sites/cell",
-    "sites/clearance",
-    "impacts/site",
-    "impacts/side",
-    "impacts/onset",
-    "impacts/approach_velocity",
-    "impacts/force",
-    "impacts/loss",
-)
 
 # What sweeps must hold for a figure.
 WHOLE_MEMBERS = "members with their fields ([sweep] fields = true), contact sites and a band above the driven one"
@@ -488,11 +468,8 @@ def _run_drawings(
 
 
 def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Return the run in ``folder``, and its analysis if any; raise ResultFileError for a run that lacks parts."""
+    """Return the run in ``folder``, and its analysis if any; raise as ``open_run``."""
     run = files.get(folder / "run.h5", open_run)
-    missing = [name for name in RUN_NEEDS if name not in run.variables and name not in run.dims]
-    if missing:
-        raise ResultFileError(f"{folder / 'run.h5'} is not a run of vipetsc: it lacks {', '.join(missing)}")
     if not (folder / "analysis.h5").exists():
         return run, None
     return run, files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))

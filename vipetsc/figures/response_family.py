@@ -25,7 +25,7 @@ from vipetsc.figures.nfrc import (
     parameter_of,
     responses_in,
 )
-from vipetsc.figures.stability import UNDECIDED, StabilityLook, draw_states
+from vipetsc.figures.series import UNDECIDED, Series
 from vipetsc.figures.style import NoPicture
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
@@ -169,7 +169,7 @@ def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:
     """Draw ``values`` (point,) of a curve, with that ``name`` in the legend; special points are marked."""
-    draw_states(axes, parameter_of(curve), values, curve["unstable"].values, StabilityLook(colour), name)
+    Series(parameter_of(curve), values, {"color": colour}, name, unstable=curve["unstable"].values).draw(axes)
     draw_special(axes, curve, values)
 
 

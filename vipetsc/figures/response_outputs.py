@@ -13,12 +13,10 @@ from matplotlib.figure import Figure
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_linear, draw_special, has_places, parameter_of, response_page, responses_in
-from vipetsc.figures.stability import StabilityLook, draw_states
+from vipetsc.figures.series import Series
 from vipetsc.figures.style import NoPicture
 from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
 
-# Units of the motions of named masses, each of which has a row of the page.
-AMPLITUDES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 # Lines of locations, which differ in greyscale print.
 DASHES = ("-", style.DASHED, "-.", style.DOTTED)
 
@@ -43,7 +41,7 @@ def response_outputs(paths: Sequence[Path]) -> Figure:
 
     rows: list[Callable[[Axes, xr.Dataset], None]] = []
     if _all_have(curves, "lag"):
-        rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]
+        rows += [partial(_draw_amplitude, quantity=quantity) for quantity in panels.MOTION_UNITS]
         rows.append(_draw_lag)
     if _all_have(curves, "transmission"):
         rows.append(_draw_transmission)
@@ -58,7 +56,7 @@ def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
 
     A linear response is proportional to the drive: it is drawn in decibels, over the drive's amplitude.
     """
-    unit = AMPLITUDES[quantity]
+    unit = panels.MOTION_UNITS[quantity]
     if not has_places(curve):
         _draw_frequency_response(axes, curve, quantity)
         return
@@ -70,7 +68,7 @@ def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
         draw_linear(axes, curve, f"peak_{quantity}", number)
     axes.set_ylabel(f"{quantity} ({unit})")
     if quantity == "displacement":
-        axes.plot([], [], color=style.GREY, lw=0.4, label="first harmonic")
+        axes.plot([], [], lw=0.4, label="first harmonic", **style.CURVES["linear"])
         _legend(axes)
 
 
@@ -80,7 +78,7 @@ def _draw_frequency_response(axes: Axes, curve: xr.Dataset, quantity: str) -> No
         level = decibels(curve[f"first_{quantity}"].values[:, number] / curve["amplitude"].values)
         _draw_states(axes, curve, level, number, label=name)
     drive_unit = "m" if NfrcCase.of(curve).drive.end else "N"
-    axes.set_ylabel(f"{quantity}\n(dB re 1 {AMPLITUDES[quantity]} per {drive_unit})")
+    axes.set_ylabel(f"{quantity}\n(dB re 1 {panels.MOTION_UNITS[quantity]} per {drive_unit})")
     if quantity == "displacement":
         _legend(axes)
 
@@ -142,6 +140,6 @@ def _draw_forces(axes: Axes, curve: xr.Dataset) -> None:
 
 def _draw_states(axes: Axes, curve: xr.Dataset, values: np.ndarray, number: int, label: str | None = None) -> None:
     """Draw ``values`` over the parameter in the look of curve ``number``; special points are marked."""
-    look = StabilityLook(style.band_colour(number + 1), broad_dashes=DASHES[number % len(DASHES)])
-    draw_states(axes, parameter_of(curve), values, curve["unstable"].values, look, label)
+    look = {"color": style.band_colour(number + 1), "ls": DASHES[number % len(DASHES)]}
+    Series(parameter_of(curve), values, look, label, unstable=curve["unstable"].values).draw(axes)
     draw_special(axes, curve, values)

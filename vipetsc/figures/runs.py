@@ -1,6 +1,6 @@
 """Pictures of one run: where its energy is, its dispersion, ledger, phase portraits; the bands of a cell."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -18,9 +18,9 @@ from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.damped import decay_length
 
 CELLS = {
-    "dispersion_before": ("Before the first site", style.BLUE),
-    "dispersion_after": ("After the first site", style.VERMILION),
-    "dispersion": ("All cells", style.BLACK),
+    "dispersion_before": "Before the first site",
+    "dispersion_after": "After the first site",
+    "dispersion": "All cells",
 }
 LARGEST_RESIDUAL = 1e-8  # of the ledger of a sound run at the default tolerances, over the work of the drive
 # Fraction of a record that two periods of the drive may take for energies to be drawn as means over them: a longer mean
@@ -111,12 +111,13 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     # The pass bands are shaded, so that the energy that each has received can be read off the sums.
     panels.shade_bands(side, ((band.low, band.high) for band in pass_bands(cell)))
     for axes, tag, (name, spectrum) in zip(maps, "ab", spectra.items(), strict=False):
-        text, colour = CELLS[str(name)]
+        text = CELLS[str(name)]
         image = panels.dispersion_map(axes, spectrum, norm, cell)
         axes.set_title(f"({tag}) {text}")
         axes.label_outer()
         energy = np.maximum(spectrum.sum("wavenumber"), 1e-300)
-        side.plot(energy, energy["frequency"] / 1e3, color=colour, lw=0.7, label=text.split()[0].lower())
+        look = {"lw": 0.7, "label": text.split()[0].lower(), **style.CURVES[str(name)]}
+        side.plot(energy, energy["frequency"] / 1e3, **look)
     panels.colour_bar(image, [*maps, side], "Mean kinetic energy per bin (J)")
 
     _mark_drive(side, model)
@@ -176,21 +177,22 @@ def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
         mean = ", mean"
 
     given = "initial energy and work" if case.initial else "work of the drive"
-    curves: list[tuple[str, xr.DataArray, str, Any]] = [
-        (given, run["energy/work"], style.BLACK, "-"),
-        ("kinetic + potential", stored, style.BLUE, "-"),
-        (f"kinetic{mean}", parts["energy/kinetic"], style.SKY, "-"),
+    curves = [
+        (given, run["energy/work"], "energy/work"),
+        ("kinetic + potential", stored, "energy/stored"),
+        (f"kinetic{mean}", parts["energy/kinetic"], "energy/kinetic"),
     ]
     # A lattice without springs, sites or dashpots has no curve of their energy.
     if case.model().chain.cell.springs:
-        curves.append((f"springs{mean}", parts["energy/spring"], style.GREEN, (0, (3, 1.5))))
+        curves.append((f"springs{mean}", parts["energy/spring"], "energy/spring"))
     if run.sizes["site"]:
-        curves.append(("contacts", contact, style.PURPLE, "-"))
-        curves.append(("dissipated", run["energy/dissipated"], style.VERMILION, style.DASHED))
+        curves.append(("contacts", contact, "energy/contact"))
+        curves.append(("dissipated", run["energy/dissipated"], "energy/dissipated"))
     if "energy/dissipated_by_damping" in run:
-        curves.append(("dissipated in dashpots", run["energy/dissipated_by_damping"], style.ORANGE, "-"))
-    for label, energy, colour, dashes in curves:
-        axes.plot(time, energy, color=colour, ls=dashes, label=label, lw=0.9)
+        name = "energy/dissipated_by_damping"
+        curves.append(("dissipated in dashpots", run[name], name))
+    for label, energy, name in curves:
+        axes.plot(time, energy, label=label, lw=0.9, **style.CURVES[name])
 
 
 def _draw_residual(axes: Axes, run: xr.Dataset, largest: float) -> None:

@@ -89,9 +89,9 @@ class SweptStates(NamedTuple):
 # Looks of the members of a sweep by the order in which they follow one another. What goes down is drawn first and
 # larger, so that both are seen where they coincide.
 LOOKS = {
-    "down": {"color": style.ORANGE, "ms": 3.2, "label": "down"},
-    "none": {"color": style.BLACK, "ms": 1.6, "label": "each from rest"},
-    "up": {"color": style.BLUE, "ms": 1.6, "label": "up"},
+    "down": {"ms": 3.2, "label": "down", **style.CURVES["follows down"]},
+    "none": {"ms": 1.6, "label": "each from rest", **style.CURVES["follows none"]},
+    "up": {"ms": 1.6, "label": "up", **style.CURVES["follows up"]},
 }
 
 

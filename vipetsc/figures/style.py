@@ -1,7 +1,7 @@
 """Sizes, type and colours of all pictures; empty figures; how figures become files, and how ranks share pictures."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,9 +49,70 @@ DASHED = (0, (4, 2))
 DOTTED = (0, (1, 2))
 DASHES_SEEN = 2.4  # length of a line in a legend, in heights of its letters, at which its dashes can be recognised
 
-# Looks of pass bands, from the lowest one; the seventh has that of the first. The dashes are for greyscale print.
+# Looks of pass bands, from the lowest one; the seventh has that of the first. The dashes are for greyscale print. The
+# colours are those of all curves that have none of their own ("C0" to "C5").
 BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 BAND_DASHES = ("-", (0, (6, 1)), (0, (4, 1, 1, 1)), (0, (1.5, 0.8)), (0, (6, 1, 1, 1, 1, 1)), (0, (3, 2)))
+
+# Looks of curves by what they show, for a colour and a line by which they differ in grey. Names with a slash are those
+# of variables in files. Pass bands have ``band_look``, and what only a number tells apart has ``numbered_look``.
+CURVES: Mapping[str, Mapping[str, Any]] = {
+    # The ledger of a run.
+    "energy/work": {"color": BLACK, "ls": "-"},
+    "energy/stored": {"color": BLUE, "ls": "-"},
+    "energy/kinetic": {"color": SKY, "ls": "-"},
+    "energy/spring": {"color": GREEN, "ls": (0, (3, 1.5))},
+    "energy/contact": {"color": PURPLE, "ls": "-"},
+    "energy/dissipated": {"color": VERMILION, "ls": DASHED},
+    "energy/dissipated_by_damping": {"color": ORANGE, "ls": "-"},
+    # Cells of a run, by their spectra.
+    "dispersion_before": {"color": BLUE},
+    "dispersion_after": {"color": VERMILION},
+    "dispersion": {"color": BLACK},
+    # What becomes of the energy of a wave at sites.
+    "transmitted": {"color": BLUE, "ls": "-"},
+    "reflected": {"color": SKY, "ls": DASHED},
+    "upper": {"color": VERMILION, "ls": DOTTED},
+    "dissipated": {"color": ORANGE, "ls": "-."},
+    "dashpots": {"color": GREEN, "ls": (0, (6, 1, 1, 1, 1, 1))},
+    # Energies of a prediction at the end: transferred, and lost.
+    "predicted/upper": {"color": BLACK, "ls": "-"},
+    "predicted/other": {"color": BLACK, "ls": "-"},
+    "predicted/dissipated": {"color": BLACK, "ls": "-"},
+    "predicted/dashpots": {"color": GREEN, "ls": DASHED},
+    "predicted/absorbed": {"color": ORANGE, "ls": DOTTED},
+    # Stability along a branch of normal modes, and its losses.
+    "stable": {"color": BLUE},
+    "unstable": {"color": VERMILION},
+    "not computed": {"color": GREY},
+    "damping_ratio": {"color": BLUE, "ls": "-"},
+    "force": {"color": VERMILION, "ls": "--"},
+    # Steady states under a drive: one curve, linear motion behind it, slow sweeps of its parameter.
+    "response": {"color": BLACK},
+    "linear": {"color": GREY},
+    "sweep up": {"color": GREEN},
+    "sweep down": {"color": PURPLE},
+    # Members of a sweep that follow one another.
+    "follows down": {"color": ORANGE},
+    "follows none": {"color": BLACK},
+    "follows up": {"color": BLUE},
+    # Designs that a search compares.
+    "case": {"color": GREY},
+    "best-1": {"color": VERMILION},
+    "best": {"color": BLUE},
+    "best-2": {"color": GREEN},
+    # Energies of all designs.
+    "designs/upper_share_at_end": {"color": PURPLE},
+    "designs/dissipated": {"color": ORANGE},
+    # Averages of the entropy.
+    "entropy/energy_weighted": {"color": BLUE},
+    "entropy/masked": {"color": VERMILION},
+    "entropy/joint": {"color": GREEN},
+    # Records of an identification, and what its model makes of them.
+    "measured": {"color": GREY},
+    "model": {"color": BLUE},
+    "residual": {"color": VERMILION},
+}
 
 
 class Shown(NamedTuple):
@@ -120,6 +181,12 @@ def band_look(number: int) -> dict[str, Any]:
     return {"color": band_colour(number), "ls": BAND_DASHES[(number - 1) % len(BAND_DASHES)]}
 
 
+def numbered_look(number: int) -> dict[str, Any]:
+    """Return colour and dashes of curve ``number`` (from 0) of those that only a number tells apart."""
+    count = len(BAND_COLOURS)
+    return {"color": BAND_COLOURS[number % count], "ls": BAND_DASHES[number // count % len(BAND_DASHES)]}
+
+
 def band_number(part: str) -> int | None:
     """Return the number of the pass band that a ``part`` of the frequency axis is, 2 for "band 2"; None for a gap.
 
@@ -146,7 +213,8 @@ def rc_style(style: str | None = None) -> Iterator[None]:
 
     What a user's ``matplotlibrc`` says has precedence over the house, and the file ``style`` over both.
     """
-    with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")):
+    house = Path(__file__).with_name("house.mplstyle")
+    with mpl.rc_context({"axes.prop_cycle": mpl.cycler(color=BAND_COLOURS)}, fname=house):
         # Where a user has no such file it is that of matplotlib, whose settings are the defaults.
         settings = _settings(mpl.matplotlib_fname())
         mpl.rcParams.update({key: value for key, value in settings.items() if value != mpl.rcParamsDefault[key]})

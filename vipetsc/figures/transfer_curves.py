@@ -22,6 +22,7 @@ from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
 from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
+from vipetsc.figures.series import Series
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import (
     AMPLITUDE,
@@ -159,11 +160,15 @@ def _draw_curve(axes: Axes, curve: TransferCurve, look: _Look, name_band: bool) 
     """Draw the transfer over the amplitude, its quantiles over samples as a band, and the floor dashed."""
     amplitudes = np.asarray(curve.data[AMPLITUDE])
     line = {"color": look.colour, "marker": look.marker, "ms": 2.2, "lw": 0.7}
-    axes.plot(amplitudes, np.asarray(curve.data["ibtet"]), label=look.label, **line)
-    band = quantile_band(curve.data, "ibtet")
-    if band:
-        label = "5 to 95 % of samples" if name_band else ""
-        axes.fill_between(amplitudes, *band, color=look.colour, alpha=0.25, lw=0, label=label)
+    drawn = Series(
+        amplitudes,
+        np.asarray(curve.data["ibtet"]),
+        line,
+        look.label,
+        band=quantile_band(curve.data, "ibtet"),
+        band_label="5 to 95 % of samples" if name_band else "",
+    )
+    drawn.draw(axes)
     floor = float(curve.data["floor"])
     if np.isfinite(floor):
         axes.axhline(floor, color=look.colour, lw=0.6, ls=style.DASHED, zorder=1)

@@ -7,7 +7,7 @@ import numpy as np
 from vipetsc.modes.problem import PeriodicProblem, Solution
 
 # Quantities of a point: name in the files, type, unit, description.
-QUANTITIES: dict[str, tuple[str, type, str, str]] = {
+POINT_VARIABLES: dict[str, tuple[str, type, str, str]] = {
     "energy": ("energy", float, "J", "energy"),
     "frequency": ("frequency", float, "Hz", "frequency"),
     "period": ("period", float, "s", "period"),
@@ -40,7 +40,8 @@ class Point(Solution):
     ``x`` are initial displacements (n,) in m (velocities in m/s for maps from the centre), or the unknowns of harmonic
     balance in m; ``tangent`` is d(x, period). Orbits that are shot have ``half_traces`` (n - 1,). Harmonic balance
     gives the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at
-    phase 0. ``QUANTITIES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something dissipates.
+    phase 0. ``POINT_VARIABLES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something
+    dissipates.
     """
 
     x: np.ndarray

@@ -15,6 +15,7 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.measure_panels import cell_edges
 from vipetsc.figures.panels import percentile_norm, quantile_band
+from vipetsc.figures.series import Series
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
@@ -23,7 +24,6 @@ from vipetsc.spectra import doubt, normalised
 from vipetsc.wording import counted
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
-COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1, with room for the text above the peak
 FEWEST = 4  # amplitudes of a sweep with pages: with fewer, a peak and a power law beyond it cannot be seen
@@ -177,7 +177,8 @@ def _entropy(facet: Facet, average: str) -> Figure:
         for name, label in AVERAGES.items():
             other = EntropyCurve.of(row, name)
             if other and name != average:
-                upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
+                look = {"lw": 0.6, "alpha": 0.5, **style.CURVES[f"entropy/{name}"]}
+                Series(other.amplitude, other.value, look, label).draw(upper)
         _draw_points(upper, curve, average, size=2.2)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
 
@@ -264,7 +265,7 @@ def _panels(rows: int, columns: int, height: float, heading: str) -> tuple[Figur
 
 def _draw_points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
     """Draw the points of a curve with bars for the deviation over the cells, over a band for the samples."""
-    colour = COLOURS[average]
+    colour = style.CURVES[f"entropy/{average}"]["color"]
     if curve.band:
         shade = {"color": colour, "alpha": 0.25, "lw": 0, "label": "5 to 95 % of samples"}
         axes.fill_between(curve.amplitude, *curve.band, **shade)

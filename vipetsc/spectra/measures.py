@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # the amplitude: 1 %, to which accelerometers are calibrated.
 PERIODS = 10
 TOLERANCE = 0.01
-QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
+MOTIONS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
 PART = "part"  # the dimension of parts of the frequency axis: pass bands, gaps, what is above
 JOINT = "-"  # between the names of a pair
 
@@ -63,7 +63,7 @@ class RunRecord:
         if point not in self._steady:
             history = self.points[point]
             amplitudes = {}
-            for quantity in QUANTITIES:
+            for quantity in MOTIONS:
                 values = getattr(history, quantity)
                 amplitudes[quantity] = histories.steady_amplitude(history.time, values, self.drive, self.periods)
             self._steady[point] = amplitudes
@@ -316,7 +316,7 @@ def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float
 
 def _of_points(kind: str, quantity: str) -> RunMeasure:
     """Return the measure of a ``kind`` (peak, rms, steady) of a ``quantity`` at a point."""
-    unit = QUANTITIES[quantity]
+    unit = MOTIONS[quantity]
     name = f"{kind}_{quantity}"
     if kind == "steady":
         text = f"steady amplitude of the {quantity}"
@@ -365,7 +365,7 @@ STANDARD = (
     # Of a linear lattice it does not depend on the amplitude.
     RunMeasure("lyapunov", "1/s", "largest Lyapunov exponent", _of_statistics("lyapunov"), power=0.0),
     RunMeasure("lyapunov_error", "1/s", "standard error of the exponent", _of_statistics("lyapunov_error"), power=0.0),
-    *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
+    *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in MOTIONS),
     RunMeasure(
         "steady_drift",
         "1",

@@ -8,7 +8,7 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import Parts
 from vipetsc.spectra.histories import History, SteadyDrive
-from vipetsc.spectra.measures import PERIODS, QUANTITIES, TOLERANCE, RunRecord
+from vipetsc.spectra.measures import MOTIONS, PERIODS, TOLERANCE, RunRecord
 
 
 def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
@@ -23,7 +23,7 @@ def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
     points: dict[str, History] = {}
     if "points/velocity" in run:
         time = run["time"].values
-        motion = {quantity: run[f"points/{quantity}"].values for quantity in QUANTITIES}
+        motion = {quantity: run[f"points/{quantity}"].values for quantity in MOTIONS}
         for number, point in enumerate(output.points or []):
             columns = {quantity: values[:, number] for quantity, values in motion.items()}
             points[point.name] = History(time=time, **columns)

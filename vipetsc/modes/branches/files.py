@@ -1,7 +1,7 @@
 """Files of branches: variables from the fields of their points, and the points again from the variables.
 
 All kinds of branches have the number and the kind of every point, and how the branch ended. A ``Format`` has what else
-a kind has: normal modes the ``QUANTITIES`` of their orbits with the initial values (shooting) or the harmonics
+a kind has: normal modes the ``POINT_VARIABLES`` of their orbits with the initial values (shooting) or the harmonics
 (condensed motions), curves of steady states the measures of ``spectra.responses``. Fields of different lengths are
 padded. The table of a branch (CSV) has columns of the same variables (``TABLES``).
 """
@@ -23,7 +23,7 @@ from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch, kinds_in, stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
 from vipetsc.modes.branches.sweeps import measure, outputs_of, sweep_down, sweep_up
-from vipetsc.modes.point import OF_LOSSES, QUANTITIES, Point
+from vipetsc.modes.point import OF_LOSSES, POINT_VARIABLES, Point
 from vipetsc.modes.response.state import Measures, Response
 from vipetsc.modes.stability import UNSTABLE_BEYOND
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS
@@ -177,7 +177,7 @@ def _padded(rows: Sequence[np.ndarray], fill: float = np.nan) -> np.ndarray:
 def _nnm_variables(branch: Branch[Point]) -> Variables:
     """Return variables of all branches of normal modes: the quantities, the regions and losses."""
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
-    for name, (stored, _, units, text) in QUANTITIES.items():
+    for name, (stored, _, units, text) in POINT_VARIABLES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
     data["multiplier_max"].attrs["unstable_beyond"] = UNSTABLE_BEYOND
     tangent_period = np.array([p.tangent[-1] if p.tangent.size else np.nan for p in branch.points])
@@ -193,7 +193,7 @@ def _nnm_variables(branch: Branch[Point]) -> Variables:
 
 def _nnm_fields(data: xr.Dataset) -> list[dict[str, Any]]:
     """Return fields of ``Point`` that all normal modes have, of every point in a file, by their names."""
-    columns: dict[str, Any] = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
+    columns: dict[str, Any] = {name: data[stored].values.tolist() for name, (stored, *_) in POINT_VARIABLES.items()}
     columns |= {name: data[name].values.tolist() for name in OF_LOSSES if name in data}
     columns["kind"] = stored_kinds(data)
     # Properties of ``Point``, which follow from other fields.

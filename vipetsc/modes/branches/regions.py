@@ -3,7 +3,7 @@
 import numpy as np
 
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.point import QUANTITIES, Point
+from vipetsc.modes.point import POINT_VARIABLES, Point
 from vipetsc.spectra import doubt, power_law
 
 # The paper names the regions and gives no bounds: the next three numbers are choices of this package. What depends on
@@ -30,8 +30,8 @@ MOST = float(np.exp(500.0))
 
 
 def quantity(branch: Branch[Point], name: str) -> np.ndarray:
-    """Return one of ``QUANTITIES`` of every point (points,)."""
-    return branch.column(name).astype(QUANTITIES[name][1])
+    """Return one of ``POINT_VARIABLES`` of every point (points,)."""
+    return branch.column(name).astype(POINT_VARIABLES[name][1])
 
 
 def regions(branch: Branch[Point]) -> np.ndarray:

@@ -20,7 +20,7 @@ from vipetsc.case.nfrc import WALLS, NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonics import Episode
 from vipetsc.modes.balance.stops import Stops
-from vipetsc.spectra.measures import QUANTITIES
+from vipetsc.spectra.measures import MOTIONS
 
 # Samples of the period, per harmonic, near the largest of which the largest value is looked for. A sample misses the
 # peak of the last harmonic by a phase of pi/16 at most, so by 2 % of this harmonic; four steps of Newton's method leave
@@ -133,7 +133,7 @@ class ResponseOutputs:
         rate = 1j * motion.omega * np.arange(harmonics.shape[1])
         values = {"location_harmonics": harmonics.real, "location_harmonics_imaginary": harmonics.imag}
         # Each quantity is the derivative by time of the one before.
-        for power, quantity in enumerate(QUANTITIES):
+        for power, quantity in enumerate(MOTIONS):
             series = harmonics * rate**power
             values[f"peak_{quantity}"] = largest_values(series)
             values[f"first_{quantity}"] = magnitude(series[:, motion.drive_order])
