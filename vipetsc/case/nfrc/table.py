@@ -62,6 +62,11 @@ class NfrcTable(Section):
         None,
     )
     harmonics: int = described("number of the last harmonic of the motion", 41, ge=1, le=2000)
+    truncation: Positive | None = described(
+        "fraction of a motion in the neglected harmonics up to which fewer than `harmonics` are taken along a curve;"
+        " default: all at every state",
+        None,
+    )
     symmetric: bool | None = described("odd harmonics only: w(t + T/2) = -w(t)", None)
     subharmonic: int = described(
         "period of the motion over that of the drive; above 1 subharmonic motions are looked for at the places of"

@@ -73,7 +73,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.case.nnm import NnmTable
-from vipetsc.modes.balance.harmonic_balance import BalanceFrame, Compliance, HarmonicBalance
+from vipetsc.modes.balance.harmonic_balance import MORE, BalanceFrame, Compliance, HarmonicBalance, order_needed
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
@@ -138,17 +138,13 @@ def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return [(begin, stop) for begin, stop in gaps if stop > begin]
 
 
-# Amplitudes are sought up to this multiple of ``SiteForces.amplitude_scale``, which is the clearance of a contact, and
-# means up to this multiple of the amplitude. The amplitude by Hertz's law grows without bound as the compliance goes to
-# 0, so that there must be some bound: of 30 random negative compliances 18 have a motion below 1e2 clearances, 19 below
-# 1e3, 26 below 1e4.
+# Amplitudes are sought up to this multiple of ``SiteForces.amplitude_scale``, the clearance of a contact, and means up
+# to this multiple of the amplitude. By Hertz's law amplitudes grow without bound as the compliance goes to 0.
 LARGEST = 1e3
 # A mean below this fraction of the amplitude is rounding, and taken to be 0.
 LEAST_MEAN = 1e-14
-# The force of a contact that is pressed at rest softens as it opens and hardens beyond. Its balance may therefore have
-# the same sign at the smallest and at the largest amplitude, and change it twice in between. It is evaluated at
-# TRIED_OF_PRESSED amplitudes, spaced evenly in their logarithms, from this multiple of the depth to ``LARGEST``. Of 50
-# random pressed contacts 21 have a motion: all are found with 21 amplitudes or more, 20 with 6 or 11.
+# The force of a contact that is pressed at rest softens as it opens and hardens beyond, so that its balance may change
+# sign twice. It is evaluated at TRIED_OF_PRESSED amplitudes from this multiple of the depth to ``LARGEST``.
 LEAST_OF_PRESSED = 1e-2
 TRIED_OF_PRESSED = 41
 
@@ -329,31 +325,13 @@ class HarmonicFrame(BalanceFrame):
 # Order of the motions with which a branch begins. No point of a branch has a lower one: a case with ``nnm.harmonics``
 # below it is refused. With 7 to 63 two breathers of the built-in lattice are the same and take the same CPU time.
 FEWEST = 15
-# The number of harmonics changes where the truncation is outside these fractions of the one allowed, and then so that
-# it becomes the fraction AIM: far enough from both ends that the number does not change at every point. It changes once
-# at 81 points of the out-of-phase branch of the paper's model up to 10 kJ (Hertz's law, truncation 1e-4). With half or
-# twice each number it changes up to 5 times, with 0.19 and 0.21 it changes 14 times.
-FEWER = 0.02
-MORE = 0.5
-AIM = 0.2
-# The truncation falls as the inverse cube of the order K at least: the harmonics of a force with a kink fall as k^-2,
-# and so does G, hence Z_k as k^-4, and the sum of those beyond K as K^-3. With a smaller power the order would grow by
-# more than is needed; the truncation itself takes k^-3 for Z_k, so that its estimate is not too small.
-DECAY = 3
-# In one step the order grows by this factor at most (and to the next odd number), since the estimate of a motion with
-# few harmonics may be far off.
-MOST_GROWTH = 2.0
 # A motion smaller than this fraction of the guess is the state of rest, which solves the equations at every frequency.
 AT_REST = 1e-6
-# A guess whose residual is below this fraction of its size solves the equations of the mean and the first harmonic: the
-# describing functions' roots are found to some 1e-9 of it.
+# A guess whose residual is below this fraction of its size solves the equations of the mean and the first harmonic.
 BALANCED = 1e-6
 # As the harmonics above the first are brought in: first step of their weight; how far the motion may change in one
 # step, over the largest harmonic of the first guess; factors of the step after success and failure; the smallest step.
-# Seven breathers of the built-in lattice, from 1450 to 5000 rad/s, take 275 Newton steps with these values. First steps
-# from 0.05 to 1, and factors from 1.2 to 2.5 and from 0.2 to 0.6, take 269 to 351 and lead to the same motions. So do
-# changes of 0.05 to 0.5, with 475 to 178: small ones are the safer, since a motion that changes much may be another
-# one.
+# Small changes are the safer: a motion that changes much may be another one.
 FIRST_WEIGHT = 0.1
 FURTHEST = 0.1
 LONGER = 1.6
@@ -413,24 +391,8 @@ class ConservativeMotions(OrbitProblem):
 
     def order_near(self, point: Point) -> int:
         """Return the order of the highest harmonic for motions near ``point``."""
-        allowed = self.control.truncation
-        order = point.order
-        # The highest order is odd in any case: symmetric motions have no other.
-        if point.truncation >= MORE * allowed:
-            growth = (point.truncation / allowed / AIM) ** (1 / DECAY)
-            order = int(order * min(growth, MOST_GROWTH)) // 2 * 2 + 1
-        elif point.truncation <= FEWER * allowed:
-            sizes = np.abs(point.x.reshape(self.forces.pairs, -1))
-            # What would be left out from each harmonic on, that harmonic included.
-            left_out = sizes[:, ::-1].cumsum(axis=1)[:, ::-1]
-            count = int((left_out > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0).sum())
-            # The last of ``count`` harmonics has the order count - 1, or 2 count - 1 if only odd ones are kept. The
-            # odd order above is taken, which keeps one harmonic more, since the next motion may need more than this
-            # one.
-            order_beyond = count
-            if self.forces.odd:
-                order_beyond = 2 * count
-            order = max(min(order_beyond // 2 * 2 + 1, order), FEWEST)
+        balance = self.balance(point.order)
+        order = order_needed(balance, point.x, point.truncation, self.control.truncation, FEWEST)
         return min(order, self.highest_order)
 
     def frame(self, point: Point, chart: str = "auto") -> HarmonicFrame:

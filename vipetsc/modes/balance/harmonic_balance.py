@@ -272,6 +272,7 @@ class RealUnknowns:
     def __init__(self, rows: int, order: int, odd: bool, cosines: bool) -> None:
         self.rows = rows
         self.order = order
+        self.cosines = cosines
         self.orders = np.arange(order + 1)
         if odd:
             self.orders = np.arange(1, order + 1, 2)
@@ -300,6 +301,16 @@ class RealUnknowns:
         z.real[:, self._places] = parts[:, : len(self.orders)]
         z.imag[:, self._sine_places] = parts[:, len(self.orders) :]
         return z
+
+    def resized(self, x: np.ndarray) -> np.ndarray:
+        """Return unknowns (size,) from those of another ``order``, ``x`` (n,), of the same kind; 0 for new orders."""
+        parts = x.reshape(self.rows, -1)
+        count = parts.shape[1]
+        if not self.cosines:
+            count = (count + self.skipped) // 2
+        kept = len(self.orders)
+        sines = parts[:, count:]
+        return np.hstack([_cut(parts[:, :count], kept), _cut(sines, kept - self.skipped)]).ravel()
 
     def by_unknowns(self, series: ForceSeries) -> np.ndarray:
         """Return derivative (pair, orders, unknowns of a row) of forces by the unknowns of their own elongations."""
@@ -346,7 +357,6 @@ class HarmonicBalance(RealUnknowns):
         self.compliance = compliance
         self.forces = forces
         self.odd = odd
-        self.cosines = cosines
         self.weight = weight
         if shifted is None:
             shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
@@ -360,17 +370,6 @@ class HarmonicBalance(RealUnknowns):
         return HarmonicBalance(
             self.compliance, self.forces, order=self.order, odd=self.odd, cosines=self.cosines, weight=weight
         )
-
-    def resized(self, x: np.ndarray) -> np.ndarray:
-        """Return unknowns (size,) from those of equations with another ``order``, ``x`` (n,); 0 for new orders.
-
-        Both must have cosines alone, and both have odd orders alone or all.
-        """
-        parts = x.reshape(self.forces.pairs, -1)
-        out = np.zeros((len(parts), self.size // len(parts)))
-        count = min(parts.shape[1], out.shape[1])
-        out[:, :count] = parts[:, :count]
-        return out.ravel()
 
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
         """Return the forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
@@ -509,6 +508,54 @@ class HarmonicBalance(RealUnknowns):
     def _means(self) -> np.ndarray:
         """The mean (orders,) over a period of products of two harmonics of one order."""
         return np.where(self.orders == 0, 1.0, 0.5)
+
+
+def _cut(parts: np.ndarray, count: int) -> np.ndarray:
+    """Return the first ``count`` columns of ``parts`` (rows, columns), with 0 in those that it lacks."""
+    out = np.zeros((len(parts), count))
+    both = min(count, parts.shape[1])
+    out[:, :both] = parts[:, :both]
+    return out
+
+
+# The number of harmonics changes where the truncation is outside these fractions of the one allowed, and then so that
+# it becomes the fraction AIM: far enough from both ends that the number does not change at every point.
+FEWER = 0.02
+MORE = 0.5
+AIM = 0.2
+# The truncation falls as the inverse cube of the order K at least: the harmonics of a force with a kink fall as k^-2,
+# and so does G, hence Z_k as k^-4, and the sum of those beyond K as K^-3. With a smaller power the order would grow by
+# more than is needed; the truncation itself takes k^-3 for Z_k, so that its estimate is not too small.
+DECAY = 3
+# In one step the order grows by this factor at most (and to the next odd number), since the estimate of a motion with
+# few harmonics may be far off.
+MOST_GROWTH = 2.0
+
+
+def order_needed(
+    balance: HarmonicBalance, x: np.ndarray, truncation: float, allowed: float, fewest: int, fewer: float = FEWER
+) -> int:
+    """Return the order, odd and at least ``fewest``, for motions near one with a ``truncation`` where ``allowed`` is.
+
+    The unknowns ``x`` (size,) of the motion are those of ``balance``, in any unit. The order falls where the truncation
+    is below the fraction ``fewer`` of the one allowed.
+    """
+    order = balance.order
+    # Odd in any case: symmetric motions have no other.
+    if truncation >= MORE * allowed:
+        growth = (truncation / allowed / AIM) ** (1 / DECAY)
+        return int(order * min(growth, MOST_GROWTH)) // 2 * 2 + 1
+    if truncation > fewer * allowed:
+        return order
+
+    sizes = np.abs(balance.unpack(x)[:, balance.orders])
+    # What would be left out from each harmonic on, that harmonic included.
+    left_out = sizes[:, ::-1].cumsum(axis=1)[:, ::-1]
+    count = int((left_out > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0).sum())
+    # The last of ``count`` harmonics has the order count - 1, or 2 count - 1 if only odd ones are kept. The odd order
+    # above is taken, which keeps one harmonic more, since the next motion may need more than this one.
+    beyond = count * (1 + balance.odd)
+    return max(min(beyond // 2 * 2 + 1, order), fewest)
 
 
 class BalanceFrame(ABC):

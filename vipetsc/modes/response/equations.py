@@ -13,20 +13,24 @@ varies along a curve, or a key of the case with both fixed: this is the paramete
 where x (n,) in m are the real and imaginary parts of Z and p is the parameter over a unit, its ``scale``. The residual
 is R over the clearance. Its derivative by p over the amplitude is -A w times the scale; over the frequency it is that
 of G_s (``HarmonicBalance.rate``) plus a central difference of the drive's term -a A w.
+
+**Number of harmonics.** All states of a curve have unknowns up to the order ``nfrc.harmonics``. With
+``nfrc.truncation`` each step solves for as many of them as that fraction needs, by the ``truncation`` of the state at
+which it begins (``balance.harmonic_balance.order_needed``); the others are 0.
 """
 
 from abc import abstractmethod
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcTable
 from vipetsc.lattice import ComplianceError, IncidentWave
-from vipetsc.modes.balance.harmonic_balance import BalanceFrame, HarmonicBalance
+from vipetsc.modes.balance.harmonic_balance import FEWER, MORE, BalanceFrame, HarmonicBalance, order_needed
 from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, NoMotionError, unit
 from vipetsc.modes.response.stability_changes import StatesWithStability
 from vipetsc.modes.response.state import Response
 
@@ -38,6 +42,8 @@ SLOPE = 1e-8
 # What may end a curve of steady states, or keep Newton's method from one. Where the derivative is singular there is no
 # unique tangent.
 FAILURES = NoMotionError, ComplianceError, np.linalg.LinAlgError
+# Order of the highest harmonic, over that of the drive, below which none is taken.
+FEWEST = 15
 
 
 class LinearMotion(NamedTuple):
@@ -68,10 +74,14 @@ class SteadyFrame(BalanceFrame):
     """The equations at and near one state, with its unknowns ``xi`` (n + 1,) and unit ``tangent`` (n + 1,).
 
     The ``shift`` (orders, 1, 1) in N/m of the compliance is chosen at this state and stays the same within a step.
+    ``whole`` are equations of a higher order, whose unknowns the points of the curve have.
     """
 
-    def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
+    def __init__(
+        self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray, whole: "SteadyEquations | None" = None
+    ) -> None:
         self.equations = equations
+        self.whole = whole or equations
         self.newton = equations.newton
         self.tolerance = equations.tolerance
         self.xi = xi
@@ -80,11 +90,11 @@ class SteadyFrame(BalanceFrame):
 
     def encode(self, point: Response) -> np.ndarray:
         """Return the unknowns (n + 1,) of another state."""
-        return point.xi
+        return self.equations.resized(point.xi)
 
     def direction(self, point: Response) -> np.ndarray:
         """Return the curve's direction (n + 1,) at another state."""
-        return point.tangent
+        return self.equations.resized(point.tangent)
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
         """Return the residual (n,), which vanishes at a steady state, over the clearance."""
@@ -99,7 +109,7 @@ class SteadyFrame(BalanceFrame):
 
         ``direction`` (n + 1,) is the branch's unit tangent there.
         """
-        return Response(xi=attempt.xi, tangent=direction)
+        return Response(xi=self.whole.resized(attempt.xi), tangent=self.whole.resized(direction))
 
 
 class SteadyEquations(StatesWithStability):
@@ -122,10 +132,56 @@ class SteadyEquations(StatesWithStability):
         self.max_newton = options.max_newton
         # Along a curve over the amplitude the drive's term is the same for all states of a step.
         self._drive_terms = BoundedCache[tuple[float, bytes], np.ndarray](1)
+        # The same equations with fewer harmonics, by their order: a curve comes back to the same few.
+        self._of_orders: dict[int, Self] = {}
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:
         """Return motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
+
+    @abstractmethod
+    def with_order(self, order: int) -> Self:
+        """Return the same equations with harmonics up to another ``order``."""
+
+    def of_order(self, order: int) -> Self:
+        """Return the same equations with harmonics up to ``order``, made once."""
+        if order == self.balance.order:
+            return self
+        if order not in self._of_orders:
+            self._of_orders[order] = self.with_order(order)
+        return self._of_orders[order]
+
+    def of_state(self, xi: np.ndarray) -> Self:
+        """Return the equations with as many harmonics as the state ``xi`` (n + 1,) has, all without a truncation."""
+        if self.options.truncation is None:
+            return self
+        sizes = np.abs(self.balance.unpack(xi[:-1])).max(axis=0)
+        (orders,) = np.nonzero(sizes)
+        order = max(int(orders.max(initial=0)), FEWEST * self.periods)
+        return self.of_order(min(order, self.balance.order))
+
+    def near(self, xi: np.ndarray) -> Self:
+        """Return the equations with as many harmonics as states near ``xi`` (n + 1,) need."""
+        allowed = self.options.truncation
+        if allowed is None:
+            return self
+        states = self.of_state(xi)
+        inner = states.resized(xi)
+        # A state with all harmonics, such as the first one of a curve, may have many more than it needs.
+        fewer = FEWER
+        if states is self:
+            fewer = MORE
+        truncation = states.truncation(inner)
+        order = order_needed(states.balance, inner[:-1], truncation, allowed, FEWEST * self.periods, fewer)
+        return self.of_order(min(order, self.balance.order))
+
+    def resized(self, xi: np.ndarray) -> np.ndarray:
+        """Return unknowns, or a tangent, (n + 1,) of equations of another order as those of these."""
+        return np.append(self.balance.resized(xi[:-1]), xi[-1])
+
+    def truncation(self, xi: np.ndarray) -> float:
+        """Return the estimated size of the harmonics that the state ``xi`` (n + 1,) leaves out, over the motion."""
+        return self.balance.truncation(xi[:-1] * self.clearance, self.motion_frequency(xi))
 
     @cached_property
     def newton(self) -> DenseNewton:
@@ -183,7 +239,21 @@ class SteadyEquations(StatesWithStability):
 
     def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
         """Return the frame at a state; there is one ``chart``."""
-        return SteadyFrame(self, point.xi, point.tangent)
+        states = self.near(point.xi)
+        if states is self:
+            return SteadyFrame(self, point.xi, point.tangent)
+        frame = SteadyFrame(states, states.resized(point.xi), unit(states.resized(point.tangent)), whole=self)
+        # With other harmonics the state itself is corrected before a step is taken from it: else the corrections of
+        # the steps would contain the change of the harmonics, however short the steps are.
+        if states is not self.of_state(point.xi):
+            attempt = frame.correct(frame.xi, 0.0)
+            if attempt.converged:
+                frame.xi = attempt.xi
+        return frame
+
+    def tangent_near(self, point: Response, xi: np.ndarray) -> np.ndarray:
+        """Return the unit tangent (n + 1,) at a state ``xi`` (n + 1,) near a ``point``, of all harmonics."""
+        return SteadyFrame(self, point.xi, point.tangent).tangent_at(xi)
 
     def first_tangent(self, start: Response, direction: int) -> np.ndarray:
         """Return the tangent (n + 1,) at the first state: the parameter grows (``direction`` 1) or falls (-1)."""

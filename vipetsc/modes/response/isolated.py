@@ -23,7 +23,7 @@ from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps
 
-# States of one line over the amplitude, at most; those of the lattice of the example ``isola`` have up to 142.
+# States of one line over the amplitude, at most.
 MOST_STATES = 1000
 # Difference of unknowns, over their size, above which two states are not the same. Newton's method leaves a residual of
 # 1e-11 (``nfrc.tolerance``), which near a fold is a much larger error of the unknowns.

@@ -34,9 +34,7 @@ from vipetsc.modes.stability import Hill, Stability
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5
-# Values whose lattices are kept: those of a step and of its differences. With 9, 4 and 2 values a curve of 24 states
-# over a clearance builds 71, 94 and 117 lattices, one of 27 states over a stiffness 272, 273 and 299. 18 values save
-# nothing over the clearance, 9 % over the stiffness.
+# Values whose lattices are kept: those of a step and of its differences.
 KEPT_VALUES = 9
 
 
@@ -102,6 +100,17 @@ class StatesOverKey(SteadyEquations):
         """
         states, inner = self._at(xi)
         return np.column_stack([states.jacobian(inner, shift)[:, :-1], self._slope(xi, shift)])
+
+    def with_order(self, order: int) -> "StatesOverKey":
+        """Return the same equations with harmonics up to another ``order``."""
+        options = self.options.model_copy(update={"harmonics": order})
+        over = self.parameter.over
+        return StatesOverKey(lambda v: self.states_at(v).of_order(order), over, self.parameter.fixed, options)
+
+    def truncation(self, xi: np.ndarray) -> float:
+        """Return the estimated size of the harmonics that the state ``xi`` (n + 1,) leaves out, over the motion."""
+        states, inner = self._at(xi)
+        return states.truncation(inner)
 
     def _within(self, p: float) -> float:
         """Return the scaled parameter within the range that is nearest to ``p``."""

@@ -34,11 +34,9 @@ from vipetsc.modes.stability import Hill, Stability
 # The power of a force counts as rounding below this fraction of amplitude times frequency times displacement, as in a
 # finite lattice without loss: nothing comes in, of which there could be fractions.
 LEAST_WORK = 1e-12
-# Frequencies of a range among which the largest linear motion is looked for. It is a unit, of which the order of
-# magnitude matters alone.
+# Frequencies of a range among which the largest linear motion is looked for, a unit.
 TRIED = 33
-# Frequencies whose linear motions are kept: those of a step and of its differences. With 2 in place of 9 a curve over
-# the frequency (``nlvib``) computes 7 % more of them; 4 and 18 serve as well.
+# Frequencies whose linear motions are kept: those of a step and of its differences.
 KEPT_MOTIONS = 9
 
 
@@ -146,6 +144,13 @@ class SteadyStates(SteadyEquations):
             raise FlowError("the drive moves no contact and no nonlinear spring; drive another mass")
         return largest
 
+    def with_order(self, order: int) -> "SteadyStates":
+        """Return the same equations with harmonics up to another ``order``."""
+        case = self.case.model_copy(update={"nfrc": self.options.model_copy(update={"harmonics": order})})
+        return SteadyStates(
+            case, self.restitution, self.parameter.fixed, compliance=self.compliance, forces=self.forces
+        )
+
     def linear_motion(self, omega: float) -> LinearMotion:
         """Return the motion of the linear lattice for the amplitude 1 at ``omega`` in rad/s.
 
@@ -174,10 +179,13 @@ class SteadyStates(SteadyEquations):
         Its ``stability`` is looked for unless it is given.
         """
         omega, amplitude = self.drive(xi[-1])
-        x = xi[:-1] * self.clearance
-        z = self.balance.unpack(x)
-        base = self.motion_frequency(xi)
-        series = self.balance.series(x, base)
+        z = self.balance.unpack(xi[:-1] * self.clearance)
+        # Forces are those at the harmonics that the state has, which the equations balance.
+        states = self.of_state(xi)
+        inner = states.resized(xi)
+        series = states.balance.series(inner[:-1] * self.clearance, self.motion_frequency(xi))
+        forces = np.zeros_like(z)
+        forces[:, : states.balance.order + 1] = series.forces[:, : states.balance.order + 1]
 
         if stability is None:
             stability = self.stability(xi)
@@ -188,7 +196,6 @@ class SteadyStates(SteadyEquations):
         rate = complex(np.nan, np.nan)
         if stability.fastest is not None:
             rate = stability.fastest
-        forces = series.forces[:, : z.shape[1]]
         sites = len(self.forces.contacts)
         return Measures(
             frequency=omega,
@@ -200,13 +207,18 @@ class SteadyStates(SteadyEquations):
             sideband=rate.imag,
             closed=series.closed[:sites],
             episodes=len(series.episodes),
-            truncation=self.balance.truncation(x, base),
+            truncation=states.truncation(inner),
             harmonics=z[:sites],
-            outputs=self.outputs.of(self._harmonic_motion(omega, amplitude, z, series)),
+            outputs=self.outputs.of(self._harmonic_motion(omega, amplitude, z, forces, series)),
         )
 
-    def _harmonic_motion(self, omega: float, amplitude: float, z: np.ndarray, series: ForceSeries) -> HarmonicMotion:
-        """Return a state, whose pairs have the harmonics ``z`` (pairs, K + 1) in m, as ``ResponseOutputs`` takes it."""
+    def _harmonic_motion(
+        self, omega: float, amplitude: float, z: np.ndarray, forces: np.ndarray, series: ForceSeries
+    ) -> HarmonicMotion:
+        """Return a state as ``ResponseOutputs`` takes it.
+
+        Its pairs have the harmonics ``z`` in m and ``forces`` in N, both (pairs, K + 1).
+        """
         wave = self.linear_motion(omega).wave
         incident: np.ndarray | float = 0.0
         if wave is not None and self.outputs.cells:
@@ -217,7 +229,7 @@ class SteadyStates(SteadyEquations):
             drive_order=self.periods,
             amplitude=amplitude,
             relative=z,
-            forces=series.forces[:, : z.shape[1]],
+            forces=forces,
             driving=amplitude * self.weights,
             episodes=series.episodes,
             incident=incident,
@@ -228,6 +240,9 @@ class SteadyStates(SteadyEquations):
 
         The latest is kept, since it keeps the compliances at the frequencies of perturbations.
         """
+        states = self.of_state(xi)
+        if states is not self:
+            return states.hill_at(states.resized(xi))
         omega = self.motion_frequency(xi)
         if self._hill is None or self._hill.omega != omega:
             options = self.options

@@ -20,11 +20,11 @@ from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.turning import BoundedTurn
 from vipetsc.parallel import StoppedError, StopRequest
 
-# Largest number of states on growing amplitudes to the beginning of a range: the examples have 40 to 180. Where the
-# case asks for short steps, as many are allowed as cover this arclength.
+# Largest number of states on growing amplitudes to the beginning of a range. Where the case asks for short steps, as
+# many are allowed as cover this arclength.
 MOST_RAMP = 300
 LONGEST_RAMP = 30.0
-# States on growing weights of the contacts' forces, at most; in the tests 26 to 80 lead to closed contacts.
+# States on growing weights of the contacts' forces, at most.
 MOST_WEIGHTS = 10_000
 
 

@@ -10,10 +10,7 @@ from vipetsc.modes.continuation.arclength import Geometry, Verdict
 from vipetsc.modes.problem import Attempt, PeriodicProblem
 from vipetsc.modes.response.state import Response, returned
 
-# The following three numbers decide how many states lie on a curve, not its course: each state solves the equations. On
-# the curve of ``runs/examples/nfrc.toml`` for the restitution 0.7, with 21 harmonics, its folds stay the same to 1e-8
-# where one of them is changed. With half the TURN it has 203 states instead of 114, with twice the TURN 97; with a
-# CORRECTION of 0.03 it has 277, with 1 still 114; with a MOST_GROWTH of 1.3 or 2.5 it has 124 or 111.
+# The following three numbers decide how many states lie on a curve, not its course.
 #
 # Largest angle in rad between tangents, and largest correction over the step, of a step that is accepted.
 TURN = 0.25
@@ -31,6 +28,10 @@ class RangeProblem(PeriodicProblem[Response]):
     @abstractmethod
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
         """Return unknowns (n + 1,) at the scaled parameter ``p`` near a ``guess``; or ContinuationError."""
+
+    def tangent_near(self, point: Response, xi: np.ndarray) -> np.ndarray:
+        """Return the unit tangent (n + 1,) at a solution ``xi`` (n + 1,) near a ``point``."""
+        return self.frame(point).tangent_at(xi)
 
 
 class BoundedTurn(ABC):
@@ -86,7 +87,7 @@ class BoundedTurn(ABC):
         # through both points is nearer to it than the last one, and along a fold Newton's method needs that.
         place = (bound - before.xi[-1]) / (p - before.xi[-1])
         xi = self.problem.at(before.xi + place * (point.xi - before.xi), bound)
-        last = replace(point, xi=xi, tangent=self.problem.frame(point).tangent_at(xi))
+        last = replace(point, xi=xi, tangent=self.problem.tangent_near(point, xi))
         return last, self.ended_at(bound)
 
     @abstractmethod
