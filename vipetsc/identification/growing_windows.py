@@ -151,8 +151,7 @@ LEAST_NOISE = 1e-9
 # zero; without full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
 # A window is repeated at half its growth if its misfit is more than RISE times that of the window before (at least 1,
-# that of noise), until it grows by less than SHORTEST of the record. In eight fits (5 % noise, starts up to 2.3 times
-# off, unknown states) 1, 2 and 4 lead to the same parameters; with 1 noise shortens windows, at seven times the CPU.
+# that of noise), until it grows by less than SHORTEST of the record.
 RISE = 2.0
 SHORTEST = 0.01
 # Length over that of the record of the first window of a record without contact, or whose initial state is estimated.
@@ -160,15 +159,11 @@ FIRST = 0.1
 # Samples of a window, at least, before it is shortened (RISE); every record has twice as many.
 LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown: with one for each, noise would be fitted exactly.
-# In four records that begin in an unknown motion 0.75 and 3 give the same windows, whose ends are those of contacts.
 DATA_EACH = 1.5
-# Fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise two come within 2e-6
-# standard errors of the values after five.
+# Fits with noise that is estimated from the fit before.
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1
-# Fits to records of 2 to 20 % noise end within 6e-6 standard errors with a tenth or ten times ASSUMED_NOISE, half
-# or twice FIRST or LEAST_SAMPLES, or a second repetition; without any within 3e-4, in 0.65 to 0.85 of the CPU time.
 
 
 class Window(NamedTuple):

@@ -28,8 +28,7 @@ from vipetsc.case.identify import IdentifyCase, Measured, SensorTable
 from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.identification.motion import MotionError, RecordedMotion, SampledModel, State
 
-# Standard deviation of the prior of a coordinate. It has to be wide: with 1, 3 and 30 the parameters of a chain, from a
-# record with 5 % noise, move by .05, .005 and .0005 standard errors.
+# Standard deviation of the prior of a coordinate, which has to be wide.
 WIDTH = 10.0
 # Standard deviation while windows grow and data are few: that of modes with the energy that was measured.
 NARROW = 1.0
@@ -96,11 +95,9 @@ ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 # step that leads there is rejected.
 REJECTED = 1e8
 REJECTED_SIZE = 1e3
-# Derivatives by a coordinate are differences between runs that are 2 h apart; this is h. Those of the example, by seven
-# coordinates over 44 impacts, have errors of 1e-7 with h = 1e-7, of 8e-6 with 1e-6 and of 8e-4 with 1e-5. However many
-# steps it takes, a fit with a relative error e of its derivatives ends e/s standard errors away: with columns of length
-# 1, s is the smallest singular value of the Jacobian, 0.03 for two parameters of correlation 0.999. One-sided
-# differences have errors of 1e-3, and cost half as much.
+# Derivatives by a coordinate are differences between runs that are 2 h apart; this is h. A fit with a relative error e
+# of its derivatives ends e/s standard errors away, with the smallest singular value s of the Jacobian over its columns:
+# 0.03 for two parameters of correlation 0.999. One-sided differences err by 1e-3, central ones by 1e-6.
 HALF_WIDTH = 3e-7
 # Motions that are kept: at the end of a fit the residuals, the contacts and the cost are asked for of the same motion.
 KEPT = 8

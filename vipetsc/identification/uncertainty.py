@@ -92,9 +92,7 @@ def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: floa
     return np.array(errors)
 
 
-# Autocorrelations that are tested at most. In 1000 residuals 20 of them show, at the level of 5 %, a slow sine of a
-# quarter of the noise in 35 % of records (half as many in 17 %, twice as many in 48 %), and a correlation of 0.15 from
-# sample to sample in 84 % (93 %, 71 %).
+# Autocorrelations that are tested at most.
 MOST_LAGS = 20
 
 
