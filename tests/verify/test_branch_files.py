@@ -15,6 +15,7 @@ import xarray as xr
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.endings import Ending
+from vipetsc.figures.frequency_energy import backbone
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
 from vipetsc.modes.branches.files import read_branch, table, to_dataset, write_branch
@@ -162,7 +163,7 @@ def files_of(folder: Path) -> dict[str, str]:
 
 
 def test_both_directions_are_two_branches(tmp_path):
-    """Each has files of its own, and both begin at one point."""
+    """Each has files of its own, and both begin at one point; the picture joins them in the order of the curve."""
     whole = follow(tmp_path, **BOTH)
     down = read_branch(tmp_path / f"{NAME}-down.h5")
     assert whole.complete
@@ -170,6 +171,12 @@ def test_both_directions_are_two_branches(tmp_path):
     assert whole.points[0].energy == down.points[0].energy
     assert whole.points[1].energy > whole.points[0].energy
     assert down.points[-1].energy < 0.01 < down.points[-2].energy
+    energies = [point.energy for point in [*reversed(down.points[1:]), *whole.points]]
+    for name, expected in ((NAME, energies), (f"{NAME}-down", [point.energy for point in down.points])):
+        drawn = backbone([tmp_path / f"{name}.h5"]).get_axes()[0]
+        assert drawn.get_xlim() == (min(expected), max(expected))
+        curve = max((line.get_xdata() for line in drawn.lines), key=len)
+        assert np.abs(np.subtract.outer(expected, curve) / curve).min(axis=1).max() < 1e-12
 
 
 def test_a_step_whose_point_cannot_be_assessed_is_repeated_as_a_whole(tmp_path, monkeypatch):

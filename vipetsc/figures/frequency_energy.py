@@ -29,7 +29,7 @@ from vipetsc.figures import style
 from vipetsc.figures.branch_curves import draw_branch, lowest, smooth
 from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
-from vipetsc.io.branch_kinds import CHOSEN, kind_names
+from vipetsc.io.branch_kinds import CHOSEN, DOWN, kind_names
 from vipetsc.io.netcdf import open_netcdf
 
 # What the panels read; ``draw_branch`` shows by ``multiplier_max`` which orbits are stable.
@@ -113,6 +113,23 @@ def backbone(paths: Sequence[Path]) -> Figure:
 
 
 def _read(path: Path) -> xr.Dataset:
+    """Return the branch in ``path``, joined to the one towards smaller energies if the mode has both."""
+    branch = _load(path)
+    below = path.with_name(f"{path.stem}{DOWN}.h5")
+    if not below.exists():
+        return branch
+
+    # Backwards, and without the start, which both have.
+    down = _load(below).isel(point=slice(None, 0, -1))
+    down = down.assign(number=-down["number"])
+    if "tangent_period" in down:
+        down = down.assign(tangent_period=-down["tangent_period"])
+    both = [name for name, values in branch.items() if "point" in values.dims and name in down]
+    joined = xr.concat([down[both], branch[both]], dim="point")
+    return branch.drop_dims("point").assign(joined)
+
+
+def _load(path: Path) -> xr.Dataset:
     """Return the branch in ``path`` with the kinds of its points in words."""
     with open_netcdf(path, "branch", NEEDS) as file:
         branch = file.load()

@@ -27,6 +27,9 @@ CHOSEN = "chosen"
 DAMPED = "damped"
 """Damped modes: frequency and damping ratio over the energy."""
 
+DOWN = "-down"
+"""Ending of the name of a branch that is followed towards smaller energies, beside the one towards larger ones."""
+
 BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES, DAMPED)
 
 

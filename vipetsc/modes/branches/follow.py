@@ -41,6 +41,7 @@ from mpi4py import MPI
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.endings import Ended, Ending
+from vipetsc.io.branch_kinds import DOWN
 from vipetsc.io.folder import Claim, claimed, provenance
 from vipetsc.io.kinds import BRANCHES
 from vipetsc.io.netcdf import root_attributes
@@ -57,8 +58,6 @@ from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.sources import source_key
 
 logger = logging.getLogger(__name__)
-# What is added to the name of a branch that is followed towards smaller energies, beside the one towards larger ones.
-DOWN = "-down"
 BranchCase = NnmCase | NfrcCase
 
 
