@@ -70,9 +70,8 @@ class CallbackErrors:
 
 
 # A Newton step below the first number, in unknowns of order one, is rounding: the residual cannot be made smaller. It
-# counts as a solution's up to the second number. Near an unstable equilibrium, where an orbit stays for a long time,
-# the derivative grows to 1e14, and a small step says nothing about the residual. On the paper's branches, whose
-# multipliers come up to 3e8, such residuals are below 4e-12.
+# counts as a solution's up to the second number: near an unstable equilibrium, where an orbit stays for a long time, a
+# small step says nothing about the residual.
 STEP_TOLERANCE = 1e-14
 LARGEST_RESIDUAL = 1e-9
 # A Newton step from a residual within rounding that leaves more than this fraction of it cannot make it smaller: but

@@ -44,8 +44,7 @@ from vipetsc.modes.stability import HalfTraceAbove, half_traces, multipliers, re
 from vipetsc.modes.system import ContactPair, System
 
 # A contact grazes if the largest value of its gap is within this fraction of the clearance of zero. The parabola below
-# errs by less: through 2000 samples of a quarter of the period by 1e-8 of a harmonic of order 30, and by 1e-6 of one of
-# order 100.
+# errs by less.
 TOUCH = 1e-5
 
 
@@ -75,9 +74,7 @@ def grazing_contacts(system: System, u: np.ndarray) -> list[int]:
     return numbers
 
 
-# The chart ``grazing`` is chosen if |w| at the start is within this fraction of the clearance of it. The paper's
-# out-of-phase branches up to 100 J (116 points with Hertz's law, 141 with the bilinear one) take up to 12 % more Newton
-# steps with values from 0.01 to 0.2.
+# The chart ``grazing`` is chosen if |w| at the start is within this fraction of the clearance of it.
 NEAR_GRAZING = 0.05
 # Lower bound of |y| in the derivative of w by y, 2 D |y|, which vanishes at the touch itself. The smallest gap beside 0
 # is a rounding error of 1e-16 of D, with a y of 1e-8: the bound acts at the touch alone.
@@ -225,9 +222,7 @@ def near_grazing(system: System, x: np.ndarray) -> bool:
 # A half-trace is (mu + 1/mu)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: if it lies within
 # this of the level, on either side, a change of sign is rounding and no special point.
 LEAST_CROSSING = 1e-6
-# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``). Those of two masses, of
-# chains and of pressed contacts with r from 7 to 2,400 are up to 3.6 times that in the map of half a period, 6 times
-# in that of the whole, and 0.7 times in that of a quarter.
+# Residuals that rounding leaves are up to this many times eps r^(3/2) (``Shooting.rounding``).
 ROUNDING = 8
 # If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
 # and the tangent is not unique.
@@ -587,9 +582,7 @@ class Shooting(OrbitProblem):
         return replace(fold, resonance=resonance(self, fold))
 
 
-# An orbit that comes back after a part of its period to within this fraction of its size repeats itself. On in-phase
-# branches of the paper's model, orbits that are other ones passed three times come back to within 4e-13. Of 125 other
-# orbits two come back to within 2e-7 and 1e-5, all others miss by 8e-3 at least.
+# An orbit that comes back after a part of its period to within this fraction of its size repeats itself.
 SAME = 1e-6
 # Numbers of repetitions that are looked for. A motion passed n times repeats itself for each prime factor of n, and one
 # that is passed more often without any of these factors is not found.

@@ -232,8 +232,7 @@ def product_of(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 # Orders of perturbations, to both sides of 0, that are kept at least where nothing dissipates, and the factor of
-# omega_h up to which further orders are. In 24 random systems with one stop the growth rates over Om differ by less
-# than 1e-3 from those with all orders; with the factor 2 they differ by less than 1e-4.
+# omega_h up to which further orders are: growth rates over Om then err by less than 1e-3.
 KEPT = 48
 ABOVE = 1.25
 # The number of orders is a multiple of this one, so that neighbouring states of a curve have compliances in common.
@@ -297,27 +296,21 @@ LEAST = 1e-4
 # the linear modes, which lie at Re lambda = -decay Om or below. The line Re lambda = const on which D is followed keeps
 # this distance from them.
 LEAST_OF_FINITE = LEAST_GROWTH
-# Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow. In
-# the tests of stability a tenth fewer determinants are taken with them than without.
+# Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow.
 LINES = (0.1, 0.02)
-# Intervals of half a strip, 0 <= Im lambda <= Om/2, at first. With 12 the tests take 4 % fewer determinants in a tenth
-# more rounds, with 48 a tenth more, and nothing else changes.
+# Intervals of half a strip, 0 <= Im lambda <= Om/2, at first.
 COARSE = 24
-# Exponents whose compliances are kept: those of the coarse grids on all lines come to 150. Of 12 contacts with all
-# harmonics up to 121 they take 140 MB.
+# Exponents whose compliances are kept: those of the coarse grids on all lines come to 150.
 MOST_KEPT = 256
 # Halvings, at most, of an interval in which D turns by more than ``TURN``: the finest is 1e-6 Om long.
 FINEST = 14
 # Largest turn of D in rad from one position to the next: at pi its sense would be ambiguous.
 TURN = 0.7
-# Largest change of log|D| from one position to the next. Beside an interval with two zeros in its middle it is 2.2. In
-# twelve motions (four breathers, six of two masses, one and five equal sites) half of it takes 2 % more determinants
-# and twice of it as many, with the same exponents; without a bound the five sites count as three.
+# Largest change of log|D| from one position to the next. Beside an interval with two zeros in its middle it is 2.2.
 STEEP = 1.5
 # Exponent at which ``stability_changes`` takes D(0): at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
-# Steps, first step and accuracy, over Om, of the secant method. With half and twice of the first two the exponents of
-# these motions are the same to 1e-13. It fails for the five equal sites alone.
+# Steps, first step and accuracy, over Om, of the secant method.
 MOST_STEPS = 30
 STEP = 1e-4
 ACCURACY = 1e-10

@@ -18,8 +18,6 @@ LINEAR = 1e-9
 SAME_PLACE = 1e-4
 SAME_DIRECTION = 0.999
 # The latest steps, which lie near the point anyway, are left out of that, and branches with few points are not checked.
-# With 2 to 12 of them left out nothing is reported on seven branches of the paper's model and of three cells: the
-# latest steps that are looked at then lie 1.2 of the point's own steps away, or more.
 LATEST = 6
 FEWEST = 10
 

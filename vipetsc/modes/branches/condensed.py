@@ -34,8 +34,7 @@ from vipetsc.wording import distinct
 # Displacements below this fraction of the largest one are rounding, and left out.
 NEGLIGIBLE = 1e-16
 # Displacements are computed up to this distance from a site, in cells, which is doubled until they are negligible
-# there, up to the last value: close to a band edge a breather decays slowly, and one of 2048 cells falls by 1e-16 if
-# its motion decays by 2 % from cell to cell.
+# there, up to the last value: close to a band edge a breather decays slowly.
 FIRST_REACH = 8
 LAST_REACH = 2048
 # Places up to which Hill's determinant gives the largest multiplier. Its matrix has the harmonics of all of them, and

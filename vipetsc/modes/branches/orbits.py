@@ -26,9 +26,8 @@ from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
 
 # What divides the energy at which a mode first touches a contact, and the largest force of springs that are not linear
-# over the linear force: a branch begins below both. Its start is then linear, or almost: the numbers decide where a
-# branch begins, not its course. A mode that feels neither is linear at every energy, and begins at the last number in
-# J.
+# over the linear force: a branch begins below both, almost linear. A mode that feels neither is linear at every energy,
+# and begins at the last number in J.
 BELOW_TOUCH = 100
 NONLINEAR_FORCE = 1e-4
 LINEAR_ENERGY = 1e-3

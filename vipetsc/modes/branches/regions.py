@@ -6,16 +6,12 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.point import POINT_VARIABLES, Point
 from vipetsc.spectra import doubt, power_law
 
-# The paper names the regions and gives no bounds: the next three numbers are choices of this package. What depends on
-# them was measured on the out-of-phase branches of the paper's model (bilinear, Hertz, Hertz with twice the modulus).
+# The paper names the regions and gives no bounds: the next three numbers are choices of this package.
 #
 # Fraction of the time in contact from which the clearance counts as negligible (region IV). With 0.90 or 0.98 region IV
-# begins at 1/6 of the energy or at 11 times the energy; the exponent of the slope in it changes by 0.003, that in
-# region III by 0.08 (bilinear) and 0.011 (Hertz) at most.
+# begins at 1/6 of the energy or at 11 times the energy.
 SMOOTH_LIMIT = 0.95
-# Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III). With half
-# or twice the value region III begins at 0.8 to 1.33 times the energy, and its exponent changes by 0.01 at most. The
-# exponent in the falling part of region II depends on it: it changes by up to a third.
+# Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III).
 SETTLED = 0.5
 # Local exponents below this still belong to the fall from the grazing peak; no limit law is so steep. Values from -3 to
 # -1.5 give the same regions.

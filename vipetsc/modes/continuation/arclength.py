@@ -125,13 +125,9 @@ def _squashed(c: np.ndarray) -> np.ndarray:
     return c * (np.arcsinh(size) / size)
 
 
-# The following numbers decide how many points lie on a branch, not its course: each point solves the equations and
-# keeps the guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21
-# attempts in vain) each may be changed by a quarter or more, and the Newton steps of all points together change by 13 %
-# at most.
+# The following numbers decide how many points lie on a branch, not its course. None is sharp.
 #
-# The largest change over its bound at which the step after an accepted one aims. At 1, nearly twice as many steps are
-# refused.
+# The largest change over its bound at which the step after an accepted one aims.
 AIM = 0.7
 # Newton steps up to which the next step need not be shorter.
 EASY = 5
@@ -416,9 +412,7 @@ def _rule(problem: Any, control: Any) -> Any:
     return control
 
 
-# A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc. The
-# guess is a cubic between two knots, which misses a circular arc that turns by 0.2 rad, the default guard, by 7e-5 of
-# its length, and one that turns by 0.8 rad by 0.01.
+# A solution farther from its first guess than this fraction of the segment's length is taken to lie on another arc.
 FURTHEST = 0.5
 # Near the tips of narrow tongues rounding keeps Newton's method from reaching the tolerance. A residual of this many
 # times the tolerance is accepted for a special point.

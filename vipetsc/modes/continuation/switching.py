@@ -37,8 +37,7 @@ FRACTIONS = np.array([1.0, 0.1, 0.01, 0.001])
 # up to 5 s on the paper's branches, and beyond 100 s where the method ends on another branch.
 ASTRAY = 20.0
 # The tolerance for a crossing branch is the one asked for, or this many times the residual of the special point in the
-# map that sees the crossing if that is larger, but ``LOOSEST`` at most. These residuals are 1e-15 to 6e-13, near the
-# tip of a tongue 2e-11. Fourteen crossing branches of the paper's model have 100 points with such tolerances.
+# map that sees the crossing if that is larger, but ``LOOSEST`` at most.
 ROUNDINGS = 10
 LOOSEST = 1e-9
 # A special point with a larger residual is no orbit of the map: an orbit that closes after two periods, for instance,
