@@ -55,10 +55,16 @@ def least_residuals(
     ``bounds`` are the lowest and the highest coordinates (active,). The residuals are evaluated ``steps`` times at
     most. Raises what ``residuals`` and ``jacobian`` raise.
     """
-    known = [] if slopes is None else [slopes]
+    given = slopes
 
     def differentiate(x: np.ndarray) -> np.ndarray:
-        return known.pop() if known else jacobian(x)
+        # SciPy asks for the derivatives at the start first.
+        nonlocal given
+        first = given
+        given = None
+        if first is not None:
+            return first
+        return jacobian(x)
 
     solution = least_squares(
         residuals,

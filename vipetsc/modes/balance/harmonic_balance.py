@@ -308,9 +308,8 @@ class RealUnknowns:
         count = parts.shape[1]
         if not self.cosines:
             count = (count + self.skipped) // 2
-        kept = len(self.orders)
-        sines = parts[:, count:]
-        return np.hstack([_cut(parts[:, :count], kept), _cut(sines, kept - self.skipped)]).ravel()
+        cosines = len(self.orders)
+        return np.hstack([_cut(parts[:, :count], cosines), _cut(parts[:, count:], cosines - self.skipped)]).ravel()
 
     def by_unknowns(self, series: ForceSeries) -> np.ndarray:
         """Return derivative (pair, orders, unknowns of a row) of forces by the unknowns of their own elongations."""
