@@ -96,7 +96,9 @@ class ScipyLattice:
         rows = [stop.row(n) for stop in self.stops]
         # Springs and dashpots are one product, because rates are evaluated some ten thousand times.
         linear = -np.hstack([self.stiffness, self.damping])
-        closed: dict[int, float] = {}
+        # Stops without clearance or loss push whenever they are met: they need no changes, and have any approach.
+        touching = [k for k, stop in enumerate(self.stops) if stop.gap == 0 and stop.restitution == 1]
+        closed: dict[int, float] = dict.fromkeys(touching, 1.0)
         impacts = 0
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
@@ -118,7 +120,9 @@ class ScipyLattice:
         accelerations = np.zeros((len(times), n))
         while t < times[-1]:
             events = []
-            for k, stop in enumerate(self.stops):
+            changing = [k for k in range(len(self.stops)) if k not in touching]
+            for k in changing:
+                stop = self.stops[k]
 
                 def beyond(_: float, y: np.ndarray, k: int = k, stop: Stop = stop) -> float:
                     return float(stop.side * (rows[k] @ y[:n]) - stop.gap)
@@ -135,7 +139,7 @@ class ScipyLattice:
                 # These errors are far below the tolerances of the tests, which then hold for the package alone.
                 rtol=1e-11,
                 atol=1e-15,
-                events=events,
+                events=events or None,
                 # Values are returned at the samples only: a dense output of all steps would cost a fifth more.
                 t_eval=times[times >= t],
                 # SciPy looks for events once a step: a longer step could miss a short contact.
@@ -148,7 +152,7 @@ class ScipyLattice:
 
             # The integration begins anew at each change, where the derivative of the force jumps.
             t, y = self._end_of(solution, times[-1])
-            for k, found in enumerate(solution.t_events):
+            for k, found in zip(changing, solution.t_events or (), strict=True):
                 if found.size and k in closed:
                     del closed[k]
                 elif found.size:
@@ -160,7 +164,7 @@ class ScipyLattice:
     @staticmethod
     def _end_of(solution: Any, last: float) -> tuple[float, np.ndarray]:
         """The time and state at the end of SciPy's ``solution``: at a change of contact, or at the time ``last``."""
-        for times, states in zip(solution.t_events, solution.y_events, strict=True):
+        for times, states in zip(solution.t_events or (), solution.y_events or (), strict=True):
             if len(times):
                 return float(times[-1]), states[-1]
         return last, solution.y[:, -1]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tests.conftest import DIFFERING, with_sections
+from vipetsc.lattice.contact import LAWS
 
 PAIR = {
     "masses": [0.35, 0.11],
@@ -105,6 +106,11 @@ CURVED = {
 ZOO = {
     "bilinear": Kind(),
     "hertz": Kind(HERTZ, exact=False, units=HERTZ_UNITS),
+    "power": Kind(
+        {"contacts": {"law": "power", "exponent": 1.25, "stiffness": 5e7}},
+        exact=False,
+        units={"contacts.stiffness": "N/m^1.25"},
+    ),
     "restitution": Kind({"contacts": {"restitution": 0.6}}, conservative=False),
     "one side": Kind({"contacts": {"side": "plus"}}),
     "rigid": Kind({"contacts": RIGID}),
@@ -255,7 +261,14 @@ ZOO = {
     ),
     "few samples": Kind({"time": {"samples": 61}}),
     "short": Kind(
-        {"lattice": {"cells": 7}, "contacts": {"sites": [5]}, "drive": {"amplitude": 240.0}}, engines=("ts",)
+        {
+            "lattice": {"cells": 7},
+            "contacts": {"sites": [5]},
+            "drive": {"amplitude": 240.0},
+            # This motion is chaotic: rounding would show in a longer one.
+            "time": {"end": 0.05, "samples": 51},
+        },
+        engines=("ts",),
     ),
     "closed at first": Kind(
         {
@@ -300,3 +313,7 @@ ZOO = {
         engines=("ts",),
     ),
 }
+# A law that no lattice above has is in one of its own.
+for law in LAWS:
+    if law not in {kind.table("ts")["contacts"]["law"] for kind in ZOO.values()}:
+        ZOO[f"law {law}"] = Kind({"contacts": {"law": law}}, exact=False, scaled=False)

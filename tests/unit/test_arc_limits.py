@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets
-from tests.reference_flows import FiniteDifferences, Tsrk
+from tests.reference_flows import FiniteDifferences
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
 from vipetsc.modes import flow
@@ -56,11 +56,10 @@ def two_masses(with_stop: bool = True) -> System:
     return System.assemble([1.0, 1.0], springs, stops, [SmoothSpring.between(None, 1, cubic=0.5)])
 
 
-@pytest.mark.parametrize("kind", [Dop853Flow, Tsrk])
-def test_an_arc_in_pieces_has_the_bits_of_the_whole(kind):
+def test_an_arc_in_pieces_has_the_bits_of_the_whole():
     """An arc in which a request is looked at after each step has the end, the changes and the steps of another one."""
     start = np.array([0.5, -0.4, 0.0, 0.0])
-    one = kind(two_masses())
+    one = Dop853Flow(two_masses())
     whole = one.arc(start, 20.0, 6.0)
     assert len(whole.events) > 10
     assert whole.steps > 100
@@ -74,25 +73,12 @@ def test_an_arc_in_pieces_has_the_bits_of_the_whole(kind):
         assert np.array_equal(getattr(parts, name), getattr(whole, name)), name
 
 
-def test_states_in_pieces_have_the_bits_of_the_whole():
-    """Samples of an orbit, each the end of an interval, are the same where each step is a piece of its own."""
-    one = Dop853Flow(two_masses())
-    start = np.array([0.5, -0.4, 0.0, 0.0])
-    whole = one.states(start, 0.7, 12, 6.0)
-    one.between_looks = 1
-    assert np.array_equal(one.states(start, 0.7, 12, 6.0), whole)
-    # Samples are states of the orbit.
-    assert one.arc(start, 8.4, 6.0).end == pytest.approx(whole[-1], abs=1e-7)
-
-
 def make_differences(system: System) -> Flow:
     """Central differences of the compiled flow."""
     return FiniteDifferences(Dop853Flow(system))
 
 
-@pytest.mark.parametrize(
-    ("make", "unknown"), [(Dop853Flow, AMPLITUDE), (make_differences, AMPLITUDE), (Dop853Flow, PERIOD), (Tsrk, PERIOD)]
-)
+@pytest.mark.parametrize(("make", "unknown"), [(Dop853Flow, AMPLITUDE), (make_differences, PERIOD)])
 def test_a_bad_newton_step_ends_the_attempt(make, unknown, monkeypatch):
     """A step of Newton's method to 2,000 times the amplitude or the period fails after few steps of the flow.
 

@@ -62,28 +62,6 @@ def test_bands_have_their_colours_by_name(make):
     assert colours == {f"band {band}": style.band_colour(band) for band in BANDS}
 
 
-@pytest.mark.parametrize("make", [prediction, law])
-def test_curves_of_a_panel_differ_in_grey(make):
-    """Curves of one panel differ in their dashes or marks, hence without colours, too."""
-    with style.rc_style():
-        figure = make()
-    for axes in figure.get_axes():
-        named = [line for line in axes.lines if not line.get_label().startswith("_")]
-        looks = {(line.get_marker(), str(line._dash_pattern)) for line in named}
-        assert len(looks) == len(named) > 1 or axes.get_legend() is None
-
-    # Simulated points have no lines and differ in their marks.
-    points = [line for axes in figure.get_axes() for line in axes.lines if line.get_linestyle() == "None"]
-    of_bands = [line.get_marker() for line in points if line.get_color() != style.BLACK]
-    assert len(set(of_bands)) == len(of_bands)
-
-
-def test_backward_energies_differ_from_forward_ones_in_grey():
-    with style.rc_style():
-        by_band = law().get_axes()[1]
-    assert [line.get_marker() for line in by_band.lines] == ["None", "o"] * len(BANDS)
-
-
 @pytest.mark.parametrize("level", [1.0, 0.2, 1e-3])
 def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
     """Energies as large as the work and as small as the axes show lie below the legends, all along the axes."""
@@ -106,14 +84,6 @@ def test_the_axis_of_transferred_energies_rises(level, onset, least):
         low, high = prediction(level, onset).get_axes()[0].get_ylim()
     assert low == pytest.approx(least)
     assert high > max(level, least)
-
-
-def test_the_amplitude_of_first_contact_is_apart_from_the_frame():
-    """The axis of amplitudes extends beyond its values, so that a line at the first of them is not on the frame."""
-    with style.rc_style():
-        low, high = prediction().get_axes()[0].get_xlim()
-    assert low < 0.99 * X[0]
-    assert high > 1.01 * X[-1]
 
 
 @pytest.mark.parametrize("make", [panels.band_diagram, runs.bands])

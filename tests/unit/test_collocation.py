@@ -10,7 +10,6 @@ from scipy.special import ellipj
 from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.propagator.collocation import (
-    _replace,
     accumulate_moments,
     collocate,
     error_ratio,
@@ -136,23 +135,6 @@ def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
-def test_a_motion_that_overflows_does_not_stop_the_next_substep():
-    """A motion near the largest float, divided by a scale below 1 m, overflows; the next substep converges."""
-    cluster = mass_on_stop()
-    cluster.contacts["scale"] = 1e-4
-    assert not collocate(cluster, cluster.trial, Substep(PLAIN, 1e5 / RATE / cluster.interval))
-    assert collocate(cluster, cluster.trial, Substep(PLAIN, 0.3))
-
-
-def test_a_spring_that_comes_to_rest_has_changed_by_its_elongation_over_the_scale():
-    """A change of 3e-6 m to an elongation of 0 is measured in the scale of the spring, 1e-5 m: it is 0.3."""
-    cluster = mass_on_cubic_spring(1.0)
-    cluster.springs["scale"] = 1e-5
-    cluster.trial.w[0] = 3e-6
-    nothing = np.zeros(NODES)
-    assert _replace(cluster, 0, nothing, nothing, cluster.trial) == pytest.approx(0.3)
-
-
 def test_springs_accelerate_the_sites_next_to_them():
     """w'' at a site is the free motion's second derivative less c u^3/m, for a spring of the elongation u nearby."""
     cubic = mass_on_cubic_spring(2e3)
@@ -171,20 +153,6 @@ def test_springs_accelerate_the_sites_next_to_them():
     np.testing.assert_allclose(motion[0], [0.5, 1e-4 / cubic.interval, expected], rtol=1e-14)
 
 
-def test_damping_takes_the_energy_that_is_booked():
-    """The mass loses, in kinetic energy and energy of the stop, what the cluster books as dissipated."""
-    cluster = mass_on_stop(damping=0.3)
-
-    trial = one_substep(cluster, Substep(PLAIN, 0.3))
-
-    x = trial.taylor[0, 0] - 1
-    v = trial.taylor[0, 1] / cluster.interval
-    lost = 0.5 * MASS * (SPEED**2 - v**2 - (RATE * x) ** 2)
-    assert cluster.energy[0] == pytest.approx(lost, rel=1e-9)
-    # More than 2 % of the initial energy m v^2/2 is lost: the comparison is not one of roundings.
-    assert lost > 1e-2 * MASS * SPEED**2
-
-
 def test_the_error_estimate_falls_as_the_order_says():
     """Half the substep divides the estimate by 2^6 to 2^8.5, and the allowed error grows with the approach."""
     ratios = []
@@ -199,20 +167,6 @@ def test_the_error_estimate_falls_as_the_order_says():
     # 1e-10 * 1.0 + 1e-12 here.
     cluster.contacts["approach"] = 1.0
     assert error_ratio(cluster, cluster.trial, 0.4) == pytest.approx(ratios[1] * 5.1e-11 / 1.01e-10)
-
-
-def test_a_sites_acceleration_is_that_of_the_free_motion_and_of_the_force():
-    """w'' of a site is the free motion's second derivative less omega^2 times the indentation."""
-    cluster = mass_on_stop()
-    interval = cluster.interval
-    indentation = 2e-6
-    taylor = np.array([[1.0 + indentation, 3.0, 20.0]])
-
-    in_units_of_step = taylor * [1.0, interval, interval * interval]
-    evaluate_site_motion(cluster._replace(taylor=taylor), in_units_of_step, cluster.site_motion)
-
-    expected = [1.0 + indentation, 3.0, 2 * 20.0 - RATE**2 * indentation]
-    assert cluster.site_motion[0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_responses_are_added_up_over_all_terms():

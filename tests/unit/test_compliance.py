@@ -56,7 +56,7 @@ def site_rows(chain: Chain) -> np.ndarray:
 
 
 # Chains (cells, sites) of one and two cells, and with contacts at ends, next to each other and far apart.
-FINITE = [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))]
+FINITE = [(1, (0,)), (2, (0, 1)), (12, (0, 2, 3, 11))]
 
 
 @pytest.mark.slow
@@ -123,29 +123,8 @@ def test_self_compliance_is_a_sum_over_bloch_waves():
         assert infinite.at(omega)[0, 0, 0] == pytest.approx(expected, rel=1e-11)
 
 
-@pytest.mark.parametrize("infinite", [False, True])
-def test_the_compliance_is_reciprocal(infinite):
-    """The compliance matrix is symmetric."""
-    compliance = WaveCompliance(chain_of(RICH, 90, (3, 40, 41)), infinite=infinite).at(FREQUENCIES)
-    assert np.abs(compliance - compliance.swapaxes(1, 2)).max() < 1e-12 * np.abs(compliance).max()
-
-
 @pytest.mark.parametrize("name", CELLS)
-@pytest.mark.parametrize(("band", "direction"), [(1, 1), (2, 1), (2, -1)])
-def test_an_incident_wave_leaves_with_its_flux(name, band, direction):
-    """Without forces the flux of an incident wave leaves on the other side; it goes with the amplitude squared."""
-    cell = CELLS[name]
-    compliance = WaveCompliance(chain_of(cell, 30, (7, 12)), infinite=True)
-    wave = compliance.incident(float(bloch(cell, 1.3).frequency[band - 1]), band, direction)
-    assert wave.relative[0] == 1
-    forwards = 0 if direction > 0 else 1
-    # The flux goes with the square of the amplitude, 2.
-    leaving = compliance.outgoing(wave.frequency, [0, 0], wave, 2.0)
-    assert leaving[forwards].sum() == pytest.approx(4 * wave.flux)
-
-
-@pytest.mark.parametrize("name", CELLS)
-@pytest.mark.parametrize(("band", "direction"), [(1, 1), (2, 1), (2, -1)])
+@pytest.mark.parametrize(("band", "direction"), [(1, 1), (2, -1)])
 # The first spring is elastic, the second one takes energy.
 @pytest.mark.parametrize("spring", [3e3, 3e3 * (1 + 0.2j)])
 def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band, direction, spring):
@@ -190,16 +169,6 @@ def test_a_long_lattice_costs_what_a_short_one_does():
     # A wave of this frequency, at 429 cells/s, decays by a factor e within 4300 cells.
     omega = DRIVEN - 0.1j
     assert relative_error(WaveCompliance(long).at(omega), WaveCompliance(long, infinite=True).at(omega)) < 1e-11
-
-
-def test_a_long_ring_has_the_sum_over_its_bloch_waves():
-    """The self-compliance of a ring of n cells is the mean over its n wavenumbers 2 pi j/n."""
-    cell = CELLS["four-band"]
-    cells = 10_007
-    ring = chain_of(cell, cells, (5,), "periodic")
-    expected = bloch_sum(cell, 2 * np.pi * np.arange(cells) / cells, DRIVEN)
-    # Without damping the frequency lies near poles, and differences between it and them lose digits.
-    assert WaveCompliance(ring).at(DRIVEN)[0, 0, 0] == pytest.approx(expected, rel=1e-7)
 
 
 def test_an_infinite_lattice_is_at_rest_beyond_static_forces():

@@ -11,154 +11,15 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 
-from tests.assembly import assembled_stiffness
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError, Model
-from vipetsc.contact.law import CLOSED
+from vipetsc.case import CaseError
 from vipetsc.dynamics import energies, run
-from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy
+from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, EnergyMeter, add_energy
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_scalars
-from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.io.store import RunMemory
-
-CELLS = 7
-# Counted from 1.
-DRIVEN_CELL = 3
-CONTACT_CELLS = (3, 7)
-
-
-def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
-    """Return the energies of one state."""
-    meter = EnergyMeter(model, layout, create_record(model, layout))
-    with state.localForm() as local:
-        work = local.array[meter.lattice.shape.work]
-        return meter.total(meter.sums(local.array)[None], np.array([work]))
-
-
-class ClosedContact:
-    """A Runge-Kutta engine at one instant, in a random state whose first contact is closed and second one free."""
-
-    # The clearance in m and the approach velocity in m/s: at w = 3e-5 m the indentation is 2e-5 m.
-    clearance = 1e-5
-    approach = 0.02
-    work = 0.25
-    losses = (0.5, 0.125)
-
-    def __init__(self, ends: str) -> None:
-        self.case: Case = small_case(
-            lattice={"cells": CELLS, "ends": ends},
-            contacts={"law": "hertz", "sites": list(CONTACT_CELLS), "clearance": 1e-5, "restitution": 0.7},
-            drive={"cell": DRIVEN_CELL, "mass": 2},
-        )
-        self.model = self.case.model()
-        self.chain = self.model.chain
-        self.pair = [self.chain.cell.host, self.chain.cell.resonator]
-        self.time = 0.3 * self.model.drive.duration
-
-        rng = np.random.default_rng(5)
-        self.u = 1e-5 * rng.normal(size=(CELLS, self.chain.cell.dofs))
-        self.v = 1e-2 * rng.normal(size=(CELLS, self.chain.cell.dofs))
-        self.u[CONTACT_CELLS[0] - 1, self.pair] = -2e-5, 1e-5
-        self.u[CONTACT_CELLS[1] - 1, self.pair] = 1e-6, 2e-6
-
-        self.layout = Layout(self.model, MPI.COMM_SELF)
-        self.engine = Integrator(self.model, self.layout)
-        sites = self.engine.lattice.contacts
-        sites["mode"][0] = CLOSED
-        sites["clearance"][0] = self.clearance
-        sites["approach"][0] = self.approach
-        ledger = [self.work, *self.losses]
-        self.engine.state.array[:] = np.concatenate([self.u.T.ravel(), self.v.T.ravel(), ledger])
-        # On a ring the rank is its own neighbour.
-        self.engine.state.ghostUpdate()
-
-    def contact_force(self, dissipates: bool = True) -> float:
-        """Return the force of the closed contact in N, or its elastic part."""
-        site = CONTACT_CELLS[0] - 1
-        w = float(np.diff(self.u[site, self.pair])[0])
-        rate = float(np.diff(self.v[site, self.pair])[0])
-        if dissipates:
-            return float(self.model.contact.force(w, self.clearance, rate, self.approach))
-        return float(self.model.contact.force(w, self.clearance))
-
-    def accelerations(self) -> np.ndarray:
-        """Return accelerations (cell, dof) in m/s^2 by springs, the drive and the closed contact."""
-        force = -(assembled_stiffness(self.chain) @ self.u.ravel()).reshape(self.u.shape)
-        force[DRIVEN_CELL - 1, 1] += float(self.model.drive.force(self.time))
-        site = CONTACT_CELLS[0] - 1
-        force[site, self.pair[0]] += self.contact_force()
-        force[site, self.pair[1]] -= self.contact_force()
-        return force / np.array(self.chain.cell.masses)
-
-
-@pytest.fixture(params=["fixed", "free", "periodic"])
-def lattice(request):
-    lattice = ClosedContact(request.param)
-    yield lattice
-    lattice.engine.destroy()
-
-
-def test_rates_are_those_of_the_equations(lattice):
-    """The rates are velocities, M^-1 (-K u + drive + contact force), the drive's power and the dissipated power."""
-    rates = lattice.engine.state.duplicate()
-    lattice.engine.ts.computeRHSFunction(lattice.time, lattice.engine.state, rates)
-    half = CELLS * lattice.chain.cell.dofs
-    velocities, accelerations, ledger = np.split(rates.array, [half, 2 * half])
-
-    expected = lattice.accelerations()
-    np.testing.assert_array_equal(velocities, lattice.v.T.ravel())
-    np.testing.assert_allclose(accelerations, expected.T.ravel(), atol=1e-13 * np.abs(expected).max())
-
-    drive = float(lattice.model.drive.force(lattice.time))
-    rate = float(np.diff(lattice.v[CONTACT_CELLS[0] - 1, lattice.pair])[0])
-    lost = (lattice.contact_force() - lattice.contact_force(dissipates=False)) * rate
-    assert ledger == pytest.approx([drive * lattice.v[DRIVEN_CELL - 1, 1], lost, 0.0])
-
-
-def test_the_motion_of_sites_is_that_of_the_equations(lattice):
-    """The motion (w, w', w'') of the sites has the accelerations of the equations."""
-    motion = np.empty((2, 3))
-    lattice.engine.observe(motion, lattice.time)
-    for row, cell in zip(motion, CONTACT_CELLS, strict=True):
-        fields = (lattice.u, lattice.v, lattice.accelerations())
-        expected = [np.diff(field[cell - 1, lattice.pair])[0] for field in fields]
-        np.testing.assert_allclose(row, expected, rtol=1e-12)
-
-
-def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
-    """Energies are m v^2/2, u^T K u/2 and that of the contact; work and losses are those of the ledger."""
-    energies = energies_of(lattice.model, lattice.layout, lattice.engine.state)
-    u = lattice.u.ravel()
-    kinetic = 0.5 * np.sum(np.array(lattice.chain.cell.masses) * lattice.v**2)
-    contact = float(lattice.model.contact.potential(3e-5, lattice.clearance))
-    assert energies.kinetic == pytest.approx(kinetic, rel=1e-12)
-    assert energies.spring == pytest.approx(0.5 * u @ assembled_stiffness(lattice.chain) @ u, rel=1e-12)
-    # Energies are summed in whole units, and the contact's energy is a small number of them.
-    assert energies.contact == pytest.approx(contact, rel=1e-10)
-    assert energies.work[0] == lattice.work
-    assert energies.dissipated[0] == sum(lattice.losses)
-
-
-def test_energies_below_the_unit_of_the_sums_add_up():
-    """Energies of 0.4 units a cell are not rounded to zero one by one: their sum is exact."""
-    model = small_case().model()
-    layout = Layout(model, MPI.COMM_SELF)
-    unit = EnergyMeter(model, layout, create_record(model, layout)).unit
-    state = layout.create_vector()
-    first = layout.dofs * layout.owned
-    state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * unit / model.chain.cell.masses[0])
-    assert energies_of(model, layout, state).kinetic == pytest.approx(0.4 * unit * layout.owned, rel=1e-10)
-
-
-def test_energies_beyond_all_scales_saturate_the_sums():
-    """Energies that are NaN or beyond the largest count as ``LARGEST`` in the sum."""
-    sums = np.zeros((ENERGY_SUMS, 2), np.int64)
-    for energy in (np.nan, np.inf, 1e300):
-        add_energy(sums, energy, 1.0)
-    assert sums[1].tolist() == [3 * int(LARGEST), 0]
 
 
 def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
@@ -177,8 +38,8 @@ def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
     assert sums[1, 0] >= LARGEST
 
 
-@pytest.mark.parametrize("size", [1, 31, 77, 640])
-@pytest.mark.parametrize("count", [1, 4, 7, 13])
+@pytest.mark.parametrize("size", [1, 77])
+@pytest.mark.parametrize("count", [1, 7, 13])
 def test_stages_are_added_as_petsc_adds_them(size, count):
     """The compiled sum of stages has the bits of PETSc's VecMAXPY, for any number of stages and any size."""
     rng = np.random.default_rng(size + count)

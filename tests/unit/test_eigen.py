@@ -69,14 +69,6 @@ def test_the_first_direct_solver_that_petsc_has_is_taken(monkeypatch, ranks, pac
     assert transformation.solver == solver
 
 
-def test_several_ranks_without_a_direct_solver_for_them_factor_the_whole_matrix_each(monkeypatch):
-    pretend_packages(monkeypatch, {"superlu"})
-    transformation = RecordingTransformation(ranks=2)
-    eigen._solve_directly(transformation)
-    assert transformation.type == "redundant"
-    assert transformation.solver == ""
-
-
 def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch):
     # An entry None in sys.modules makes the import fail.
     monkeypatch.setitem(sys.modules, "slepc4py", None)
@@ -116,63 +108,6 @@ def test_both_copies_of_a_mode_of_a_ring_are_found():
     # The two modes are different motions.
     overlap = np.sum(modes.shapes[1] * modes.shapes[2])
     assert abs(overlap) < 1e-8
-    matrices.destroy()
-
-
-def record_searches(monkeypatch) -> list[int]:
-    """Return a list that receives the number of modes that each search from now on is asked for."""
-    slepc = load_slepc()
-    wanted: list[int] = []
-
-    class RecordingSolver(slepc.EPS):
-        def solve(self) -> None:
-            wanted.append(self.getDimensions()[0])
-            super().solve()
-
-    monkeypatch.setattr(eigen, "load_slepc", lambda: SimpleNamespace(EPS=RecordingSolver))
-    return wanted
-
-
-def test_further_copies_are_sought_one_at_a_time_until_none_is_nearer(monkeypatch):
-    """Copies of the modes found are searched for one at a time until a search finds none that is nearer."""
-    wanted = record_searches(monkeypatch)
-    matrices = matrices_of("periodic")
-    modes_near(matrices, 3, 0.0)
-    assert wanted[0] == 3
-    assert set(wanted[1:]) == {1}
-    # No further mode of the ring is as near as the three lowest: one search finds a farther one, and none follows.
-    assert len(wanted) == 2
-    matrices.destroy()
-
-
-def test_no_copies_are_sought_where_all_modes_were_found(monkeypatch):
-    wanted = record_searches(monkeypatch)
-    matrices = matrices_of("fixed", 4)
-    modes_near(matrices, matrices.rows, 1.0)
-    assert wanted == [matrices.rows]
-    matrices.destroy()
-
-
-def test_all_modes_of_a_lattice_may_be_asked_for():
-    matrices = matrices_of("fixed", 4)
-    modes = modes_near(matrices, matrices.rows, 1.0)
-    assert len(modes.frequency) == matrices.rows
-    assert np.all(np.diff(modes.frequency) > 0)
-    assert modes.residual.max() < 1e-9
-    matrices.destroy()
-
-
-def test_modes_keep_their_digits_beside_one_that_was_hit_exactly(monkeypatch):
-    """Modes keep small residuals where the shift is the frequency of one of them.
-
-    The iterated eigenvalue 1/(omega^2 - shift) of that mode exceeds all others by many orders.
-    """
-    # PETSc's own solver loses more digits than the other ones.
-    monkeypatch.setattr(eigen, "ON_ONE_RANK", ("petsc",))
-    matrices = matrices_of("fixed", 4)
-    hit = modes_near(matrices, matrices.rows, 1.0).frequency[3]
-    modes = modes_near(matrices, matrices.rows, hit)
-    assert modes.residual.max() < 1e-9
     matrices.destroy()
 
 

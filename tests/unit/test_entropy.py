@@ -101,15 +101,6 @@ def test_fewer_cells_have_the_entropy_that_they_have_among_all(stride):
         assert getattr(thinned, name) == pytest.approx(getattr(whole, name), rel=1e-3)
 
 
-@pytest.mark.parametrize("stride", [2, 3])
-def test_long_waves_keep_their_weight_at_fewer_cells(stride):
-    """A wave of 63 cells has the same weight at every second or third cell as at all."""
-    signal = packet(300.0, kappa=0.1)[None]
-    _, whole_weight = local_entropy(signal)
-    _, weight = local_entropy(signal, stride)
-    assert weight == pytest.approx(whole_weight[:, ::stride], rel=1e-6, abs=1e-9 * whole_weight.max())
-
-
 def test_the_mask_is_relative_to_the_largest_weight_of_all_snapshots():
     """The threshold of the mask is 1 % of the largest weight of all snapshots, also of those left out of averages."""
     # The loudest snapshot is not among every second one.
@@ -120,16 +111,6 @@ def test_the_mask_is_relative_to_the_largest_weight_of_all_snapshots():
     expected = local[::2][above_threshold].mean()
     assert entropy(signal, every=2).masked == pytest.approx(expected, rel=1e-12)
     assert entropy(signal[::2]).masked != pytest.approx(expected, rel=1e-3)
-
-
-def test_one_long_transform_gives_the_same_packet():
-    """The padding of every octave is enough: one long transform for all nodes changes nothing."""
-    signal = packet(300.0)
-    local, weight = local_entropy(signal[None])
-    power = np.abs(transform(signal, KAPPA, KC, 6000)[:, :600]) ** 2
-    is_loud = weight[0] > 1e-4 * weight.max()
-    assert np.abs(local[0] - bits(power))[is_loud].max() < 1e-6
-    assert weight[0] == pytest.approx(power.sum(axis=0), rel=1e-6, abs=1e-12)
 
 
 @settings(max_examples=15)
@@ -143,36 +124,6 @@ def test_a_power_of_two_leaves_the_bits_of_the_entropy(seed, power):
     assert np.array_equal(np.ldexp(plain.weight, 2 * power), scaled.weight)
     for name in (*AVERAGES, "error"):
         assert getattr(plain, name) == getattr(scaled, name)
-
-
-@settings(max_examples=15)
-@given(st.integers(0, 99), st.floats(1e-9, 1e9))
-def test_the_entropy_does_not_depend_on_the_amplitude(seed, factor):
-    signal = noise((3, 40), seed)
-    plain = entropy(signal)
-    scaled = entropy(factor * signal)
-    for name in (*AVERAGES, "error"):
-        assert getattr(plain, name) == pytest.approx(getattr(scaled, name), abs=1e-11)
-
-
-def test_the_entropy_moves_with_the_field():
-    """The local entropy of a shifted packet is shifted with it."""
-    local, weight = local_entropy(packet(250.0)[None])
-    moved_local, moved_weight = local_entropy(packet(310.0)[None])
-    # The packet has moved by sixty cells.
-    assert moved_local[0, 250:371] == pytest.approx(local[0, 190:311], abs=1e-8)
-    assert moved_weight[0, 250:371] == pytest.approx(weight[0, 190:311], rel=1e-8)
-
-
-def test_snapshots_do_not_see_each_other():
-    """The local entropy of a snapshot has the same bits with and without earlier snapshots."""
-    signal = scattering_run()
-    local, weight = local_entropy(signal)
-    # Snapshots are transformed in chunks: the first one has various places in a chunk here.
-    for first in (1, 4, 7, 11):
-        late_local, late_weight = local_entropy(signal[first:])
-        assert np.array_equal(local[first:], late_local)
-        assert np.array_equal(weight[first:], late_weight)
 
 
 def test_averages_are_those_of_their_definitions():
@@ -204,21 +155,6 @@ def test_averages_are_those_of_their_definitions():
     assert found.joint == pytest.approx(np.mean(joint), abs=1e-6)
 
 
-def test_the_mask_leaves_out_where_the_run_grows_quiet():
-    """Snapshots with 1e-4 of the weight do not change the masked average."""
-    signal = scattering_run()
-    signal[8:] *= 0.01
-    assert entropy(signal).masked == pytest.approx(entropy(signal[:8]).masked)
-
-
-def test_scattering_raises_every_average():
-    """Two packets of different wavenumbers have a larger entropy than one, in every average."""
-    before = entropy(packet(200.0)[None])
-    after = entropy((packet(200.0) + packet(220.0, kappa=1.1))[None])
-    for name in AVERAGES:
-        assert getattr(after, name) > getattr(before, name) + 0.1
-
-
 @pytest.mark.parametrize(("strong", "counted"), [(31, False), (5, True)])
 def test_the_mask_heeds_samples_between_the_snapshots_after_the_start(strong, counted):
     """A sample with a hundred times the motion masks all snapshots though it is none, if it is not before the start."""
@@ -240,12 +176,3 @@ def test_a_snapshot_at_rest_has_no_entropy():
     found = entropy(signal)
     assert found.snapshot[2] == 0
     assert np.all(np.delete(found.snapshot, 2) > 0)
-
-
-def test_requests_that_cannot_be_met_are_named():
-    signal = noise((3, 20))
-    with pytest.raises(ValueError, match="start"):
-        entropy(signal, 3)
-    signal[1, 4] = np.nan
-    with pytest.raises(ValueError, match="not finite in samples 0 to 2"):
-        entropy(signal)

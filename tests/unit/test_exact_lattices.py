@@ -9,7 +9,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import small_case
 from tests.exact_lattices import exponential, unlike_lattice
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
@@ -17,7 +16,6 @@ from vipetsc.dynamics.propagator.clusters import apply_impulses, create_dof_tabl
 from vipetsc.dynamics.propagator.groups import group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.taylor import evaluate
 from vipetsc.lattice.chain import Pair
 
@@ -32,11 +30,8 @@ LATTICES = pytest.mark.parametrize(
         ("periodic", "all", True),
         ("periodic", "some", False),
         ("free", "some", True),
-        ("fixed", "some", False),
         ("fixed", "none", True),
-        ("fixed", "none", False),
         ("free", "none", False),
-        ("periodic", "none", False),
     ],
 )
 
@@ -161,11 +156,3 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
         expected = forms[members].reshape(-1, d * n) @ exact[: d * n] * series.interval
         found = response[members, i - groups.first[cluster]] @ powers
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
-
-
-def test_lattices_that_differ_in_contacts_have_one_series():
-    few = small_case(contacts={"sites": [5], "clearance": 1e-3}).model()
-    many = small_case(contacts={"sites": [5, 9]}).model()
-    longer = small_case(lattice={"cells": 25}).model()
-    assert step_series(few) is step_series(many)
-    assert step_series(few) is not step_series(longer)

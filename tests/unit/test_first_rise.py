@@ -50,7 +50,7 @@ def starting_gap(mantissas: tuple[float, ...], exponents: tuple[float, ...], sta
 @example((0.0, 0.0, 0.5, -1.0, 0.0, 1.0), (0.0, 0.0, -3.0, -2.25, 0.0, -1.0), "below")
 # The slope falls through zero in the quarter in which it also rises from zero.
 @example((-8e-75, 0.0, 2e-190, 1.0, 0.0, -1.0), (0.0, 0.0, 0.0, -2.0, 0.0, -1.0), "below")
-@settings(max_examples=400)
+@settings(max_examples=150)
 def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
     """No sampled gap above the interpolant's error is missed, and none comes before the change that is found."""
     coefficients = starting_gap(mantissas, exponents, start)
@@ -74,11 +74,6 @@ def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
         near = np.abs(sampled - position) <= flow.DECIDED
         assert gap[near].min(initial=0.0) <= ROUNDING + margin
         assert gap[near].max(initial=0.0) >= -ROUNDING - margin
-
-
-def test_a_hump_next_to_a_dip_in_one_quarter_of_a_step_is_found():
-    """The gap of a contact that has just opened rises through zero and falls again in the first fifth of a step."""
-    assert 0 < first_rise((0.0, -4.6e-4, 5.0e-2, -0.31, 2.2e-4, 1.4e-3)) < 0.02
 
 
 def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.frequency_energy import frequency_energy, portraits, slope
+from vipetsc.figures.frequency_energy import frequency_energy, portraits
 
 POINTS = 40
 GRAZING = 8
@@ -73,30 +73,6 @@ def test_the_inset_shows_a_tenth_of_the_frequency_beyond_grazing(rise):
     last = shown[-1] / 100.0
     tenth = 1.1 if rise > 0 else 1 / 1.1
     assert last == pytest.approx(tenth, rel=0.015)
-
-
-@pytest.mark.parametrize("change", [0.05, -0.05])
-def test_the_inset_of_a_branch_that_changes_little_shows_its_beginning(change):
-    """Where the frequency is nowhere a tenth off that at grazing, the inset would show all that the panel shows."""
-    branch = branch_of(100.0 * (1 + change * np.maximum(PLACE - PLACE[GRAZING], 0.0) ** 0.5))
-    (inset,) = drawn(branch).child_axes
-    assert inset.lines[0].get_xdata()[-1] < 100.0 ** PLACE[POINTS // 2]
-
-
-def test_a_branch_of_one_frequency_says_so_in_its_panel_of_slopes():
-    branch = branch_of(np.full(POINTS, 100.0), grazing=POINTS).assign(slope=("point", np.zeros(POINTS)))
-    axes = Figure().subplots()
-    axes.set(xscale="log", xlim=(1.0, 100.0))
-    slope(axes, branch)
-    axes.figure.draw_without_rendering()
-    assert [text.get_text() for text in axes.texts] == ["the frequency does not change with the energy"]
-    assert axes.get_xscale() == "log"
-
-
-def test_the_legend_is_beside_a_branch_that_falls():
-    branch = branch_of(100.0 - 50.0 * PLACE, grazing=POINTS)
-    axes = drawn(branch)
-    assert points_within(axes, branch, axes.get_legend().get_window_extent()) == 0
 
 
 def test_an_orbit_is_in_the_region_of_its_own_point():

@@ -74,44 +74,6 @@ def test_cells_beyond_fixed_ends_are_reference_cells():
     assert np.array_equal(found, np.vstack([reference, fixed.variation.stiffness, reference]))
 
 
-def test_cells_that_differ_from_the_reference_are_marked():
-    masses = np.tile(four_band().masses, (CELLS, 1))
-    masses[4, 2] *= 1.1
-    chain = Chain(four_band(), CELLS, "fixed", variation=Variation(masses))
-    assert chain.differs.tolist() == [False] * 4 + [True, False]
-    assert chain.is_uniform(-3, 4)
-    assert chain.is_uniform(5, 12)
-    assert not chain.is_uniform(4, 5)
-    # On a ring, cells -3 to -1 include the one that differs.
-    ring = Chain(four_band(), CELLS, "periodic", variation=Variation(masses))
-    assert not ring.is_uniform(-3, 0)
-
-
-def test_a_chain_is_damped_by_a_dashpot_anywhere():
-    """A chain with one dashpot to the ground is damped; one with dashpots of zero is not."""
-    grounding = np.zeros((CELLS, 4))
-    grounding[3, 1] = 0.1
-    assert Chain(four_band(), CELLS, variation=Variation(grounding=grounding)).is_damped
-    assert not Chain(four_band(), CELLS, variation=Variation(grounding=0 * grounding)).is_damped
-
-
-def test_variations_are_equal_by_what_they_hold():
-    chain = scattered_chain()
-    same = scattered_chain()
-    assert chain == same
-    assert hash(chain) == hash(same)
-    assert chain != scattered_chain(seed=2)
-
-
-def test_a_variation_is_read_only_and_of_all_cells():
-    """The arrays of a variation cannot be written and must have the number of cells of the chain."""
-    chain = scattered_chain()
-    with pytest.raises(ValueError, match="read-only"):
-        chain.variation.masses[0, 0] = 1.0
-    with pytest.raises(ValueError, match="shape"):
-        replace(chain, cells=5)
-
-
 def damped_table(lattice: dict[str, Any] | None = None, **cell: Any) -> dict[str, Any]:
     """Return the table of a case with dashpots of each kind; ``lattice`` and ``cell`` update it."""
     damped_cell = {

@@ -7,7 +7,6 @@ import pytest
 
 from tests.unit.propagator_parts import pressed_mass
 from vipetsc.contact.law import CLOSED
-from vipetsc.contact.search import MOST_ATTEMPTS
 from vipetsc.dynamics.propagator import advance
 from vipetsc.dynamics.propagator.advance import CUT, SHORTEST, _first_kink
 from vipetsc.dynamics.propagator.nodes import EXIT
@@ -96,13 +95,6 @@ def test_a_substep_is_repeated_until_no_kink_is_inside(monkeypatch):
     assert (loop.state.rejected, loop.state.length) == (3, 9.0)
 
 
-def test_a_substep_without_a_kink_is_not_repeated(monkeypatch):
-    loop = SubstepsOnKinks(monkeypatch, [])
-    assert loop.end(0.4) == Substep(EXIT, 0.4)
-    assert loop.lengths == []
-    assert loop.state.missed == 0
-
-
 @pytest.mark.parametrize(("factor", "is_cut"), [(0.99, False), (1.01, True)])
 def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut):
     """A substep is cut at a kink only if its length stays above the shortest one."""
@@ -110,15 +102,6 @@ def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut
     loop = SubstepsOnKinks(monkeypatch, [fraction])
     expected = fraction * 0.4 if is_cut else 0.4
     assert loop.end(0.4) == Substep(EXIT, expected)
-
-
-def test_repetitions_end_although_each_substep_has_a_kink(monkeypatch):
-    """A substep is repeated at most MOST_ATTEMPTS times; that a kink is left inside is counted."""
-    # Rounding could keep a kink just inside of every substep.
-    loop = SubstepsOnKinks(monkeypatch, [0.9] * (MOST_ATTEMPTS + 5))
-    assert loop.end(0.4).length == pytest.approx(0.4 * 0.9**MOST_ATTEMPTS)
-    assert len(loop.lengths) == MOST_ATTEMPTS
-    assert loop.state.missed == 1
 
 
 def test_a_substep_that_cannot_be_repeated_is_rejected_and_the_next_one_is_shorter(monkeypatch):

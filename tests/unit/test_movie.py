@@ -1,17 +1,15 @@
 """Movies: contents of frames, data read for them, files that are whole or absent, and input that is refused."""
 
-import h5py
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.unit.test_figures import INTERVAL, SAMPLES, SHAPES, write_run
+from tests.unit.test_figures import write_run
 from vipetsc.cli.main import main
 from vipetsc.figures import movie
 from vipetsc.figures.movie_frames import FADE, Shot, movie_frames
 from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import field_time, open_run
+from vipetsc.io.read import open_run
 from vipetsc.lattice import Chain, bloch, four_band
 from vipetsc.spectra import band_envelopes, wave_energies
 from vipetsc.studies.reanalysis import measure_run
@@ -114,104 +112,6 @@ def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
     assert content.sites.tolist() == [8, 16]
 
 
-@pytest.mark.slow
-def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(tmp_path):
-    """Frames of a record without displacements show the kinetic energy with the masses of each cell.
-
-    The bands are those of the mean cell of the cells that are shown.
-    """
-    write_run(tmp_path / "run.h5")
-    with h5py.File(tmp_path / "run.h5", "a") as file:
-        profiles = (
-            '"masses[1]" = { first = 0.005, last = 0.01 }',
-            '"springs[1].stiffness" = { cells = [10], factor = 3.0 }',
-        )
-        file.attrs["case"] = "\n".join([file.attrs["case"], "[lattice.profiles]", *profiles])
-        file["displacement"][...] = 0.0
-        velocity = file["velocity"][...]
-    masses = np.tile(CELL.masses, (24, 1))
-    masses[:, 0] = np.linspace(0.005, 0.01, 24)
-
-    with open_run(tmp_path / "run.h5") as run:
-        content = movie_frames(run, None, Shot(speed=0.016, rate=3.0))
-        part = movie_frames(run, None, Shot(speed=0.016, rate=3.0, cells=(11, 24)))
-        velocities = movie_frames(run, None, Shot("velocity", speed=0.016, rate=3.0))
-
-    rows = np.rint(content.time / INTERVAL).astype(int)
-    kinetic = 0.5 * (masses * velocity[rows] ** 2).sum(axis=(1, 2))
-    assert content.waves.sum(axis=(1, 2)) == pytest.approx(kinetic, rel=1e-12)
-    # At first a part of the wave is beyond the end of the lattice.
-    assert content.wave.sum(axis=(1, 2))[3:] == pytest.approx(kinetic[3:], rel=0.05)
-    assert np.array_equal(velocities.wave[:, 0], velocity[rows, :, CELL.host])
-
-    # A movie has the mean cell of the cells that it shows.
-    assert content.cell.masses == pytest.approx((0.0075, *CELL.masses[1:]))
-    assert part.cell.masses[0] == pytest.approx(masses[10:, 0].mean())
-    stiffness = CELL.springs[0].stiffness
-    # One cell of 24 has three times the stiffness; it is not among the cells 11 to 24.
-    assert content.cell.springs[0].stiffness == pytest.approx((1 + 2 / 24) * stiffness)
-    assert part.cell.springs[0].stiffness == pytest.approx(stiffness)
-
-
-def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monkeypatch):
-    """Nine frames of ten cells show the samples nearest in time and read nine rows of ten cells from the file."""
-    read = {}
-    original = h5py.Dataset.__getitem__
-
-    def counted(self, *key, **options):
-        values = original(self, *key, **options)
-        read[self.name] = read.get(self.name, 0) + np.size(values)
-        return values
-
-    with h5py.File(folder / "run.h5") as file:
-        time = file["time"][...]
-        velocity = file["velocity"][...]
-
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
-    # Eight frames a second, which is 20.8 ms of the run, are 2.6 ms apart.
-    shot = Shot("velocity", start=0.01, stop=0.0308, speed=0.0208, rate=8.0, cells=(5, 14))
-    content = movie_frames(*opened, shot)
-
-    assert content.time == pytest.approx(0.01 + np.arange(9) * 0.0026)
-    rows = np.abs(time - content.time[:, None]).argmin(axis=1)
-    assert np.array_equal(content.wave[:, 0], velocity[rows, 4:14, CELL.host])
-    assert read["/velocity"] == 9 * 10 * CELL.dofs
-    assert read["/displacement"] == 9 * 10 * CELL.dofs
-    assert content.cells.tolist() == list(range(5, 15))
-
-
-@pytest.mark.slow
-def test_a_gif_holds_every_frame_for_its_time(clear, stage):
-    """A GIF has the frames of the stage, within the colours that it can hold, and lasts as long as they do."""
-    count = len(stage.content.time)
-    assert count == int((SAMPLES - 1) * INTERVAL / 0.016 * 3) + 1
-
-    (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.gif"])
-    assert [p.name for p in path.parent.iterdir()] == ["movie.gif"]
-
-    with Image.open(path) as image:
-        assert image.n_frames == count
-        assert image.size == (320, 180)
-        lasts = 0
-        for k in range(count):
-            image.seek(k)
-            lasts += image.info["duration"]
-            frame = np.asarray(image.convert("RGB"), int)
-            # A frame of a GIF has 256 colours: the mean deviation is below one step of 256.
-            assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k
-    # Durations are in ms, and a GIF counts in units of 10 ms.
-    assert lasts == round(1000 * count / 3, -1)
-
-
-def test_frames_have_even_sides(opened):
-    """An MP4 has one colour for two by two pixels, and ffmpeg refuses odd sides."""
-    run, analysis = opened
-    content = movie_frames(run, analysis, Shot(speed=0.016, rate=3.0))
-    with rc_style():
-        frame = movie.MovieFigure(run, content, width=341).frame(0)
-    assert frame.shape[:2] == (192, 342)
-
-
 def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
     """ffmpeg receives every frame; if it fails, its message is raised and the old movie stays."""
     # A script in place of ffmpeg copies its input into the file that its last argument names.
@@ -285,20 +185,3 @@ def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsy
     message = capsys.readouterr().err.splitlines()[-1]
     assert words.split()[-2] in message or words.split()[0] in message
     assert sorted(clear.rglob("*")) == before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
-def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
-    """Runs without sites, with a window behind the sites, of every third sample or of one cell have moving frames."""
-    write_run(tmp_path / "run.h5", SHAPES[shape])
-    shot = Shot("velocity", rate=0.3, width=320)
-
-    with rc_style(), open_run(tmp_path / "run.h5") as run:
-        stage = movie.MovieFigure(run, movie_frames(run, None, shot), shot.width)
-        assert field_time(run)[-1] >= stage.content.time[-1]
-        assert np.ptp(stage.frame(1)) > 0
-        # A record of one cell has no wavenumbers, hence no energies of bands.
-        if shape == "single cell":
-            with pytest.raises(ValueError, match="contiguous cells"):
-                movie_frames(run, None, Shot())

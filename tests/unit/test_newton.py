@@ -1,7 +1,5 @@
 """PETSc's Newton method: exceptions of the equations reach the caller, and the solver can be used afterwards."""
 
-from petsc4py import PETSc
-
 import numpy as np
 import pytest
 
@@ -70,35 +68,12 @@ def test_leaving_the_domain_is_an_attempt_that_failed():
             assert meets_the_circle(newton)
 
 
-@pytest.mark.parametrize("asked", ["", "l2"])
-def test_there_is_no_line_search_that_no_option_asks_for(asked, petsc_options, tmp_path):
-    """Steps are not searched along unless an option asks for it, and the solver leaves no option of its own behind."""
-    if asked:
-        petsc_options(nnm_snes_linesearch_type=asked)
-    newton = DenseNewton(2, 20)
-    assert meets_the_circle(newton)
-    assert PETSc.Options().getAll().get("nnm_snes_linesearch_type", "") == asked
-
-    viewer = PETSc.Viewer().createASCII(str(tmp_path / "solver"))
-    newton._snes.view(viewer)
-    viewer.destroy()
-    assert f"type: {asked or 'basic'}" in (tmp_path / "solver").read_text()
-
-
 def test_an_error_that_petsc_makes_of_it_does_not_hide_it(petsc_options):
     """An exception of the equations is raised, not the PETSc error that follows from it."""
     petsc_options(nnm_snes_error_if_not_converged=True)
     newton = DenseNewton(2, 20)
     with pytest.raises(ZeroDivisionError):
         newton.solve(Circle({"residual": 1}, ZeroDivisionError("no such orbit")), GUESS, ROW, 0.0, 1e-12)
-
-
-def test_errors_of_petsc_itself_pass(petsc_options):
-    """An error of PETSc that no exception of the equations has caused is raised."""
-    petsc_options(nnm_snes_error_if_not_converged=True)
-    newton = DenseNewton(2, 1)
-    with pytest.raises(PETSc.Error):
-        newton.solve(Circle(), GUESS, ROW, 0.0, 1e-12)
 
 
 @pytest.mark.parametrize("residual", [np.nan, np.inf])

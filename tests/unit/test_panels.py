@@ -1,20 +1,15 @@
 """Panels that several figures use show their data at their coordinates, with marks, bands, gaps and regions."""
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
-from vipetsc.figures.identified import DETERMINED, _draw_profile, growing_windows
 from vipetsc.figures.nfrc import lag_of
-from vipetsc.figures.spring_line import draw_spring
-from vipetsc.identification import uncertainty
 from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
 TIME = np.linspace(0.0, 0.3, 4)
@@ -73,22 +68,6 @@ def test_a_map_of_a_long_lattice_shows_the_cells_that_have_moved(first, last, sh
 
     assert part["cell"].values.tolist() == [cell + 1 for cell in shown]
     assert part.shape[0] == len(TIME)
-
-
-def test_a_lattice_at_rest_is_shown_whole():
-    field = xr.DataArray(np.zeros((2, 30)), {"time": [0.0, 1.0], "cell": np.arange(30)}, ("time", "cell"))
-    assert panels.moved_cells(field, panels.log_norm(field)).sizes["cell"] == 30
-
-
-def test_colours_follow_the_data(axes):
-    """The scale of colours ends at the largest value in any unit, and at 1 if no value is positive."""
-    for largest in (1e-9, 2.0, 3e7):
-        norm = panels.log_norm(largest, 0.5 * largest, decades=3)
-        assert norm.vmin == pytest.approx(1e-3 * largest)
-        assert norm.vmax == pytest.approx(largest)
-
-    assert panels.log_norm(0.0).vmax == 1.0
-    assert panels.log_norm(np.nan).vmax == 1.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -178,15 +157,6 @@ def test_gaps_are_shaded_and_pass_bands_are_not(axes):
         assert line.get_ydata().max() == pytest.approx(band.high / 1e3, rel=1e-6)
 
 
-def test_bands_are_shaded_along_either_axis(axes):
-    """A band of 100 to 300 rad/s along x is a span from 0.1 to 0.3 krad/s."""
-    panels.shade_bands(axes, [(100.0, 300.0)], "x")
-
-    ((low, _), (high, _)) = spans(axes)[0]
-    assert low == pytest.approx(0.1)
-    assert high == pytest.approx(0.3)
-
-
 def test_regions_follow_one_another(axes):
     """Each region is shaded from the end of the one before to its own last point, and is named."""
     energy = np.geomspace(1.0, 1e4, 9)
@@ -212,16 +182,6 @@ def test_means_over_blocks_keep_the_mean():
     np.testing.assert_allclose(pooled[-1], values[-1])
 
 
-@pytest.mark.parametrize("begin", [panels.ROUNDING - 180, -panels.ROUNDING])
-def test_rounding_does_not_turn_phases(begin):
-    """Phase and antiphase are 0 and 180 degrees on whichever side of them rounding puts them, as sums of turns may."""
-    exact = np.array([0, 0, 180, 180, 0, 180, 180])
-    rounded = exact + 1e-10 * np.array([1, -1, 1, -1, -1, -1, 1]) + 360 * np.array([0, 1, 0, -1, 0, -1, 0])
-
-    assert panels.continuous_phase(rounded, begin) == pytest.approx(exact, abs=1e-9)
-    assert panels.continuous_phase(rounded[2:], begin) == pytest.approx(exact[2:], abs=1e-9)
-
-
 def test_antiphase_to_the_drive_is_a_lag_of_180_degrees():
     """Without loss the first site is behind the drive by 0 or 180 degrees, whatever the sign of the rounding."""
     harmonics = np.zeros((4, 1, 2))
@@ -233,106 +193,3 @@ def test_antiphase_to_the_drive_is_a_lag_of_180_degrees():
     lag = lag_of(xr.Dataset({"harmonics": (names, harmonics), "harmonics_imaginary": (names, imaginary)}))
 
     assert lag == pytest.approx(np.array([180, 180, 0, 180]), abs=1e-9)
-
-
-def test_a_phase_that_goes_on_turns_without_jumps():
-    """A phase that grows by more than a revolution has no jumps, in whichever revolution its values are given."""
-    exact = np.arange(-100.0, 800.0, 40.0)
-
-    assert panels.continuous_phase(np.mod(exact, 360), begin=-180) == pytest.approx(exact, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("angles", "low", "high"), [((180.0, 180 + 1e-10), 179.5, 180.5), ((-1e-10, 1e-10), -0.5, 0.5), ((0, 3), 0, 3)]
-)
-def test_an_axis_of_a_constant_phase_does_not_show_its_rounding(axes, angles, low, high):
-    """The axis of a phase spans a degree or more, about its values."""
-    axes.margins(y=0)
-    axes.plot(angles)
-
-    panels.mark_degrees(axes)
-
-    assert axes.get_ylim() == pytest.approx((low, high), abs=1e-9)
-    assert not axes.yaxis.get_major_formatter().get_offset()
-
-
-@pytest.mark.parametrize(("value", "label"), [(2e-3, "% from 0.002 m"), (0.0, "from 0 m")])
-def test_the_profile_of_a_parameter_whose_best_value_is_0_is_drawn(value, label):
-    """Percentages of 0 would be infinite; the parabola goes through 1 at one standard error."""
-    places = value + np.array([-1e-3, 0.0, 1e-3])
-    parameter = xr.Dataset(
-        {
-            "value": value,
-            "standard_error": 1e-3,
-            "profile/value": ("place", places),
-            "profile/cost": ("place", [1.0, 0.0, 1.0]),
-        },
-        coords={"parameter": "clearance", "unit": "m"},
-    )
-    axes = Figure().subplots()
-    _draw_profile(axes, parameter)
-    drawn, parabola = axes.lines[:2]
-    assert axes.get_xlabel() == label
-    assert np.isfinite(drawn.get_xdata()).all()
-    assert parabola.get_ydata()[[0, -1]] == pytest.approx([1.0, 1.0])
-    assert parabola.get_xdata()[[0, -1]] == pytest.approx(drawn.get_xdata()[[0, -1]])
-
-
-def test_windows_of_an_identification_have_whole_numbers(monkeypatch):
-    """The axes of fourteen windows have ticks at whole numbers only."""
-    monkeypatch.setattr("vipetsc.figures.identified.IdentifyCase.of", lambda data: SimpleNamespace(parameters=()))
-    number = np.arange(1, 15)
-    identified = xr.Dataset(
-        {
-            "windows/misfit": ("window", 1 + 1 / number),
-            "windows/impacts": ("window", 3 * number),
-            "windows/value": (("window", "parameter"), np.zeros((14, 0))),
-            "starts/valley": ("start", [1]),
-        },
-        coords={"window": number},
-    )
-    misfit, course = growing_windows(identified).axes
-    for axes in (misfit, course):
-        ticks = axes.get_xticks()
-        assert np.array_equal(ticks, np.round(ticks))
-
-
-def test_starts_that_failed_are_counted(monkeypatch):
-    """A start that failed has no deviance, and so no point in its panel: the title says how many there are."""
-    monkeypatch.setattr("vipetsc.figures.identified.IdentifyCase.of", lambda data: SimpleNamespace(parameters=()))
-    identified = xr.Dataset(
-        {
-            "windows/misfit": ("window", [1.0]),
-            "windows/impacts": ("window", [3]),
-            "windows/value": (("window", "parameter"), np.zeros((1, 0))),
-            "starts/valley": ("start", [1, 0, 2, 0]),
-            "starts/deviance": ("start", [0.0, np.nan, 7.0, np.nan]),
-        },
-        coords={"window": [1]},
-    )
-    with style.rc_style():
-        starts = growing_windows(identified).axes[2]
-    assert starts.get_title("left").endswith("4 starts, 2 failed")
-    assert starts.get_xlabel() == "valley"
-
-
-def test_the_line_of_undetermined_parameters_is_that_of_the_fit():
-    """The dashed line of the picture is at the error above which the fit takes a parameter for not determined."""
-    assert DETERMINED == uncertainty.DETERMINED
-
-
-@pytest.mark.parametrize("degrees", range(0, 360, 15))
-def test_the_text_of_a_spring_is_next_to_its_zigzag(degrees):
-    """The text lies on no part of a spring's line, in whatever direction the spring is drawn."""
-    figure = Figure(figsize=(4, 4), dpi=100)
-    axes = figure.subplots()
-    axes.set(xlim=(-2.5, 2.5), ylim=(-2.5, 2.5), aspect="equal")
-    angle = np.radians(degrees)
-    draw_spring(axes, [(0.0, 0.0), (1.4 * np.cos(angle), 1.4 * np.sin(angle))], "6 kN/m")
-    figure.draw_without_rendering()
-
-    (text,) = axes.texts
-    (line,) = axes.lines
-    corners = axes.transData.transform(line.get_xydata())
-    dense = np.concatenate([np.linspace(begin, end, 20) for begin, end in itertools.pairwise(corners)])
-    assert not any(text.get_window_extent().contains(*point) for point in dense)

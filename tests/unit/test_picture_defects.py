@@ -9,10 +9,8 @@ from matplotlib.figure import Figure
 
 from tests.conftest import run_of, small_case
 from vipetsc.figures import identified, registry, style
-from vipetsc.figures.frequency_energy import MOST_ORBITS, portraits
 from vipetsc.figures.modal import MOST_ROWS, MovedEnergies
 from vipetsc.figures.prefixed_units import prefix_units
-from vipetsc.figures.style import NoPicture
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.transfer_curves import TransferCurve, _of_contact, _superposition
 from vipetsc.figures.warning_lines import warned
@@ -89,33 +87,6 @@ def test_channels_that_are_left_out_are_counted(draw):
     note, warning = warned(lambda: draw(identification(11)), [shown])().get_label().splitlines()
     assert "8 of 11" in note
     assert warning == "a warning"
-
-
-@pytest.mark.parametrize(("starts", "panels"), [(1, 2), (2, 3)])
-def test_an_identification_has_no_empty_panel(monkeypatch, starts, panels):
-    """With one start there is no panel of starts; without profiles there is no picture of them."""
-    monkeypatch.setattr(identified.IdentifyCase, "of", lambda data: SimpleNamespace(parameters=()))
-    assert len(identified.growing_windows(identification(1, starts)).axes) == panels
-
-
-def test_profiles_that_were_not_computed_are_a_reason():
-    data = xr.Dataset({"profile/value": (("parameter", "place"), np.zeros((2, 0)))})
-    with pytest.raises(NoPicture, match="no profile"):
-        identified.misfit_profiles(data)
-
-
-@pytest.mark.parametrize("count", [MOST_ORBITS, MOST_ORBITS + 3])
-def test_orbits_that_are_left_out_are_counted(count):
-    orbits = {
-        "orbits/number": ("orbit", np.arange(count)),
-        "orbits/energy": ("orbit", np.ones(count)),
-        "orbits/displacement": (("orbit", "phase", "mass"), np.ones((count, 4, 2))),
-        "orbits/velocity": (("orbit", "phase", "mass"), np.ones((count, 4, 2))),
-    }
-    points = {name: ("point", np.arange(count)) for name in ("number", "region")}
-    part = Figure().subfigures(1, 1)
-    portraits(part, xr.Dataset(orbits | points | {"kind": ("point", np.full(count, "regular"))}), "e")
-    assert (f"of {count}" in part._suptitle.get_text()) == (count > MOST_ORBITS)
 
 
 @pytest.mark.parametrize("sites", [MOST_ROWS, MOST_ROWS + 6])

@@ -42,28 +42,6 @@ def test_regions_and_power_law_of_a_constructed_branch():
     assert law["points"] == np.sum(region == 4)
 
 
-def test_region_three_begins_where_the_exponent_settles():
-    """Region III begins where the exponent of the slope changes by less than 1/2 per e-fold of energy.
-
-    The slope E^-1 + c E^-6, whose second term is the fraction a of it, has the exponent -1 - 5 a, which grows by
-    25 a (1 - a): by 1/2 at a = 0.0204.
-    """
-    energy = np.geomspace(1e-3, 1e6, 4000)
-    touched = energy > FIRST_CONTACT
-    slope, fraction = two_powers(energy, factor=1e3, peak=1e4, exponent=-6.0)
-
-    region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
-
-    begin = np.nonzero(region == 3)[0][0]
-    # The root of a (1 - a) = 0.02; from one point to the next the fraction falls by 3 %.
-    assert fraction[begin] == pytest.approx((1 - np.sqrt(0.92)) / 2, rel=0.05)
-    laws = fit_slope(energy, slope, region)
-    assert set(laws) == {"II", "III"}
-    assert laws["II"]["exponent"] < -1.2
-    assert laws["III"]["exponent"] == pytest.approx(-1, abs=1e-3)
-    assert laws["II"]["points"] == begin - np.argmax(slope)
-
-
 def test_the_law_of_region_two_is_that_of_its_falling_part():
     """The law of region II is fitted after the peak of the slope and the last point where the branch goes backwards."""
     energy = np.geomspace(1, 100, 60)
@@ -77,13 +55,6 @@ def test_the_law_of_region_two_is_that_of_its_falling_part():
 
     assert laws["II"]["exponent"] == pytest.approx(-2.5, abs=1e-12)
     assert laws["II"]["points"] == len(falling)
-
-
-def test_too_few_points_or_no_numbers_have_no_law():
-    """Three points, or slopes that are not numbers, have no power law."""
-    energy = np.geomspace(1, 100, 60)
-    assert fit_slope(energy[:3], energy[:3] ** -1.0, np.full(3, 3)) == {}
-    assert fit_slope(energy, np.full(60, np.nan), np.full(60, 3)) == {}
 
 
 def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():

@@ -76,15 +76,3 @@ def test_where_a_curve_folds_its_largest_state_counts():
     assert widest_gap([folded, isolated], 1.0, 0, 5) == pytest.approx(1.0)
     within = part([2.5, 2.6], [2.0, 2.0])
     assert widest_gap([folded, within], 1.0, 0, 5) == pytest.approx(2.0)
-
-
-def test_points_on_either_side_of_an_excursion_are_no_neighbours():
-    """A curve that leaves the range and comes back has no parabola through the points before and after that."""
-    # Between 2.0 and 1.9 the curve goes to 0.5 beyond the range; a parabola through 1.0, 2.0 and 1.9 would reach 2.3.
-    excursion = part([0.0, 0.9, 1.2, 0.95], [1.0, 2.0, 0.5, 1.9])
-    assert largest_response([excursion], 0, 1) == 2.0
-    # Where three points of the range follow each other, they do have one, however high the curve is elsewhere.
-    rises = part([0.9, 1.2, 0.9, 0.8, 0.7, 0.6], [1.9, 2.5, 0.5, 1.0, 1.5, 1.4])
-    at_end = 1.9 + 0.6 / 3
-    assert largest_response([rises], 0, 1) == pytest.approx(at_end)
-    assert largest_response([rises], 0, 0.85) > 1.5

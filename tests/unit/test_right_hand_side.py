@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -17,7 +16,6 @@ from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, FREE
 from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.springs import damping_powers
 from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs, register
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
 from vipetsc.lattice.chain import Pair
@@ -290,55 +288,3 @@ def test_a_rank_writes_only_to_what_it_owns():
     expected[(d + 1) * n + SITES[1] + 1] += forces[1] / CELL.masses[1]
     expected[layout.dissipated + 3] = np.nan
     np.testing.assert_allclose(rates, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_a_rank_without_cells_writes_no_power_of_dashpots(ends):
-    """Of more ranks than cells the last has no first and no last cell, and so no dashpots to walls."""
-    model = lattice(ends)
-    last = SimpleNamespace(rank=CELLS, size=CELLS + 1)
-    layout = Layout(model, last, dashpots=True)
-    record = create_record(model, layout)
-    assert layout.owned == 0
-    assert record.damping.any()
-
-    # Empty views, whose surroundings show what is read and written beyond them.
-    motion = np.ones(3)
-    powers = np.zeros(3)
-    damping_powers(motion[1:1], record, 0, powers[1:1])
-    assert powers.tolist() == [0.0, 0.0, 0.0]
-
-
-def test_an_engine_that_keeps_no_ledger_of_dashpots_has_the_components_of_drives_and_sites_alone():
-    """Without dashpots the state has no ledger of them, and the rates of the other ledgers are the same."""
-    model = lattice("fixed")
-    motion = random_motion(model)
-    with_ledger = evaluate(model, motion)
-    undamped = evaluate(replace(model, chain=replace(model.chain, cell=undamped_cell())), motion)
-    half = CELLS * CELL.dofs
-
-    assert undamped.lattice.shape.damping == -1
-    assert undamped.layout.size == with_ledger.layout.size - CELLS
-    assert not np.isnan(undamped.rates[: undamped.layout.size]).any()
-    np.testing.assert_array_equal(undamped.rates[2 * half :], with_ledger.rates[2 * half + CELLS :])
-
-
-def undamped_cell() -> UnitCell:
-    """Return ``CELL`` without its dashpots."""
-    springs = tuple(replace(spring, damping=0.0) for spring in SPRINGS)
-    return replace(CELL, springs=springs, grounding=())
-
-
-def test_pressed_contacts_at_rest_are_not_accelerated():
-    """The motion of pressed sites at rest, which the search for changes uses, is zero: the load balances the force."""
-    model = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0}).model()
-    layout = Layout(model, MPI.COMM_SELF)
-    record = create_record(model, layout)
-    rest = np.zeros(layout.size)
-    motion = np.full((3, 3), np.nan)
-    context = register(PETSc.TS().create(MPI.COMM_SELF), record)
-    observe_at(0.0, rest, context.ctypes.data, motion)
-    assert record.contacts["preload"].min() > 1.0
-    # The load alone would accelerate by 4e3 m/s^2. It is computed with NumPy and the force compiled: both differ in
-    # rounding, and the bound is less than 1e-12 of that acceleration.
-    assert np.abs(motion).max() < 1e-9

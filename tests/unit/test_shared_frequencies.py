@@ -40,17 +40,6 @@ def test_multiples_are_companions_of_the_lower_mode_alone():
     assert "mode 3 has 3 times the frequency of mode 1" in why_not_alone(oscillators(1.0, 2.0, 3.0), 0)
 
 
-@pytest.mark.parametrize("near", [1e-9, -1e-9])
-def test_frequencies_that_differ_are_none(near):
-    """Frequencies that differ by 1e-9 of their size are no companions."""
-    assert companions(oscillators(1.0, 1.0 + near), 0) == []
-
-
-def test_motions_that_are_nowhere_linear_are_left_to_their_equations():
-    """A system with smooth springs is not refused for equal frequencies, since its motions are nowhere linear."""
-    assert why_not_alone(oscillators(1.0, 1.0, cubic=1.0), 0) == ""
-
-
 def ring(**nnm) -> NnmCase:
     """Return the case of a ring of three cells of two masses, whose modes 2 and 3 are waves in both directions."""
     springs = [

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 from scipy import fft
 from scipy.integrate import trapezoid
 
-from vipetsc.lattice import Band, bloch, diatomic, four_band, pass_bands
+from vipetsc.lattice import Band, bloch, four_band
 from vipetsc.spectra import (
     CellWindow,
-    Dispersion,
     Parts,
     block_means,
     dispersion,
@@ -25,7 +24,6 @@ from vipetsc.spectra import (
     taper,
     wavenumber_content,
 )
-from vipetsc.spectra.cosine_squares import CosineSquares
 
 MASSES = (0.5, 2.0)
 
@@ -111,22 +109,6 @@ def test_parts_are_a_partition(nt, n, seed, inner):
     assert trapezoid(energy) == pytest.approx(trapezoid(np.sum(signal**2, axis=1)), rel=1e-12)
 
 
-def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
-    """Energies and maps of parts are those of the parts themselves, computed at once or in blocks."""
-    velocity = noise((64, 10, 2))
-    edges = [0.0, 8.0, 20.0, np.inf]
-    energy = part_energies(velocity, MASSES, 0.1, edges).total
-    total = kinetic_energy(velocity, MASSES).sum(axis=1)
-    assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
-
-    for memory in (1.0, 2e4):
-        monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 3)
-        assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory).total, energy, rtol=1e-12)
-
-    (middle,) = split(velocity, 0.1, edges[1:3])
-    assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)
-
-
 @settings(max_examples=60)
 @given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(0, 99))
 def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, seed):
@@ -166,18 +148,6 @@ def test_maps_of_parts_are_means_of_their_energy(nt, one, other, samples, cells,
     assert np.allclose(found.maps, [expected], rtol=1e-6, atol=1e-12 * energy.max() + 1e-300)
 
 
-def test_a_part_takes_twice_as_many_points_as_it_has_cosines():
-    """A part of n cosines takes 2 n points or a few more, at any frequencies; without cosines it has no energy."""
-    for low in (0, 640, 4000):
-        part = CosineSquares.zeros(low, low + 255)
-        assert 2 * 255 < part.length <= 512 + 1
-        assert len(part.square) == part.length // 2 + 1
-    empty = CosineSquares.zeros(9, 8)
-    empty.add(np.ones((20, 3)), 1.0)
-    assert not empty.square.any()
-    assert not empty.cosines().amplitude.any()
-
-
 def test_a_last_wide_part_is_coarser_by_the_stride():
     """The energy above the last edge is interpolated between every tenth sample; other parts stay exact."""
     velocity = noise((100, 3, 2))
@@ -188,41 +158,6 @@ def test_a_last_wide_part_is_coarser_by_the_stride():
     assert not np.allclose(every[1], tenth[1], rtol=0.1)
     # 99 steps become 10; the samples 0 and 99 belong to both.
     assert np.allclose(every[1, [0, 99]], tenth[1, [0, 99]], rtol=1e-12)
-
-
-@settings(max_examples=30)
-@given(st.integers(2, 200), st.floats(0, 0.3), st.integers(2, 20), st.integers(0, 99))
-def test_an_open_part_at_strided_times_is_the_part_there(nt, low, stride, seed):
-    """The last part with a stride has the energy of the part without one at those of its times that are samples."""
-    edges = [0.0, low * np.pi / 0.1, np.inf]
-    velocity = noise((nt, 3, 2), seed)
-    every = part_energies(velocity, MASSES, 0.1, edges).total
-    strided = part_energies(velocity, MASSES, 0.1, edges, stride).total
-
-    last = nt - 1
-    steps = min(fft.next_fast_len(-(-last // stride), real=True), last)
-    times = np.arange(steps + 1) * last
-    both = times[times % steps == 0] // steps
-    assert np.allclose(strided[1, both], every[1, both], rtol=0, atol=1e-12 * every.max())
-
-
-def test_a_tone_stays_in_its_part():
-    """A tone of 200 rad/s that swells and fades leaves less than 1e-6 of its energy to other parts."""
-    t = np.arange(2001) * 1e-3
-    velocity = ((1 - np.cos(np.pi * t)) * np.sin(200 * t))[:, None, None]
-
-    energy = part_energies(velocity, [1.0], 1e-3, [0.0, 100.0, 300.0, np.inf]).total.sum(axis=1)
-    assert energy[1] / energy.sum() > 1 - 1e-6
-
-
-def test_parts_name_bands_and_gaps():
-    """The four-band lattice's parts are its bands and gaps, with known edges, and the part above all bands."""
-    parts = Parts.of(pass_bands(four_band("calibrated")))
-    assert parts.names == ("band 1", "gap 1", "band 2", "gap 2", "band 3", "gap 3", "band 4", "above")
-    assert np.allclose(parts.edges[1:-1], [612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75], atol=0.006)
-    assert [parts.names[i] for i in np.nonzero(parts.above(1023.27))[0]] == ["band 3", "band 4"]
-    # The driven band is the highest one of two.
-    assert not Parts.of(pass_bands(diatomic())).above(5520.0).any()
 
 
 def test_parts_of_bands_that_overlap_touch_or_begin_above_zero():
@@ -313,13 +248,3 @@ def test_ridge_of_a_packet_lies_on_the_branch():
     # The ridge is refined off the grid of frequencies.
     bin_width = 2 * np.pi / (1200 * interval)
     assert np.abs(frequency - branch).max() < 0.1 * bin_width
-
-
-def test_ridge_leaves_quiet_wavenumbers_out():
-    """Wavenumbers with a billionth of the energy have no ridge; a symmetric peak has its ridge in the middle."""
-    energy = np.full((3, 5), 1e-9)
-    energy[1] = [1e-9, 0.5, 1.0, 0.5, 1e-9]
-
-    found, frequency = ridge(Dispersion(np.arange(3.0), np.arange(5.0), energy))
-    assert found.tolist() == [1.0]
-    assert frequency == pytest.approx(2.0)

@@ -70,22 +70,6 @@ def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
     assert driven.initial.frequency is None
 
 
-def test_two_frequencies_are_refused():
-    """A frequency of the initial motion beside that of a drive is refused, and accepted without a drive."""
-    initial = {"cell": 1, "velocity": 1.0, "frequency": 1e4}
-    with pytest.raises(CaseError, match=r"initial\.frequency = 10000\.0: the drive has a frequency; omit this key"):
-        beads(initial, drive={"amplitude": 1.0, "frequency": 2e4})
-    assert beads(initial).model().drive.frequency == 1e4
-
-
-def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
-    """A lossy site that touches at rest has no approach velocity and is refused; at a struck mass it has one."""
-    lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}
-    with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
-        beads({"cell": 1, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
-    assert beads({"cell": 3, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
-
-
 def test_a_lossy_site_is_not_at_rest_where_the_mass_of_the_next_cell_is_struck():
     """A contact between cells j and j + 1 is not at rest if cell j + 1 is struck; on a ring cell 1 follows the last."""
     lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}

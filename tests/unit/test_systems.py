@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.models import CLEARANCE, four_band_contact, reduced_model
+from tests.models import four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
-from vipetsc.lattice import Chain, Contact, Spring, UnitCell, diatomic
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.flow import MAPS, Dop853Flow
-from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 LINEAR_STOP = four_band_contact("bilinear")
@@ -23,12 +21,6 @@ def test_reduced_model_of_the_paper():
     system = reduced_model()
     assert system.masses == pytest.approx([0.0025, 0.0025])
     assert system.stiffness == pytest.approx(np.array([[2.2e4, -2e3], [-2e3, 2e3]]))
-
-
-def test_reduced_model_of_another_cell():
-    """The host of the diatomic cell is on two springs of 90 kN/m to its neighbours, and on a third to the resonator."""
-    system = System.reduced(diatomic(), Stops.both(LINEAR_STOP, CLEARANCE))
-    assert system.stiffness == pytest.approx(np.array([[2 * 9e4 + 9e4, -9e4], [-9e4, 9e4]]))
 
 
 def test_forces_are_the_energy_gradient():
@@ -79,13 +71,6 @@ def test_unsound_systems_are_refused(change, message):
     parts = {"masses": [1.0, 1.0], "springs": [(None, 0, 1.0), (0, 1, 1.0)]}
     with pytest.raises(ValueError, match=message):
         System.assemble(**(parts | change))
-
-
-def test_quarter_map_needs_an_odd_system():
-    """The quarter map refuses a system whose mirrored motions are none, and proposes the half map."""
-    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=0.1)])
-    with pytest.raises(ValueError, match="half"):
-        Shooting(Dop853Flow(system), MAPS["quarter"])
 
 
 def test_a_system_of_ones_own_has_its_springs_and_its_contact():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,10 @@ from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import registry, sweep_members, transfer, wavenumber_bins
+from vipetsc.figures import transfer, wavenumber_bins
 from vipetsc.figures.registry import FIGURES, specified_drawings
-from vipetsc.figures.style import Drawing, Shown, rc_style
-from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps, from_series
-from vipetsc.figures.warning_lines import warning_lines
-from vipetsc.io import kinds
+from vipetsc.figures.style import Drawing, rc_style
+from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.studies import backbone
@@ -157,44 +154,6 @@ def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkey
     ]
 
 
-def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
-    """A single member has a page with its key and value in the name, and its own warning."""
-    (page,) = dispersions(monkeypatch, member_of("a", 10, 0.5))
-    assert page.stem.endswith("contacts.restitution-0.5")
-    figure = page.draw()
-    assert len(titles(figure)) == 1
-    assert figure.get_label() == "the run a"
-
-
-def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
-    # A page has two panels here, so that three members suffice.
-    monkeypatch.setattr(transfer, "MOST_PANELS", 2)
-    members = [member_of(letter, 10, restitution) for letter, restitution in zip("abc", (0.5, 0.7, 0.9), strict=True)]
-    stems = [page.stem for page in dispersions(monkeypatch, *members)]
-    assert stems[0] == "transfer_dispersions-members-1-to-2"
-    assert stems[1].endswith("contacts.restitution-0.9")
-
-
-def test_a_page_without_members_has_the_warnings_of_its_sweeps():
-    """A picture without members, which shows whole sweeps, has the warnings of these sweeps."""
-    sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
-    spec = registry.FigureSpec("a_figure", kinds.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
-    with Files() as files:
-        (drawing,) = specified_drawings(spec, [sweep], files)
-    assert drawing.draw().get_label() == "of the sweep"
-
-
-def series_of_three(*warnings: str) -> AmplitudeSeries:
-    """Return a series of three amplitudes whose runs have these warnings; an empty text stands for none."""
-    runs = []
-    for amplitude, warning in zip((0.1, 2, 20), warnings, strict=True):
-        member = member_of(f"{amplitude:g}", amplitude, 0.5)
-        about = {"warnings": json.dumps([warning] if warning else [])}
-        recorded = {"cell": [8, 9, 10], "sites/cell": ("site", [9])}
-        runs.append(member._replace(run=xr.Dataset(recorded, attrs=about)))
-    return AmplitudeSeries(suffix="", title="", runs=tuple(runs), wave=DrivenWave(0, np.nan, np.nan))
-
-
 def test_amplitudes_of_a_moved_wall_are_in_metres():
     """Headings of panels, and energies over the square of the amplitude, have the unit of what drives the lattice."""
     drive = {"cycles": 8, "band": 2, "at": "max-group-velocity", "end": "left"}
@@ -232,39 +191,3 @@ def test_amplitudes_of_a_moved_wall_are_in_metres():
 def test_spectra_of_two_cells_have_room_on_their_axis(peaks, limits):
     """The common axis ends above the larger peak and begins below the smaller one, unless that is a rounding error."""
     assert transfer._spectra_limits(peaks) == pytest.approx(limits)
-
-
-def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:
-    """Return the warnings below a picture of that ``series``."""
-    monkeypatch.setattr(sweep_members, "series_of", lambda sweeps, *needs: iter([series]))
-    spec = registry.FigureSpec("a_figure", kinds.SWEEP, figure_of_series)
-    with Files() as files:
-        (drawing,) = specified_drawings(spec, [], files)
-    return drawing.draw().get_label().splitlines()
-
-
-def test_a_warning_below_a_series_names_its_amplitude(monkeypatch):
-    """A warning below a picture of several amplitudes names the amplitudes that it is about."""
-    series = series_of_three("no contact", "", "coarse samples")
-    whole = from_series()(lambda series: Figure())
-    assert lines_below(whole, series, monkeypatch) == ["0.1 N: no contact", "20 N: coarse samples"]
-
-    series = series_of_three("no contact", "energy off by 1 %", "energy off by 3 %")
-    assert lines_below(whole, series, monkeypatch) == [
-        "0.1 N: no contact",
-        "2 N, 20 N (numbers of 2 N): energy off by 1 %",
-    ]
-
-
-def test_a_picture_of_the_medium_amplitude_has_its_warnings_alone(monkeypatch):
-    """A picture of the medium amplitude has the warnings of that run and no others."""
-    medium = from_series(medium_alone=True)(lambda series: Figure())
-    assert lines_below(medium, series_of_three("no contact", "", ""), monkeypatch) == []
-    assert lines_below(medium, series_of_three("", "no contact", "of 20 N"), monkeypatch) == ["no contact"]
-
-
-def test_many_members_of_one_warning_are_counted():
-    """A warning names up to four members that have it and counts the others."""
-    shown = [Shown(f"{number} N", [xr.Dataset(attrs={"warnings": '["beware"]'})]) for number in range(1, 8)]
-    assert warning_lines(shown) == ["1 N, 2 N, 3 N, 4 N and 3 others: beware"]
-    assert warning_lines(shown[:1]) == ["beware"]

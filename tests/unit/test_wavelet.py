@@ -4,45 +4,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from vipetsc.spectra import (
-    BINS,
-    Nodes,
-    filter_bank,
-    inverse,
-    kinetic_energy,
-    local_entropy,
-    padded_length,
-    partition,
-    transform,
-)
+from vipetsc.spectra import BINS, Nodes, filter_bank, inverse, kinetic_energy, local_entropy, partition, transform
 from vipetsc.spectra.wavelet import constant, wavenumbers
 
 
 def noise(shape, seed=0):
     """Return standard normal numbers."""
     return np.random.default_rng(seed).standard_normal(shape)
-
-
-def packet(kappa, cells=600, centre=300.0, width=40.0, phase=0.0):
-    """Return a Gaussian packet over the cells."""
-    x = np.arange(cells) - centre
-    return np.exp(-0.5 * (x / width) ** 2) * np.cos(kappa * x - phase)
-
-
-@pytest.mark.parametrize("kc", [6.0, 12.0])
-def test_transform_is_the_convolution_with_the_wavelet_in_space(kc):
-    """Transforms at nodes whose band ends below pi are sums over the cells with Morlet's wavelet in closed form."""
-    kappa = np.pi / 60 * np.array([1, 2, 7, 13, 20])
-    signal = noise(50)
-    found = transform(signal, kappa, kc)
-
-    # At kc = 6 the cut at eta = 0 takes exp(-18) off the wavelet.
-    tolerance = 1e-12 if kc == 12 else 1e-7
-    distance = np.arange(50)[:, None] - np.arange(50)
-    for row, k in zip(found, kappa, strict=True):
-        wave = np.exp(-0.5 * (k * distance / kc) ** 2 + 1j * k * distance) * k / kc / np.sqrt(2 * np.pi)
-        expected = np.sqrt(kc / k) * wave @ signal
-        assert np.abs(row[:50] - expected).max() < tolerance * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("length", [64, 75])
@@ -130,43 +98,6 @@ def test_nodes_lie_in_bins_of_equal_width():
     assert np.all(kappa[inside] <= (bins[inside] + 1) * width + 1e-12)
 
 
-def test_padding_keeps_periodic_images_apart():
-    """Twice the padding leaves the transform on the lattice the same, for wavelets whose band ends below pi."""
-    kappa = np.pi / 60 * np.array([1, 5, 30])
-    signal = noise(200)
-    length = padded_length(200, 12.0)
-
-    found = transform(signal, kappa, 12.0, length)[:, :200]
-
-    with_twice_the_padding = transform(signal, kappa, 12.0, 2 * length)[:, :200]
-    assert np.abs(found - with_twice_the_padding).max() < 1e-13
-
-
-def moving_packet(times=21):
-    """Return a packet (time, cell) at the paper's wavenumber 5 pi/9 that moves by ten cells from time to time."""
-    return np.array([packet(5 * np.pi / 9, centre=200 + 10 * t, phase=3 * t) for t in range(times)])
-
-
-def test_a_packet_lands_in_bins_7_and_8():
-    """Bins 7 and 8 meet at 7 pi/12 above the packet's 5 pi/9; its content lies between pi/2 and 2 pi/3."""
-    signal = packet(5 * np.pi / 9)
-    content = np.abs(np.fft.rfft(signal)) ** 2
-    eta = wavenumbers(600)
-    within = (eta >= np.pi / 2) & (eta < 2 * np.pi / 3)
-    assert content[within].sum() > 0.99 * content.sum()
-
-    energy = partition(signal[None], 1.0).energy[:, 0]
-
-    # The wavelets are broader than the packet: a part of its energy is in the neighbouring bins.
-    assert energy[6:8].sum() / energy.sum() > 0.85
-
-
-def test_analytic_parts_reconstruct_a_packet_within_one_percent():
-    """The parts of a packet add up to it within 1 % of its energy, as the filters add up to 1."""
-    found = partition(moving_packet(), 0.01)
-    assert found.error.max() < 0.01
-
-
 def test_partition_accounts_for_its_energies():
     """Energies of parts, of their sum and of the whole are those of the filtered velocities; fields sum to them."""
     velocity = noise((37, 80, 2))
@@ -189,12 +120,6 @@ def test_partition_accounts_for_its_energies():
     assert np.allclose(found.cross_share[1:], 1 - found.energy.sum(axis=0)[1:] / found.kinetic[1:])
     # Fields are as large as the record and are kept on request alone.
     assert partition(velocity, masses).field is None
-
-
-def test_neighbouring_bins_share_much_of_a_packet():
-    """The bins overlap at kc = 6: cross terms of the parts are 40 to 80 % of the energy."""
-    cross_terms = partition(moving_packet(), 1.0).cross_share
-    assert np.all((cross_terms > 0.4) & (cross_terms < 0.8))
 
 
 class Record:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from vipetsc import Case, open, simulate
+from vipetsc import Case, simulate
 from vipetsc.cli.main import main
 from vipetsc.contact.law import (
     create_contacts,
@@ -25,9 +24,6 @@ from vipetsc.plugins import load
 
 K = 2e5
 B = 4e5
-# The stop of ``steady`` is soft: its drive lies below all modes, so that only the stop's force is large.
-SOFT = 2e3
-STEADY_B = 2e6
 D = 1e-3
 
 
@@ -195,107 +191,7 @@ contacts = [{{ host = 0, resonator = 1, clearance = {D} }}]
     return found
 
 
-def periodic(omega: float, amplitude: float, chain) -> float:
-    """Largest |w| in m of the symmetric periodic orbit under amplitude cos(omega t) on the first mass."""
-    stiffness = chain.stiffness_matrix().toarray()
-    masses = chain.masses()
-    pair = np.zeros(len(masses))
-    pair[chain.cell.host] = -1
-    pair[chain.cell.resonator] = 1
-
-    n = len(masses)
-
-    def rate(t, y, strength):
-        # The columns of u and v are orbits, which are integrated together.
-        u, v = y.reshape(2, n, -1)
-        w = pair @ u
-        push = np.sign(w) * force(np.maximum(np.abs(w) - D, 0.0), SOFT, STEADY_B)
-        pull = stiffness @ u + pair[:, None] * push
-        pull[0] -= strength * np.cos(omega * t)
-        return np.concatenate([v, -pull / masses[:, None]]).ravel()
-
-    def orbits(starts, strength):
-        """Displacements and velocities (2, mass, orbit, time) of orbits that begin at rest at ``starts``."""
-        # Nothing dissipates. A periodic orbit that begins at rest is therefore even in time, and at rest again after
-        # half a period.
-        times = np.linspace(0, np.pi / omega, 201)
-        begin = np.concatenate([starts, 0 * starts]).ravel()
-        solved = solve_ivp(rate, times[[0, -1]], begin, "DOP853", times, args=(strength,), rtol=1e-8, atol=1e-12)
-        return solved.y.reshape(2, n, -1, len(times))
-
-    linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
-    last = D / abs(pair @ linear)
-    u = linear * last
-    # The force grows in three steps from the one at which the linear motion touches the stop: Newton's method does
-    # not reach the orbit in one step.
-    for strength in np.linspace(last, amplitude, 4)[1:]:
-        u = u * strength / last
-        last = strength
-        for _ in range(10):
-            # Orbits of one integration have the same time steps, whose errors cancel in the differences.
-            starts = u[:, None] + np.column_stack([np.zeros(n), 1e-6 * D * np.eye(n)])
-            speeds = orbits(starts, strength)[1, :, :, -1] / (omega * D)
-            if np.abs(speeds[:, 0]).max() < 1e-7:
-                break
-            u = u - 1e-6 * D * np.linalg.solve(speeds[:, 1:] - speeds[:, :1], speeds[:, 0])
-        assert np.abs(speeds[:, 0]).max() < 1e-7
-    return float(np.abs(pair @ orbits(u[:, None], amplitude)[0, :, 0]).max())
-
-
-def steady() -> dict:
-    """The error of the largest |w| of a steady state of ``nfrc`` against a periodic orbit, and the term b x^2 there."""
-    lattice = {"preset": "four-band", "cells": 2}
-    chain = Case.from_table({"plugins": PLUGINS, "lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
-    stiffness = chain.stiffness_matrix().toarray()
-    masses = chain.masses()
-    lowest = np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])
-    omega = round(0.7 * float(lowest), 3)
-    linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(len(masses))[0])
-    touching = D / abs(linear[chain.cell.resonator] - linear[chain.cell.host])
-    case = f"""
-[plugins]
-modules = ["stops.py"]
-
-[lattice]
-preset = "four-band"
-cells = 2
-
-[contacts]
-law = "hardening"
-parameters = {{ b = {STEADY_B} }}
-stiffness = {SOFT}
-sites = [1]
-clearance = {D}
-restitution = 1.0
-
-[drive]
-cell = 1
-mass = 1
-
-[nfrc]
-source = "force"
-infinite = false
-fixed = [{omega}]
-range = [{0.9 * touching}, {3 * touching}]
-harmonics = 21
-
-[output]
-figures = false
-"""
-    Path("nfrc.toml").write_text(case)
-
-    assert main(["nfrc", "nfrc.toml", "--out", "nfrc", "--force"], {}) == 0
-
-    (path,) = Path("nfrc").glob("branch-*.h5")
-    with open(path) as curve:
-        amplitude = curve["amplitude"].values
-        largest = curve["largest"].values
-    expected = periodic(omega, amplitude[-1], chain)
-    # The second number shows that the cubic term of the law matters at this amplitude.
-    return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
-
-
 def compare() -> dict:
     """The results of all comparisons by name; the current folder must contain the module ``stops.py``."""
     load(str(Path("stops.py").resolve()))
-    return twins() | engines() | normal_modes() | steady()
+    return twins() | engines() | normal_modes()

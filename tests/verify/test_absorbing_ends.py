@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.case.absorbing import reflected, sections_of, sources_of
-from vipetsc.cli.case_rows import describe_ends
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import waves_at
@@ -71,7 +70,7 @@ def source_and_sections(of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cell", "mass"), [(1, 1), (5, 2), (100, 3)])
+@pytest.mark.parametrize(("cell", "mass"), [(5, 2)])
 def test_what_a_drive_sends_is_its_work(cell, mass):
     """The energy of the waves that a force sends, an integral over its spectrum, is the work it does in a run.
 
@@ -85,12 +84,6 @@ def test_what_a_drive_sends_is_its_work(cell, mass):
     # All waves leave to the right, as the wall at the left reflects those that go there.
     (sent,) = integrate(lambda omegas: source.sent(omegas, "right").sum(axis=1)[None], source.edges())
     assert sent == pytest.approx(work, rel=1e-3)
-
-
-def stated(of):
-    """The fraction of the sent energy that the ends of the case ``of`` are predicted to reflect."""
-    source, sections = source_and_sections(of)
-    return reflected([source], sections)
 
 
 @cache
@@ -125,7 +118,7 @@ def returning(source, section, slowest):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strength", [60.0, 230.0])
+@pytest.mark.parametrize("strength", [230.0])
 def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
     """The energy that comes back in a run lies between two predictions, for fast waves alone and for all that return.
 
@@ -158,41 +151,6 @@ def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
     # The weak end reflects fast waves, the strong one slow waves: both bounds are tested.
     assert (least > 0.9 * every) == (strength < 100)
     assert measured > 0.35 * every
-
-
-@pytest.mark.slow
-def test_the_end_that_is_chosen_keeps_its_bound():
-    """An end chosen for this burst reflects at most 0.1 % of all that the drive sends, side lobes included.
-
-    An end chosen for the main lobe of the spectrum alone reflects 0.8 %.
-    """
-    of = case({"cells": 1200, "absorbing": {}}, BURST | {"cell": 400})
-    source, sections = source_and_sections(of)
-    (back,) = returning(source, sections[0], [0])
-    assert of.lattice.absorbing.cells > 160
-    assert back < 1.01e-3
-    assert f"{reflected([source], sections):.1e} of all waves that the drive sends" in describe_ends(of)
-
-
-@pytest.mark.slow
-def test_both_ends_absorb_what_each_of_them_gets():
-    """Two equal ends reflect the same fraction of all sent energy as one; for a force at a wall it is much smaller."""
-    one, both = (
-        case({"cells": 300, "absorbing": {"end": end, "cells": 20, "strength": 200.0}}, BURST | {"cell": 150})
-        for end in ("right", "both")
-    )
-    fractions = [stated(of) for of in (one, both)]
-    # Reflected energy is divided by all energy that is sent, so that a second end leaves the fraction as it is.
-    assert fractions[1] == pytest.approx(fractions[0], rel=0.02)
-    # A force next to the wall, which stays at the left, sends hardly any waves at the edge of the band.
-    at_wall = case({"cells": 300, "absorbing": {"cells": 20, "strength": 200.0}}, BURST)
-    assert stated(at_wall) < 0.2 * fractions[0]
-
-
-@pytest.mark.slow
-def test_where_no_end_keeps_the_bound_the_message_names_the_remedy():
-    with pytest.raises(CaseError, match=r"lattice\.absorbing\.reflection.*slow waves at band edges; allow more"):
-        case({"cells": 300, "absorbing": {}}, BURST | {"cell": 100})
 
 
 def test_drives_without_an_end_or_a_sine():

@@ -45,9 +45,3 @@ def test_normal_modes_have_the_period_of_the_energy_integral(found, method, erro
     """A mass between hardening stops has the period 4 int dx/sqrt(2 (E - V(x))/m), by shooting and condensed."""
     assert found["reached"][method] > 0.5
     assert found["periods"][method] < error
-
-
-def test_a_steady_state_is_a_periodic_orbit(found):
-    """A steady state of ``nfrc`` has the largest |w| of the periodic orbit by SciPy and Newton's method."""
-    assert found["steady_hardens"] > 0.01
-    assert found["steady"] < 1e-3

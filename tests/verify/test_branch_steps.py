@@ -115,18 +115,6 @@ def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
     assert points[-1].energy < points[124].energy < 0.031
 
 
-@pytest.mark.slow
-def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one():
-    """Without the guard on turns the in-phase branch jumps to the out-of-phase one, and the monitor says so.
-
-    After the jump each point is an out-of-phase orbit passed three times.
-    """
-    problem, points = in_phase_hertz(guards=Guards(turn_relative=0), points=200)
-
-    assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 2 * Guards().turn_relative
-    assert findings(problem, points)[0] == "left its branch: the orbit of point 200 is another one passed 3 times"
-
-
 def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
     """A branch has returned to a linear mode when it has the mode's frequency and no contact.
 

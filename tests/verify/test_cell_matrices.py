@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy
-from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case, Sweep
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.section import CaseError
-from vipetsc.dynamics import simulate
 from vipetsc.lattice import bloch, pass_bands
 
 ELEMENTS = 20
@@ -82,49 +80,6 @@ def test_bands_are_those_of_wave_finite_elements(form, tmp_path):
         squared = scipy.linalg.eigh(k, m, eigvals_only=True)
         np.testing.assert_allclose(bloch(cell, kappa).frequency ** 2, squared, rtol=1e-8, atol=1e-11 * squared.max())
         np.testing.assert_allclose(cell.damping_matrix(kappa), c, atol=1e-9 * np.abs(c).max())
-
-
-def assembled(cells):
-    """M, K and C of ``cells`` between walls: the nodes of both neighbouring cells do not move."""
-    size = 40
-    total = 2 + (cells + 2) * size
-    whole = []
-    for matrix in beam():
-        sum_of_cells = np.zeros((total, total))
-        for first in range(0, total - size - 1, size):
-            sum_of_cells[first : first + size + 2, first : first + size + 2] += matrix
-        whole.append(sum_of_cells[size : (cells + 1) * size, size : (cells + 1) * size])
-    return whole
-
-
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_runs_agree_with_dop853_on_the_assembled_matrices(engine, tmp_path):
-    """Compares all displacements of three cells with an impact against the ground, by both engines."""
-    given = table(saved(tmp_path, "npz"))
-    case = Case.from_table(given | {"time": given["time"] | {"engine": engine}})
-    result = simulate(case)
-    assert result.complete and result.statistics["episodes"] >= 1
-    run = result.dataset
-
-    mass, stiffness, damping = assembled(3)
-    inverse = 1 / np.diag(mass)
-    drive = case.model().drives[0].waveform
-    stop = 40 + 20
-
-    def rate(t, y):
-        u, v = y.reshape(2, -1)
-        force = -stiffness @ u - damping @ v
-        force[20] += drive.force(t)
-        depth = abs(u[stop]) - CLEARANCE
-        if depth > 0:
-            force[stop] -= np.sign(u[stop]) * 4e3 * depth
-        return np.concatenate([v, force * inverse])
-
-    times = run["time"].values
-    exact = solve_ivp(rate, (0, times[-1]), np.zeros(240), "DOP853", times, rtol=1e-10, atol=1e-12, max_step=5e-5)
-    u = run["displacement"].values.reshape(len(times), -1)
-    np.testing.assert_allclose(u, exact.y[:120].T, atol=1e-6 * np.abs(u).max())
-    assert result.statistics["ledger_error"] < 1e-7
 
 
 def test_a_resolved_case_needs_no_files(tmp_path):
@@ -205,20 +160,6 @@ def test_other_matrices_are_refused(matrices, cell, sections, word, tmp_path):
     given["drive"] |= sections.get("drive", {})
     with pytest.raises(CaseError, match=word):
         Case.from_table(given)
-
-
-def test_the_coupling_to_the_next_cell_may_be_given(tmp_path):
-    """K_next and C_next of the cell's own rows in place of a boundary: the same cell."""
-    cell = Case.from_table(table(saved(tmp_path, "npz"))).lattice.unit_cell()
-    blocks = {}
-    for name, matrix in (("M", M), ("K", K), ("C", C)):
-        blocks[name] = matrix[:40, :40].copy()
-        blocks[name][:2, :2] += matrix[40:, 40:]
-        if name != "M":
-            blocks[f"{name}_next"] = np.zeros((40, 40))
-            blocks[f"{name}_next"][:, :2] = matrix[:40, 40:]
-    np.savez(tmp_path / "blocks.npz", **blocks)
-    assert Case.from_table(table({"matrices": str(tmp_path / "blocks.npz")})).lattice.unit_cell() == cell
 
 
 def test_members_of_a_sweep_have_their_own_matrices(tmp_path):

@@ -49,17 +49,3 @@ def test_a_branch_passes_the_first_touch_as_in_shooting(mode):
         if "regular" == left.kind == right.kind:
             secant = (right.frequency - left.frequency) / (right.energy - left.energy)
             assert np.sign(left.slope) == np.sign(right.slope) == np.sign(secant)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({"mode": 2, "top": 0.5, "modulus": 2e8, "truncation": 1e-6}, id="stiffer"),
-        pytest.param({"mode": 2, "top": 0.5}, id="as by default"),
-        pytest.param({"mode": 1, "top": 0.0037, "truncation": 1e-6}, id="in phase"),
-    ],
-)
-def test_the_number_of_harmonics_may_change_at_the_touch(options):
-    branch = condensed(**options)
-    assert branch.complete
-    assert max(p.order for p in branch.points) > 100

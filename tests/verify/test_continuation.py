@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -85,39 +84,6 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     assert np.abs(vanishing).max() > 1e-4 * np.abs(quarter).max()
 
 
-@pytest.mark.parametrize("faster", [2.0**40, 2.0**-40])
-@pytest.mark.parametrize("kind", ["symmetry-breaking", "period-doubling"])
-def test_a_crossing_branch_is_the_same_in_any_unit_of_time(kind, faster, kerschen_in_phase):
-    """A system whose time runs faster or more slowly has the same crossing branch, with orbits so much faster."""
-    slow = kerschen_in_phase.problem
-    system = kerschen_system()
-    springs = tuple(
-        spring._replace(law=replace(spring.law, cubic=spring.law.cubic * faster**2)) for spring in system.springs
-    )
-    system = replace(system, stiffness=system.stiffness * faster**2, springs=springs)
-    fast = Shooting(Dop853Flow(system), slow.map, slow.tolerance, slow.newton.max_newton)
-    point = kerschen_in_phase.of_kind(kind)[0]
-    tangent = np.append(point.tangent[:-1], point.tangent[-1] / faster)
-    moved = replace(point, period=point.period / faster, energy=point.energy * faster**2, tangent=tangent)
-
-    slow_problem, expected = switch(slow, point)
-    fast_problem, found = switch(fast, moved)
-
-    assert fast_problem.map is slow_problem.map
-    assert fast_problem.tolerance == slow_problem.tolerance
-    unit = 1.0 if fast_problem.map.starts_at_rest else faster
-    assert found.x.tolist() == (expected.x * unit).tolist()
-    assert found.period == expected.period / faster
-
-
-def test_a_crossing_branch_has_the_newton_steps_that_were_asked_for(kerschen_in_phase):
-    """A crossing branch inherits nnm.max_newton, the key that a failure of Newton's method advises to change."""
-    old = kerschen_in_phase.problem
-    patient = Shooting(old.flow, old.map, old.tolerance, max_newton=9)
-    problem, _ = switch(patient, kerschen_in_phase.of_kind("symmetry-breaking")[0])
-    assert problem.newton.max_newton == 9
-
-
 def test_a_failure_states_where_it_stopped_why_and_what_to_change():
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"], max_newton=1)
     start = linear_start(problem, OUT_OF_PHASE, 2.9e-2)
@@ -132,28 +98,6 @@ def test_a_failure_states_where_it_stopped_why_and_what_to_change():
     assert f"E = {points[-1].energy:.9g} J" in text
     assert "residuals of the last attempt" in text
     assert "change nnm." in text
-
-
-@pytest.mark.slow
-def test_contacts_change_at_grazing_points():
-    """On either side of a grazing point an orbit has the contacts of that end of the step."""
-    problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
-    start = linear_start(problem, IN_PHASE, 1e-3)
-    points = Continuation(problem, start, NnmTable(energy=[0.0, 25.0], points=20000))
-    # The first half dozen of such steps reaches the grazing cascade, where changes of contacts lie closest together.
-    # The branch is followed no further.
-    changes = ((a, b) for a, b in itertools.pairwise(points) if a.episodes != b.episodes)
-    for a, b in itertools.islice(changes, 6):
-        (point,) = [p for p in locate(problem, a, b, grazing=True) if p.kind == "grazing"]
-        segment = Segment(problem, "relative", a, b)
-        # Steps of the cascade are as short as 3e-9; the tolerance of Newton's method, and the rounding errors of the
-        # BLAS that is installed, place an orbit to some 1e-11.
-        shift = max(1e-4 * segment.length, 1e-10)
-        before = segment.at(point.step - shift)
-        after = segment.at(point.step + shift)
-        assert before.episodes == a.episodes
-        assert after.episodes == b.episodes
-        assert point.episodes == min(a.episodes, b.episodes)
 
 
 @pytest.mark.parametrize("nudge", [0.0, 1e-9, -1e-9])

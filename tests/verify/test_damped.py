@@ -14,7 +14,7 @@ from vipetsc.case import Case
 from vipetsc.case.warnings import losses
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
-from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
+from vipetsc.lattice import Chain, bloch, diatomic, four_band, max_group_velocity
 from vipetsc.lattice.damped import KAPPAS, damped_bloch, damped_waves, decay_length, fitted_dashpots
 from vipetsc.lattice.ends import absorber, reflection
 
@@ -102,32 +102,6 @@ def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
         engine.destroy()
 
 
-@pytest.mark.parametrize("ends", ["fixed", "free"])
-def test_ends_without_dashpots_send_all_back(ends):
-    """A lattice without dashpots reflects all energy, however its cells differ; in a gap the reflection is NaN."""
-    omega = max_group_velocity(four_band(), 2)[1]
-    masses = np.tile(four_band().masses, (12, 1))
-    # Heavier cells in the middle reflect some waves before the end does: together they must reflect all.
-    masses[4:8] *= 1.3
-    chain = Chain(four_band(), 12, ends, variation=Variation(masses))
-
-    assert reflection(chain, omega, 9, "right") == pytest.approx(1)
-    assert reflection(chain, omega, 9, "left") == pytest.approx(1)
-    assert np.isnan(reflection(chain, 890.0, 9))
-
-
-def test_an_absorbing_end_reflects_alike_on_either_side():
-    """A mirrored end reflects as much as the original, since a diatomic cell is its own mirror image."""
-    omega = max_group_velocity(diatomic(), 2)[1]
-    right = absorber(diatomic(), "fixed", 10, 400.0)
-    # The left end has the same dashpots in the opposite order.
-    left = replace(right, variation=Variation(grounding=right.variation.grounding[::-1]))
-    computed = reflection(right, omega, 10)
-    # A wrong reflection could be 0 or 1 on either side: this one is neither.
-    assert 1e-6 < computed < 0.9
-    assert reflection(left, omega, 10, "left") == pytest.approx(computed, rel=1e-9)
-
-
 def test_a_packet_comes_back_as_computed():
     """A weak absorbing end leaves the predicted fraction of a packet's energy, within ten per cent.
 
@@ -195,19 +169,6 @@ def test_profiles_defects_and_scatter_of_a_case():
     other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
     assert np.all(other.masses[:, 0] != varied.masses[:, 0])
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
-
-
-def test_what_differs_stands_in_the_file():
-    """A run's file holds the quantities that differ between cells, for the cells that it records."""
-    case = small_case(
-        lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
-        output={"window": [2, 4]},
-        time={"end": 1e-3},
-    )
-    run = run_of(case)
-
-    assert run["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
-    assert "lattice/stiffness" not in run
 
 
 def lossy(cell, loss):

@@ -6,34 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.conftest import run_of, small_case
-from vipetsc.case import Case
-from vipetsc.figures import impact_panels, panels, runs, style
+from tests.conftest import small_case
+from vipetsc.figures import impact_panels, runs
 from vipetsc.lattice import four_band, max_group_velocity
-
-
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_the_ledger_has_the_dashpots(engine, tmp_path):
-    """The ledger of either engine shows the loss in dashpots, and its balance has a residual below 1e-8."""
-    damping = {"mass": 10.0, "stiffness": 1e-5}
-    run = run_of(small_case(lattice={"damping": damping}, time={"engine": engine, "end": 0.02}))
-
-    with style.rc_style():
-        figure = runs.ledger(run, None)
-        style.save(figure, tmp_path / "ledger.png")
-    upper, lower = figure.axes
-
-    curves = {line.get_label(): np.asarray(line.get_ydata()) for line in upper.lines}
-    assert curves["dissipated in dashpots"][-1] > 0.01 * curves["work of the drive"][-1]
-    residual = np.asarray(lower.lines[0].get_ydata())
-    assert residual.max() < 1e-8
-    # The propagator takes what dashpots dissipate from the balance, which then has no residual.
-    assert (residual.max() > 1e-18) == (engine == "ts")
-
-    # The legend, of four rows here, stands above the work by half the height of a row at least.
-    box = upper.get_legend().get_window_extent()
-    _, highest = upper.transData.transform((0.0, curves["work of the drive"].max()))
-    assert box.y0 - highest > box.height / 8
 
 
 def test_bands_of_a_damped_cell_show_its_decay():
@@ -89,37 +64,3 @@ def test_impacts_that_markers_do_not_distinguish_are_a_map():
 
     pooled = impact_panels.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
     assert len(pooled.get_array()) <= impact_panels.MAP_ROWS
-
-
-def test_contacts_that_touch_from_the_beginning_show_their_indentation():
-    """The second of three beads moves by 2e-6 m towards the third, which it indents, and comes apart from the first."""
-    table = {
-        "lattice": {"cells": 3, "ends": "free", "cell": {"masses": [1e-3]}},
-        "drive": {"frequency": 1e3},
-        "contacts": {"sites": [1, 2], "next_cell": True, "side": "minus", "clearance": 0.0, "stiffness": 1e9},
-        "time": {"end": 1.0, "sample_interval": 0.1},
-    }
-    case = Case.from_table(table)
-    u = np.zeros((11, 3, 1))
-    u[5, 1] = 2e-6
-    run = (
-        impacts_of(2, 2)
-        .drop_vars("time")
-        .assign(
-            {
-                "impacts/force": ("episode", [0.0, 3.0]),
-                "time": np.arange(11) / 10,
-                "cell": [1, 2, 3],
-                "displacement": (("time", "cell", "dof"), u),
-            }
-        )
-    )
-
-    depth = panels.indentations(run, case.model())
-
-    assert depth[1, 5] == 2e-6
-    assert np.count_nonzero(depth) == 1
-
-    raster, bars, *_ = impact_panels.impacts(run.assign_attrs(case=case.to_toml()), None).axes
-    assert raster.get_title() == "(a) Indentation"
-    assert [bar.get_width() for bar in bars.patches] == [0.0, 3.0]

@@ -9,9 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
-from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import NnmCase
-from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 
 pytestmark = pytest.mark.parallel(1)
@@ -106,16 +104,3 @@ def test_a_free_motion_decays_as_the_mode_says():
     predicted = solve_ivp(slow, (0, times[len(mean) - 1]), [mean[0]], rtol=1e-8).y[0, -1]
     assert mean[-1] < 0.6 * mean[0]
     assert np.log(mean[-1] / mean[0]) == pytest.approx(np.log(predicted / mean[0]), rel=0.004)
-
-
-def test_a_branch_is_resumed_from_its_file(tmp_path):
-    """A branch that has used up its points goes on to the same bits."""
-    whole = case_of(TWO_MASSES, modes=[2], points=8)
-    for name in ("whole", "parts"):
-        (tmp_path / name).mkdir()
-    follow_all(whole, tmp_path / "whole", MPI.COMM_SELF)
-    follow_all(case_of(TWO_MASSES, modes=[2], points=4), tmp_path / "parts", MPI.COMM_SELF)
-    follow_all(whole, tmp_path / "parts", MPI.COMM_SELF, resume=True)
-    (name,) = [path.name for path in (tmp_path / "whole").glob("*.h5")]
-    assert len(read_branch(tmp_path / "parts" / name).regular()) == 9
-    assert_same_bits(datasets(tmp_path / "whole" / name), datasets(tmp_path / "parts" / name))

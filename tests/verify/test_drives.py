@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.integrate import solve_ivp
 
 from tests.conftest import run_of
 from vipetsc.case import Case, CaseError
@@ -181,92 +179,3 @@ def test_samples_travel_with_the_case(tmp_path):
     assert other.model() != case.model()
     with pytest.raises(CaseError, match=r"drive\.samples\.file.*lab\.h5"):
         case_of(drive)
-
-
-@pytest.mark.parametrize(("engine", "error"), [("ts", 1e-9), ("propagator", 2e-14)])
-def test_drives_superpose(engine, error):
-    """Without contacts the motion under three drives is the sum of those under each, to rounding in exact steps."""
-    drives = [
-        BURST,
-        {"waveform": "impulse", "amplitude": 1e-3, "duration": 7e-4, "cell": 11},
-        {"waveform": "step", "amplitude": 2e-6, "ramp": 3e-3, "end": "right"},
-    ]
-    together = run_of(case_of(*drives, engine=engine))
-    alone = [run_of(case_of(drive, engine=engine))["displacement"].values for drive in drives]
-
-    assert relative_error(together["displacement"].values, np.sum(alone, axis=0)) < error
-    assert ledger_error(together) < 1e-9
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_further_drive_acts_beside_a_weak_motion(engine):
-    """A first drive of amplitude 0 is none: others act as they do alone, however weak the motion at t = 0 is."""
-    alone = run_of(case_of(BURST, engine=engine))
-    struck = {"kind": "velocity", "cell": 8, "velocity": 1e-9}
-    beside = run_of(case_of({"amplitude": 0.0}, BURST, engine=engine, initial=struck))
-    assert relative_error(beside["displacement"].values, alone["displacement"].values) < 1e-6
-    assert ledger_error(beside) < 1e-9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("end", ["left", "right"])
-def test_a_moved_end_against_another_integrator(engine, end):
-    """A wall of given motion x(t) acts on a mass by the force k (x - u), and its work is the integral of k (x - u) x'.
-
-    SciPy's DOP853 integrates the same equations.
-    """
-    chirp = {
-        "waveform": "chirp",
-        "amplitude": 2e-5,
-        "frequency": 600.0,
-        "bandwidth": 700.0,
-        "duration": 0.02,
-        "end": end,
-    }
-    case = case_of(chirp, engine=engine, lattice={"cells": 3})
-    chain = case.model().chain
-    wave = case.model().drive
-    k = chain.stiffness_matrix().toarray()
-    masses = chain.masses()
-    n = len(masses)
-    moved = 0 if end == "left" else n - chain.cell.dofs
-    spring = chain.cell.springs[0].stiffness
-
-    def rate(t, y):
-        u = y[:n]
-        # The waveform gives the wall's displacement; its speed is a central difference.
-        h = 1e-7
-        wall = float(wave.force(t))
-        speed = float(wave.force(t + h) - wave.force(t - h)) / (2 * h)
-        acceleration = -k @ u
-        acceleration[moved] += spring * wall
-        power = spring * (wall - u[moved]) * speed
-        return [*y[n:-1], *(acceleration / masses), power]
-
-    run = run_of(case)
-
-    # No step of the reference crosses a kink of the waveform.
-    time = run["time"].values
-    y = np.zeros(2 * n + 1)
-    rows = []
-    for begin, stop in pairwise([0.0, *wave.breaks, time[-1]]):
-        inside = time[(time >= begin) & (time < stop)]
-        solved = solve_ivp(rate, (begin, stop), y, "DOP853", np.append(inside, stop), rtol=1e-11, atol=1e-16)
-        rows.append(solved.y[:, : len(inside)])
-        y = solved.y[:, -1]
-    expected = np.concatenate([*rows, y[:, None]], axis=1).T
-
-    u = run["displacement"].values.reshape(len(time), -1)
-    assert relative_error(u, expected[:, :n]) < 1e-8
-    # The bound is wider for the work: the wall's speed is a central difference with an error of its own.
-    assert relative_error(run["energy/work"].values, expected[:, -1]) < 1e-7
-    assert ledger_error(run) < 1e-9
-
-
-def test_a_moved_end_stays_where_its_samples_end():
-    """A moved end stays at the last of its samples, whereas a force is zero after its last."""
-    samples = {"time": [0.0, 1e-3, 2e-3], "value": [0.0, 0.5, 1.0]}
-    wave = waveform_of(case_of({"waveform": "samples", "samples": samples, "end": "left", "amplitude": 1e-5}).drive)
-    assert wave.duration == np.inf
-    np.testing.assert_allclose(wave.force([0.0, 1e-3, 2e-3, 1.0]), [0.0, 5e-6, 1e-5, 1e-5], rtol=1e-14)

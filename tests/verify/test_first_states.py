@@ -145,34 +145,6 @@ def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by
     assert by_weights
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("over", ["amplitude", "frequency"])
-def test_growing_amplitudes_have_the_scale_of_the_frequency_that_they_begin_at(monkeypatch, over):
-    """Growing amplitudes are followed at the frequency at which the curve begins.
-
-    A curve over the frequency has a fixed amplitude, which must not be taken for that frequency.
-    """
-    omega = 1700.0
-    states = states_from(omega, 1.5)
-    if over == "frequency":
-        amplitude = float(states.options.range[0])
-        update = {"over": over, "range": [omega, 1.1 * omega], "fixed": [amplitude]}
-        case = states.case.model_copy(update={"nfrc": states.options.model_copy(update=update)})
-        states = SteadyStates(case, RESTITUTION, amplitude)
-
-    frequencies = []
-
-    class Recorded(SteadyStates):
-        def __init__(self, case: NfrcCase, *others: Any, **named: Any) -> None:
-            super().__init__(case, *others, **named)
-            frequencies.append(case.frequency)
-
-    monkeypatch.setattr(steps, "SteadyStates", Recorded)
-    first_state(states)
-    assert frequencies
-    assert frequencies == pytest.approx([omega] * len(frequencies), rel=1e-12)
-
-
 def test_a_request_to_stop_ends_the_way_to_the_first_state(monkeypatch, by_weights):
     """Neither growing amplitudes nor growing weights go on after a request to stop."""
     states = states_from(1000.0, 3.0)

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
-from tests.conftest import simulated, small_case
+from tests.conftest import simulated
 from tests.unit.propagator_parts import mass_on_stop
 from vipetsc.case import Case
-from vipetsc.contact.search import MISSED
-from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.advance import _control_length
-from vipetsc.dynamics.ts.integrator import Integrator
 
 ENGINES = pytest.mark.parametrize("engine", ["ts", "propagator"])
 
@@ -64,17 +58,6 @@ def test_what_dashpots_dissipate_may_exceed_the_energy_by_far(engine):
     assert result.statistics["ledger_error"] < 1e-8
 
 
-def test_many_steps_between_two_samples_are_no_stall():
-    """A method of low order at a fine tolerance takes more than 10,000 steps to the next sample."""
-    case = small_case(
-        contacts={"sites": []},
-        drive={"amplitude": 1.0},
-        time={"end": 1.2e-3, "method": "2a", "rtol": 1e-12, "engine": "ts", "sample_interval": 6e-4},
-    )
-    _, result = simulated(case)
-    assert result.statistics["steps"] > 10_000
-
-
 @pytest.mark.parametrize("clearance", [0.141421356237, 0.14142135623, 0.1414213562373, 0.14142135623731])
 def test_a_mode_that_begins_at_a_turning_point_on_the_stop_goes_on(clearance):
     """The pair of two masses begins at rest within 1e-10 of the stop, with |w| = 2^1/2/10 of its second mode."""
@@ -97,63 +80,6 @@ def test_a_mode_that_begins_at_a_turning_point_on_the_stop_goes_on(clearance):
     assert result.statistics["ledger_error"] < 1e-9
 
 
-@pytest.mark.parametrize("beyond", [0.0, 5e-11, 9e-11, -5e-11, 5e-10])
-def test_a_pair_at_rest_within_the_tolerance_of_its_stop_goes_on(beyond):
-    """A site that stands at its clearance and does not approach is no change: the engine goes on to the next sample."""
-    case = small_case(lattice={"cells": 60}, contacts={"sites": [30], "clearance": 1e-3, "restitution": 1.0})
-    model = case.model()
-    layout = Layout(model, MPI.COMM_SELF)
-    engine = Integrator(model, layout)
-    cells = np.zeros((60, 2 * layout.dofs))
-    w = 1e-3 * (1 + beyond)
-    cells[29, model.chain.cell.resonator] = w
-    engine.begin(cells, np.array([[w, 0.0]]), 0.0)
-    assert engine.advance(model.sample_interval)
-    assert engine.counts["steps"] < 200
-    engine.destroy()
-
-
-def test_a_pair_at_rest_on_its_stop_that_is_pulled_into_it_begins_a_contact():
-    """The switching function rises from zero with zero rate: a change at the start at which nothing switches yet."""
-    case = small_case(lattice={"cells": 60}, contacts={"sites": [30], "clearance": 1e-3, "restitution": 1.0})
-    model = case.model()
-    layout = Layout(model, MPI.COMM_SELF)
-    engine = Integrator(model, layout)
-    cells = np.zeros((60, 2 * layout.dofs))
-    cell = model.chain.cell
-    cells[29, cell.resonator] = 1e-3
-    # All other masses pull the host away from its resonator.
-    others = [mass for mass in range(layout.dofs) if mass not in (cell.host, cell.resonator)]
-    cells[28:31, others] = -0.05
-    engine.begin(cells, np.array([[1e-3, 0.0]]), 0.0)
-    assert engine.tracker.start[0, 1] == 0.0
-    assert engine.tracker.start[0, 2] > 0.0
-    assert engine.advance(model.sample_interval)
-    assert engine.counts["switches"] == 1
-    engine.destroy()
-
-
-class Misses(Integrator):
-    """An engine whose first landing ends beside the change."""
-
-    def _judge(self, attempt, change):
-        if self.counts["missed"]:
-            return super()._judge(attempt, change)
-        return attempt, MISSED
-
-
-def test_landings_that_miss_are_counted():
-    model = small_case().model()
-    counts = []
-    for kind in (Integrator, Misses):
-        engine = kind(model, Layout(model, MPI.COMM_SELF))
-        engine.advance(0.02)
-        counts.append(engine.statistics()["missed"])
-        assert engine.counts["landings"] > 0
-        engine.destroy()
-    assert counts == [0, 1]
-
-
 @pytest.mark.parametrize(("length", "forced"), [(1e-10, 1), (1e-3, 0)])
 def test_substeps_that_are_taken_in_spite_of_their_error_are_counted(length, forced):
     """Of a force that is not smooth the shortest substep is taken and counted; a longer one is rejected."""
@@ -165,7 +91,7 @@ def test_substeps_that_are_taken_in_spite_of_their_error_are_counted(length, for
     assert cluster.state["rejected"].tolist() == [1 - forced]
 
 
-SHORTS = pytest.mark.parametrize("short", [10.0**-k for k in range(4, 15)])
+SHORTS = pytest.mark.parametrize("short", [1e-4, 1e-9, 1e-14])
 
 
 def creeping(cells: int, coupling: float, ground: float, short: float) -> tuple[Case, float]:
@@ -214,42 +140,3 @@ def test_a_mass_that_creeps_onto_a_stop_comes_to_rest_on_it(cells, coupling, gro
     # The error in the end is what is allowed to a step; in equilibrium the contact is pressed by 1e-4 of ``short``.
     final = run["displacement"].values[-1, cells // 2, 0]
     assert final == pytest.approx(rest * (1.0 - short), abs=rest * (2e-4 * short + 1e-11))
-
-
-@pytest.mark.parametrize("short", [1e-4, 1e-6, 1e-8])
-def test_impacts_of_a_creeping_mass_scale_with_what_is_left_to_press(short):
-    """The slow mode alone is left before the first impact. In units of ``short`` all motions on the stop are then one.
-
-    This one is integrated by SciPy: y = (w - D)/short, y'' + 3 y' + y = 1 - force, from the onset on.
-    """
-    run, _ = simulated(creeping(1, 0.5, 3.0, short)[0])
-    speeds = run["impacts/approach_velocity"].values / short
-    times = run["impacts/onset"].values
-
-    slow = (3 - np.sqrt(5)) / 2
-    state = np.array([0.0, slow])
-    onset = 0.0
-    expected = []
-    for _ in range(4):
-        approach = state[1]
-        expected.append((onset, approach))
-
-        def rates(t: float, y: np.ndarray, approach: float = approach) -> list[float]:
-            contact = 1e4 * max(y[0], 0.0) * (1 + 0.75 * y[1] / approach)
-            return [y[1], 1 - 3 * y[1] - y[0] - contact]
-
-        for crossing in (-1.0, 1.0):
-
-            def at_stop(t: float, y: np.ndarray) -> float:
-                return float(y[0])
-
-            at_stop.terminal = True
-            at_stop.direction = crossing
-            # One short step away from the stop, on which the motion begins.
-            away = solve_ivp(rates, (0.0, 1e-6), state, rtol=1e-12, atol=1e-16)
-            back = solve_ivp(rates, (0.0, 10.0), away.y[:, -1], events=at_stop, rtol=1e-10, atol=1e-14)
-            state = np.array([0.0, back.y[1, -1]])
-            onset += away.t[-1] + back.t[-1]
-    onsets, approaches = np.array(expected).T
-    assert speeds[:4] == pytest.approx(approaches, rel=1e-3)
-    assert times[:4] - times[0] == pytest.approx(onsets, rel=1e-3, abs=1e-6)

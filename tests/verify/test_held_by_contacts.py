@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rigs import after_a_period
-from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, UnitCell
 from vipetsc.modes.response.over_key import KeyedCase
@@ -76,32 +74,6 @@ def test_along_a_curve_over_its_law_a_contact_that_holds_the_lattice_has_the_spr
         np.testing.assert_allclose(outputs["first_displacement"], np.abs(u), rtol=1e-5)
 
 
-@pytest.mark.parametrize("side", ["plus", "minus"])
-def test_a_motion_that_opens_the_contact_returns_after_a_period(side):
-    """A steady state whose contact opens returns after a period of an independent integration.
-
-    The static load, which an open contact does not balance, pushes the lattice back against the stop.
-    """
-    states = SteadyStates(held({"side": side}, range=[1.4, 2.0], fixed=[0.5]), 1.0, 0.5)
-    point = first_state(states)
-    measured = states.measured(point.xi)
-    assert 0 < measured.closed[0] < 0.9
-    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
-    assert after_a_period(states, point, state) == pytest.approx(state, abs=2e-4 * np.abs(state).max())
-
-
-def test_growing_weights_lead_to_the_same_state_beside_a_stop_that_touches():
-    """Growing weights find a steady state that returns after a period, next to a stop that touches at rest."""
-    each = {"precompression": [DEPTH, 0.0], "pair": [[0, 1], [0, 1]], "side": ["minus", "plus"]}
-    contacts = {"sites": [1, 2], "each": each, "side": None, "pair": None, "precompression": None}
-    given = {key: value for key, value in contacts.items() if value is not None}
-    case = held(given, range=[1.4, 2.0], fixed=[0.1])
-    states = SteadyStates(case, 1.0, 0.1)
-    point = first_state(states)
-    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
-    assert after_a_period(states, point, state) == pytest.approx(state, abs=1e-3 * np.abs(state).max())
-
-
 def test_the_unit_of_a_curve_is_its_largest_linear_motion():
     """The unit of a curve's amplitudes is the largest linear motion in its range, which a resonance determines.
 
@@ -122,41 +94,7 @@ def test_a_lattice_that_walls_hold_has_its_own_springs_alone():
 SPRINGS = [{"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 1.0}]
 SPRUNG = {"masses": [1.0, 0.5], "springs": SPRINGS, "contact": [1, 2]}
 IN_A_CELL = {"sites": [2], "pair": [1, 2], "side": "plus", "clearance": 0.1, "precompression": None}
-GRAINS = {"masses": [1.0], "contact": [1, 1]}
-WITH_RESONATORS = {"masses": [1.0, 0.5], "springs": [SPRINGS[1]], "contact": [1, 2]}
 PRESSED = {"clearance": 0.0, "precompression": DEPTH}
-BETWEEN_CELLS = {"sites": [1, 2], "pair": [1, 1], "next_cell": True}
-RING = {"sites": [1, 2, 3], "pair": [1, 1], "next_cell": True}
-BOTH_SIDES = BETWEEN_CELLS | {"side": "both", "clearance": 0.01, "precompression": None}
-
-
-@pytest.mark.parametrize(
-    ("cell", "ends", "damping", "contacts", "force"),
-    [
-        pytest.param(SPRUNG, "free", {"mass": DASHPOT}, IN_A_CELL, 0.3, id="dashpots"),
-        pytest.param(SPRUNG | {"grounding": [DASHPOT, 0.0]}, "free", {}, IN_A_CELL, 0.3, id="a dashpot"),
-        pytest.param(SPRUNG, "periodic", {"mass": DASHPOT}, IN_A_CELL, 0.3, id="a ring"),
-        pytest.param(GRAINS, "free", {"mass": DASHPOT}, BETWEEN_CELLS, 0.2, id="grains"),
-        pytest.param(GRAINS, "free", {}, BETWEEN_CELLS, 0.2, id="grains without loss"),
-        pytest.param(GRAINS, "periodic", {"mass": DASHPOT}, RING, 0.2, id="a ring of grains"),
-        pytest.param(GRAINS, "free", {"mass": DASHPOT}, BOTH_SIDES, 0.02, id="grains apart"),
-        pytest.param(WITH_RESONATORS, "free", {"mass": DASHPOT}, BETWEEN_CELLS, 0.2, id="resonators"),
-        pytest.param(WITH_RESONATORS, "periodic", {"mass": DASHPOT}, RING, 0.2, id="a ring of resonators"),
-        pytest.param(WITH_RESONATORS, "free", {"mass": DASHPOT}, BOTH_SIDES, 0.1, id="resonators apart"),
-    ],
-)
-def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, damping, contacts, force):
-    """Steady states of lattices with contacts between their own masses return after a period.
-
-    The contact forces add up to zero over the lattice, so that its mean position is arbitrary.
-    """
-    lattice = {"cells": 3, "ends": ends, "cell": cell, "damping": damping}
-    case = held(contacts, lattice, range=[1.3, 2.0], fixed=[force], infinite=False)
-    states = SteadyStates(case, 1.0, force)
-    point = first_state(states)
-    assert min(states.measured(point.xi).closed) > 0
-    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(3))])
-    assert after_a_period(states, point, state) == pytest.approx(state, abs=2e-4 * np.abs(state).max())
 
 
 def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():

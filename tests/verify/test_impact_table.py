@@ -41,7 +41,7 @@ def test_the_impulse_of_an_impact_is_the_change_of_momentum(engine, law, restitu
 
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear", "rigid"])
-@pytest.mark.parametrize("clearance", [0.01, 0.02, 0.03, 0.05])
+@pytest.mark.parametrize("clearance", [0.01, 0.03])
 def test_an_onset_at_the_border_of_two_steps_is_an_impact(law, clearance):
     """The log has the full approach velocity of a mass that comes to its stop where a step of the engine ends."""
     stiffness = {"law": law}

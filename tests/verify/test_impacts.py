@@ -30,7 +30,7 @@ def effective_restitution(r: float) -> float:
 
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
-@pytest.mark.parametrize("restitution", [0.95, 0.7, 0.3])
+@pytest.mark.parametrize("restitution", [0.7, 0.3])
 def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     """An isolated impact has the effective restitution e of its law, and the loss mu v^2 (1 - e^2)/2."""
     # The springs are so soft that they do not matter during one impact.
@@ -68,28 +68,6 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
 
     reduced_mass = masses[0] * masses[1] / sum(masses)
     assert episode["loss"] == pytest.approx(0.5 * reduced_mass * (1 - rebound**2), rel=1e-7)
-
-
-def test_clipped_contacts_never_pull():
-    """The law with restitution 0 pulls late in an impact, where clipping keeps the force at zero."""
-    _, allowed = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "allow"}))
-    _, clipped = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "clip"}))
-
-    assert allowed.statistics["pulled"] > 0
-    assert allowed.statistics["clipped"] == 0
-    assert clipped.statistics["pulled"] == 0
-    assert clipped.statistics["clipped"] > 0
-    assert allowed.statistics["ledger_error"] < 1e-8
-    assert clipped.statistics["ledger_error"] < 1e-8
-
-
-def test_a_floor_on_the_approach_velocity_is_counted():
-    """The statistics count the impacts whose approach velocity is below the floor."""
-    run, result = simulated(small_case(contacts={"approach_floor": 0.3}))
-
-    slow = np.abs(run["impacts/approach_velocity"].values) < 0.3
-    assert slow.any()
-    assert result.statistics["floored"] == slow.sum()
 
 
 @pytest.fixture(scope="module", params=["ts", "propagator"])

@@ -5,23 +5,19 @@ SciPy's integration and the cubic oscillator's closed forms confirm them.
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import vipetsc
-from tests.rigs import period_map, rate_of
+from tests.rigs import period_map
 from tests.steady_states import CUBIC_OSCILLATOR, motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.endings import Ending
 from vipetsc.figures.registry import draw
-from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.sweeps import measure
 from vipetsc.modes.response import isolated
@@ -101,64 +97,6 @@ def test_its_two_ends_are_folds_of_the_flow(curves):
         period = period_map(states, point, state)
         assert np.abs(period.end - state).max() < 1e-5 * np.abs(state).max()
         assert np.abs(period.multipliers - 1).min() < 1e-2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("place", "stays"), [(-0.01, True), (0.01, False)])
-def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stays):
-    """A motion that begins on the isola stays large below the isola's upper end, and falls to the main curve beyond.
-
-    SciPy integrates from a stable state near that end, at frequencies 1 % below and above it.
-    """
-    _, (_, isola) = curves
-    states = equations()
-    stable = [point for point in isola.points if point.measured.unstable == 0 and point.kind == "regular"]
-    upper = measure(isola, "frequency").max()
-    begin = min(stable, key=lambda point: abs(point.measured.frequency - upper * 0.99))
-
-    omega = upper * (1 + place)
-    periods = 150
-    rate = rate_of(states, omega, 0.18)
-    end = 2 * np.pi / omega * periods
-    late = np.linspace(0.97 * end, end, 400)
-    motion = solve_ivp(rate, (0, end), state_of(states, begin), "DOP853", t_eval=late, rtol=1e-5, atol=1e-7)
-
-    largest = np.abs(motion.y[0]).max()
-    assert (largest > 1.3) == stays
-    if not stays:
-        assert largest < 0.5
-
-
-def test_where_there_is_none_no_file_is_left(tmp_path):
-    """At 0.15 N no isolated curve exists, and the search leaves no file; at 0.18 N there is one."""
-    assert len(follow_all(absorber(0.15), tmp_path, MPI.COMM_SELF)) == 1
-
-
-def put_main(curves, folder: Path) -> None:
-    """Copy the main curve into another ``folder``, in which a resumed search for isolated curves goes on from it."""
-    begun, (main, _) = curves
-    shutil.copy(begun / f"branch-{main.name}.h5", folder)
-
-
-def test_a_stopped_isola_goes_on_to_the_same_bits(curves, tmp_path):
-    _, (_, isola) = curves
-    put_main(curves, tmp_path)
-    first = follow_all(absorber(points=40), tmp_path, MPI.COMM_SELF, resume=True)
-    assert [curve.complete for curve in first] == [True, False]
-    more = follow_all(absorber(), tmp_path, MPI.COMM_SELF, resume=True)
-    assert [point.xi.tolist() for point in more[1].points] == [point.xi.tolist() for point in isola.points]
-
-
-def test_legends_number_isolas_beside_the_keys(curves):
-    folder, _ = curves
-    loaded = []
-    for path in sorted(folder.glob("branch-*.h5")):
-        with vipetsc.open(path) as data:
-            loaded.append(data.load())
-    assert legend_of(loaded) == ["r1-0.18-isola-1", "r1-0.18"]
-    weaker = loaded[1].assign(amplitude=loaded[1]["amplitude"] / 2)
-    texts = [text.replace("\u00a0", " ") for text in legend_of([*loaded, weaker])]
-    assert texts == ["amplitude 0.18 N, isola 1", "amplitude 0.18 N", "amplitude 0.09 N"]
 
 
 # The oscillator under a force of 0.3 N. The range of frequencies ends between its two folds, which are at 1.32 and

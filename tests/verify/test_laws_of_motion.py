@@ -13,6 +13,7 @@ import xarray as xr
 from tests.conftest import InParts, StopAt, assert_same_bits, datasets, run_of, simulated, with_sections
 from tests.units import HUGE, TINY, assert_same_motion
 from tests.zoo import ZOO
+from tests.zoo_by_scipy import is_known, motion_by_scipy
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
@@ -34,9 +35,17 @@ def run_in_zoo(name: str, engine: str) -> xr.Dataset:
     return in_zoo(name, engine)[0]
 
 
-def runs(condition: str) -> Any:
-    """Return parameters for both engines and the lattices with a ``condition``, a property of their kinds."""
-    return pytest.mark.parametrize(("name", "engine"), [pair for pair in ENGINES if getattr(ZOO[pair[0]], condition)])
+def in_turn(condition: str | None = None) -> Any:
+    """Return parameters of the lattices with a ``condition``, a property of their kinds; the engines take turns.
+
+    Both engines move as one: what holds for the motions of one of them holds for those of the other.
+    """
+    names = [name for name, kind in ZOO.items() if condition is None or getattr(kind, condition)]
+    pairs = []
+    for number, name in enumerate(names):
+        engines = ZOO[name].engines
+        pairs.append((name, engines[number % len(engines)]))
+    return pytest.mark.parametrize(("name", "engine"), pairs)
 
 
 def largest(run: xr.Dataset, name: str = "velocity") -> float:
@@ -77,6 +86,18 @@ def test_engines_agree(name):
     assert_engines_agree(in_zoo(name, "propagator"), in_zoo(name, "ts"))
 
 
+@pytest.mark.parametrize("name", [name for name, kind in ZOO.items() if is_known(kind.table("ts"))])
+def test_the_motion_is_that_of_scipy(name):
+    """SciPy's integrator finds the same motion and as many impacts, from equations written by the case's table."""
+    engine = ZOO[name].engines[0]
+    run = run_in_zoo(name, engine)
+    expected, impacts = motion_by_scipy(name, ZOO[name].table(engine), run.sizes["time"])
+    np.testing.assert_allclose(run["displacement"][::10], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    # Contacts that touch at rest have no onsets there.
+    if impacts:
+        assert run.sizes["episode"] == impacts
+
+
 @pytest.mark.slow
 def test_engines_agree_on_half_of_the_builtin_run():
     """The built-in run has 80 impacts up to 0.44 s."""
@@ -115,11 +136,7 @@ def assert_engines_agree(exact: tuple[xr.Dataset, dict[str, Any]], stepped: tupl
         assert error < 0.05 * lost
 
 
-# The engines take turns.
-@pytest.mark.parametrize(
-    ("name", "engine"),
-    [(name, kind.engines[number % len(kind.engines)]) for number, (name, kind) in enumerate(ZOO.items())],
-)
+@in_turn()
 def test_a_stopped_run_goes_on_to_the_same_bits(name, engine, tmp_path):
     """A run that is stopped in its middle and called again leaves the file of a run that goes on."""
     case = Case.from_table(ZOO[name].table(engine))
@@ -131,11 +148,12 @@ def test_a_stopped_run_goes_on_to_the_same_bits(name, engine, tmp_path):
     assert_same_bits(datasets(tmp_path / "whole" / "run.h5"), datasets(tmp_path / "stopped" / "run.h5"))
 
 
-@pytest.mark.parametrize("units", [TINY, HUGE], ids=["tiny", "huge"])
-@runs("scaled")
-def test_results_do_not_depend_on_units(name, engine, units):
+@pytest.mark.parametrize(("name", "engine"), [pair for pair in ENGINES if ZOO[pair[0]].scaled])
+def test_results_do_not_depend_on_units(name, engine):
     """No length, force or energy in the program is absolute: each bit stays where powers of numbers are exact."""
     kind = ZOO[name]
+    # Each engine has either change of units in half of the lattices.
+    units = [TINY, HUGE][(list(ZOO).index(name) + (engine == "ts")) % 2]
     run = run_of(Case.from_table(units.of_table(kind.table(engine), kind.key_units())))
     tolerance = 0.0
     if not kind.exact:
@@ -143,7 +161,7 @@ def test_results_do_not_depend_on_units(name, engine, units):
     assert_same_motion(run, run_in_zoo(name, engine), units, tolerance)
 
 
-@runs("turned")
+@in_turn("turned")
 def test_motion_changes_its_sign_with_its_cause(name, engine):
     """A lattice that is turned round, with its stops and even springs, moves the other way, to the bit."""
     run = run_in_zoo(name, engine)
@@ -176,7 +194,7 @@ def turned_round(value: Any, key: str = "") -> Any:
     return value
 
 
-@runs("mirrored")
+@in_turn("mirrored")
 def test_a_lattice_may_be_counted_from_its_other_end(name, engine):
     """A lattice with left and right exchanged moves as the mirror image."""
     run = run_in_zoo(name, engine)
@@ -237,7 +255,7 @@ def test_a_ring_may_be_counted_from_any_cell(engine):
         assert np.abs(difference).max() < 1e-7 * largest(run)
 
 
-@runs("linear_without_sites")
+@in_turn("linear_without_sites")
 def test_motion_without_contact_is_proportional(name, engine):
     """Before the first contact twice the cause has twice the effect, bitwise."""
     table = with_sections(ZOO[name].table(engine), {"contacts": {"clearance": 1.0}})

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rigs import TWO_MASSES, followed
+from tests.rigs import TWO_MASSES
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice.compliance.by_modes import ModalCompliance
 from vipetsc.modes import stability
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -28,23 +27,6 @@ def rig(sites: list[int], **nfrc: Any) -> NfrcCase:
             "nfrc": TWO_MASSES["nfrc"] | options,
         }
     )
-
-
-def test_a_state_takes_a_few_thousand_compliances(tmp_path, monkeypatch):
-    """A state and its stability evaluate the compliance, a sum over 200 poles, at fewer than 5,000 frequencies."""
-    evaluated = 0
-    at = ModalCompliance.at
-
-    def counted(self, omegas):
-        nonlocal evaluated
-        evaluated += np.size(omegas)
-        return at(self, omegas)
-
-    monkeypatch.setattr(ModalCompliance, "at", counted)
-    _, points = followed(rig([3], points=20), tmp_path / "long")
-    assert len(points) >= 20
-    assert all(point.measured.episodes for point in points)
-    assert 0 < evaluated < 5000 * len(points)
 
 
 def test_stops_that_are_not_touched_do_not_count(monkeypatch):

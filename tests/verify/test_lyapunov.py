@@ -147,13 +147,6 @@ def test_a_stopped_run_goes_on_to_the_same_exponent(tmp_path, engine, looks):
     assert float(measured["lyapunov"]) == straight.statistics["lyapunov"]
 
 
-def test_a_run_without_an_exponent_says_why():
-    """A run too short for one, and one that never moves."""
-    short = simulate(Case.from_table(EXPONENT_OF_CHAIN | {"time": EXPONENT_OF_CHAIN["time"] | {"end": 0.02}}))
-    assert "lyapunov" not in short.statistics
-    assert any("Lyapunov" in text and "time.end" in text for text in short.warnings)
-
-
 class Stopped:
     """An engine of one mass that stands where it is: its ``cells`` (1, 2), and of a contact the mode and approach."""
 
@@ -198,11 +191,3 @@ def test_a_closed_contact_has_its_approach_as_a_part_of_the_state():
     assert observer.growth[-1] == pytest.approx((2.0, 1.0, np.log(8.0)), rel=1e-9)
     assert companion.state["cells"][0, 1] - 1.0 == pytest.approx(1e-6, rel=1e-6)
     assert companion.state["sites"]["approach"][0] - 1.2 == pytest.approx(5e-7, rel=1e-6)
-
-
-def test_the_mean_begins_anew_where_a_deviation_vanishes():
-    """The growth before is left out, and a new deviation begins."""
-    companion = Stopped([0.0, 1.0], 0, 0.0)
-    observer = compared(Stopped([0.0, 1.0], 0, 0.0), companion)
-    assert observer.growth == []
-    assert np.abs(companion.state["cells"] - [[0.0, 1.0]]).max() == pytest.approx(1e-6)

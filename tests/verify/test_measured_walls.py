@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import h5py
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
 
 from vipetsc.case import Case
 from vipetsc.case.section import CaseError
-from vipetsc.dynamics import simulate
-from vipetsc.lattice.drive import Drive, joined
+from vipetsc.lattice.drive import joined
 
 SPAN = 0.4  # s
 
@@ -74,103 +70,6 @@ def table(drive, engine="ts", **sections):
         "drive": {"amplitude": 2.0, "end": "left"} | drive,
         "time": {"end": 0.3, "engine": engine, "rtol": 1e-11, "samples": 601},
     } | sections
-
-
-def wall(drive):
-    """The displacement and the velocity of the wall in a ``drive``, as functions of time, and their kinks."""
-    if drive["waveform"] == "samples":
-        order = {"displacement": 0, "velocity": 1, "acceleration": 2}[drive["samples"]["quantity"]]
-        motion = joined(TIMES, VALUES, "linear", order).curve
-        slope = motion.derivative()
-        inside = lambda f: lambda t: 2.0 * float(f(t)) * (t < TIMES[-1])  # noqa: E731
-        return inside(motion), inside(slope), TIMES
-    if drive["waveform"] == "chirp":
-
-        def chirp(t):
-            s = np.clip(min(t, 0.2 - t) / 0.05, 0.0, 1.0)
-            return 2.0 * (10 * s**3 - 15 * s**4 + 6 * s**5) * np.sin(t * 30.0 + 100.0 * t**2)
-
-        def slope(t):
-            # Differences of the fourth order.
-            h = 1e-4
-            return (8 * (chirp(t + h) - chirp(t - h)) - chirp(t + 2 * h) + chirp(t - 2 * h)) / (12 * h)
-
-        return chirp, slope, [0.05, 0.15, 0.2]
-    omega, cycles = 50.0, 3
-    end = 2 * np.pi * cycles / omega
-
-    def burst(t):
-        return 2.0 * (1 - np.cos(omega * t / cycles)) * np.sin(omega * t) * (t < end)
-
-    def rate(t):
-        slow = omega * t / cycles
-        value = np.sin(slow) / cycles * np.sin(omega * t) + (1 - np.cos(slow)) * np.cos(omega * t)
-        return 2.0 * omega * value * (t < end)
-
-    return burst, rate, [end]
-
-
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-@pytest.mark.parametrize(
-    "drive",
-    [
-        {"waveform": "samples", "samples": SAMPLES | {"quantity": "velocity"}},
-        {"waveform": "samples", "samples": SAMPLES | {"quantity": "acceleration"}},
-        {"waveform": "burst", "frequency": 50.0, "cycles": 3},
-        {"waveform": "chirp", "frequency": 50.0, "bandwidth": 40.0, "duration": 0.2, "ramp": 0.05},
-    ],
-)
-def test_a_damped_wall_agrees_with_dop853(engine, drive):
-    """Compares displacements, the work of the wall and the losses of all dashpots with their own integrals."""
-    run = simulate(Case.from_table(table(drive, engine))).dataset
-    moved, rate, kinks = wall(drive)
-    masses = np.tile([0.1, 0.05], 4)
-
-    def equations(t, y):
-        u, v = np.split(y[:16], 2)
-        # Places of the first masses with both walls.
-        x, dx = np.zeros((2, 6))
-        x[0], x[1:5] = moved(t), u[::2]
-        dx[0], dx[1:5] = rate(t), v[::2]
-        pull, inner = np.diff(x), u[1::2] - u[::2]
-        pull_rate, inner_rate = np.diff(dx), v[1::2] - v[::2]
-        along = 900.0 * (pull + BETA * pull_rate)
-        inside = 400.0 * (inner + BETA * inner_rate)
-        force = np.zeros(8)
-        force[::2] = np.diff(along) + inside
-        force[1::2] = -inside
-        work = -along[0] * rate(t)
-        loss = BETA * (900.0 * np.sum(pull_rate**2) + 400.0 * np.sum(inner_rate**2))
-        return np.concatenate([v, force / masses, [work, loss]])
-
-    times = run["time"].values
-    y = np.zeros(18)
-    found = np.zeros((18, len(times)))
-    bounds = np.unique([0.0, *kinks, times[-1]])
-    for a, b in itertools.pairwise(bounds):
-        inside = (times >= a) & (times <= b)
-        # Up to just before a kink, at which the velocity may jump.
-        part = solve_ivp(equations, (a, b * (1 - 1e-13)), y, "DOP853", rtol=1e-11, atol=1e-13, dense_output=True)
-        found[:, inside] = part.sol(times[inside])
-        y = part.y[:, -1]
-
-    u = run["displacement"].values.reshape(len(times), -1)
-    np.testing.assert_allclose(u, found[:8].T, atol=3e-7 * np.abs(u).max())
-    for name, values in (("work", found[16]), ("dissipated_by_damping", found[17])):
-        np.testing.assert_allclose(run[f"energy/{name}"], values, atol=2e-6 * found[16].max(), err_msg=name)
-
-
-def test_the_responses_of_dashpots_are_integrals():
-    """The change of modes by the velocity of a wall is that of quadrature."""
-    wave = Case.from_table(table({"waveform": "burst", "frequency": 50.0, "cycles": 3})).model().drives[0].waveform
-    frequency = np.array([0.0, 30.0, 77.0])
-    found = Drive(wave, 0, 0, damping=3.0).response(frequency, 0.02, 0.3)
-    for w, value in zip(frequency, found, strict=True):
-        parts = [
-            quad(lambda s, f=f, w=w: f(w * (0.3 - s)) * float(wave.rate(s)), 0.02, 0.3, limit=400)[0]
-            for f in (np.cos, np.sin)
-        ]
-        assert value == pytest.approx(complex(*parts), abs=1e-8)
 
 
 def test_tables_of_records_drive_a_wall(tmp_path):

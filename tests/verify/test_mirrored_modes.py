@@ -113,7 +113,7 @@ SIDES = [
 
 
 @pytest.mark.parametrize(("sides", "halved", "stops"), SIDES)
-@pytest.mark.parametrize("map_name", ["auto", "half", "whole"])
+@pytest.mark.parametrize("map_name", ["auto", "whole"])
 def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map_name):
     """Branches of mirror-symmetric modes pass the grazing of two contacts and reach the end of their range.
 

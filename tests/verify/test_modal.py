@@ -7,7 +7,7 @@ from tests.conftest import run_of, small_case
 from vipetsc import Case
 from vipetsc.figures.modal import MovedEnergies
 from vipetsc.lattice import modes
-from vipetsc.spectra import ModalParts, upper_fraction
+from vipetsc.spectra import ModalParts
 from vipetsc.studies.analysis import analyse
 
 # The indices of the bands among the parts of the four-band lattice's spectrum; the other parts are gaps.
@@ -59,23 +59,6 @@ def test_modal_energies_of_the_built_in_run(builtin):
     parts = ModalParts.of(Case.of(run).model().chain)
     at_ends = np.flatnonzero(~np.isin(parts.part, BANDS))
     assert parts.modes.frequency[at_ends] == pytest.approx([2034.825] * 2, abs=1e-3)
-
-
-# 0.25 s is left out: amid the first contacts the share changes by a tenth from one sample to the next.
-@pytest.mark.slow
-@pytest.mark.parametrize(("time", "share"), [(0.3, 0.1113), (0.4, 0.2351), (0.5, 0.3365), (0.6, 0.3385)])
-def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
-    """The share of the upper bands in the work of the built-in run has known values at four times."""
-    run, analysis = builtin
-    model = Case.of(run).model()
-    sample = int(np.searchsorted(run["time"].values, time - 1e-9))
-    u = run["displacement"].values[sample]
-    v = run["velocity"].values[sample]
-
-    assert upper_fraction(model.chain, model.drive, u, v, run["energy/work"].values[-1]) == pytest.approx(
-        share, abs=1e-4
-    )
-    assert analysis["upper_share_at_end"].item() == pytest.approx(0.3385, abs=6e-5)
 
 
 def test_transfers_close_the_ledger_of_every_cluster(builtin):
@@ -140,20 +123,6 @@ def test_work_of_the_drive_is_no_transfer():
 
     total = run["energy/kinetic"].values[-1] + run["energy/spring"].values[-1]
     assert transfer.sum() + analysis["bands/drive_work"].values.sum() == pytest.approx(total, rel=1e-12)
-
-
-def test_without_contacts_all_is_work_of_the_drive():
-    """Without contacts every part's energy is the work of the drive on it, and there are no transfers."""
-    run = run_of(small_case(contacts={"sites": 0}, time={"engine": "propagator", "end": 0.08}))
-    model = Case.of(run).model()
-    analysis = analyse(run, ("modal", "transfers"))
-    parts = ModalParts.of(model.chain)
-    rest = np.zeros(len(parts.part), complex)
-    span = np.array([0.0, model.drive.duration])
-    expected = parts.driven_change(rest, model.drives, span)
-
-    assert analysis["bands/drive_work"].values == pytest.approx(expected, abs=1e-9 * expected.sum())
-    assert analysis["bands/transfer"].shape == (0, 8)
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])

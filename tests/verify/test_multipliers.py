@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 
@@ -13,8 +11,6 @@ from vipetsc.case import NnmCase
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches import condensed
 from vipetsc.modes.branches.condensed import CondensedMethod, state_of
-from vipetsc.modes.branches.files import read_branch
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.system import System
@@ -45,29 +41,6 @@ def test_a_breather_and_its_multiplier_are_those_of_shooting():
     # The breather is unstable; all multipliers of a stable one would have the modulus 1.
     assert orbit.multiplier > 1.3
     assert point.multiplier == pytest.approx(orbit.multiplier, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_branch_is_stored_with_its_multiplier_and_resumed(tmp_path):
-    """A branch of breathers has the same points in one piece and in two."""
-    short = tmp_path / "short"
-    whole = tmp_path / "whole"
-    short.mkdir()
-    whole.mkdir()
-    (branch,) = follow_all(breather_case(), short, MPI.COMM_SELF)
-    assert branch.name == "breather-1600"
-    assert branch.ended.sentence.startswith("2 points reached")
-
-    stored = read_branch(short / "branch-breather-1600.h5")
-    assert [point.multiplier for point in stored.points] == [point.multiplier for point in branch.points]
-    assert min(point.multiplier for point in stored.points) > 1.3
-
-    longer = breather_case(points=3)
-    (resumed,) = follow_all(longer, short, MPI.COMM_SELF, resume=True)
-    (once,) = follow_all(longer, whole, MPI.COMM_SELF)
-    energies = [point.energy for point in once.points]
-    assert [point.energy for point in resumed.points] == energies
-    assert np.all(np.diff(energies) > 0)
 
 
 @pytest.mark.parametrize("sites", [[1], [1, -2]])

@@ -2,115 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import eigh
 from scipy.optimize import root
 
-from tests.conftest import assert_same_bits, datasets, run_of
 from tests.models import CLEARANCE
-from tests.steady_states import (
-    CONTACTS,
-    CUBIC_OSCILLATOR,
-    LATTICE,
-    curve_of,
-    first_harmonic,
-    motion_at,
-    nfrc_case,
-    refined,
-)
-from vipetsc.case import Case, CaseError
+from tests.steady_states import curve_of, nfrc_case
+from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.figures.registry import draw
 from vipetsc.lattice import DenseCompliance, Spring
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.sweeps import ParameterSweep, measure, sweep_down, sweep_up, swept, with_stable_folds
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.stability import Hill
 
 pytestmark = pytest.mark.parallel(1)
 
 THREE = {"sites": [10, 12, 15], "clearance": [CLEARANCE, 0.97 * CLEARANCE, 0.9 * CLEARANCE], "restitution": 0.7}
-
-
-def varied(case: NfrcCase, **options: Any) -> NfrcCase:
-    """The same case with other ``options`` of its section [nfrc]."""
-    return case.model_copy(update={"nfrc": case.nfrc.model_copy(update=options)})
-
-
-@pytest.mark.parametrize("detuning", [3e-7, 1e-4, 1e-2])
-def test_the_derivative_by_frequency_is_exact_beside_a_mode_that_hardly_moves_the_pair(detuning):
-    """The drive's term changes as the lattice with a spring of the shift at its pair, by d(D^-1)/domega = 2 omega/D^2.
-
-    A mode of such a lattice is at 3e-6 of the frequency of the lattice's own mode.
-    """
-    cell = {
-        "masses": [1.0, 0.15],
-        "springs": [
-            {"start": 1, "end": 1, "stiffness": 1e3, "next_cell": True},
-            {"start": 1, "end": 2, "stiffness": 4e4},
-        ],
-    }
-    table = {
-        "lattice": {"cells": 3, "cell": cell},
-        "contacts": {"law": "bilinear", "stiffness": 1e4, "restitution": 1.0, "sites": [2], "clearance": 1e-3},
-        "drive": {"waveform": "harmonic", "frequency": 20.0, "cell": 1, "amplitude": 1.0},
-        "time": {"end": 1.0},
-        "nfrc": {"source": "force", "over": "frequency", "infinite": False, "harmonics": 5, "range": [10.0, 30.0]},
-    }
-    table["nfrc"]["fixed"] = [1.0]
-    states = SteadyStates(NfrcCase.from_table(table), restitution=1.0, fixed=1.0)
-    chain = states.case.model().chain
-    stiffness = chain.stiffness_matrix().toarray()
-    masses = np.diag(chain.masses())
-    omega = np.sqrt(eigh(stiffness, masses, eigvals_only=True)[0]) * (1 + detuning)
-
-    # At rest the pair's force, and the derivative of its term, vanish.
-    rest = np.append(np.zeros(states.balance.size), omega / states.parameter.scale)
-    shift = states.shift_near(rest)
-    column = states.jacobian(rest, shift)[:, -1] * states.clearance / states.parameter.scale
-
-    first = list(states.balance.orders).index(1)
-    pair = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0])
-    push = np.eye(6)[0]
-    dynamic = stiffness + shift[first, 0, 0] * np.outer(pair, pair) - omega**2 * masses
-    expected = -2 * omega * pair @ np.linalg.solve(dynamic, masses @ np.linalg.solve(dynamic, push))
-    (place,) = np.flatnonzero(column)
-    assert column[place] == pytest.approx(expected, rel=1e-4)
-
-
-def after_a_period(chain, contact, site: int, omega: float, state: np.ndarray, force: float) -> np.ndarray:
-    """Displacements and velocities (2n,) a period after ``state`` under ``force`` cos(omega t) on the first mass.
-
-    SciPy integrates the lattice with one contact, in cell ``site`` from 0.
-    """
-    stiffness = chain.stiffness_matrix().tocsr()
-    masses = chain.masses()
-    n = len(masses)
-    host = site * chain.cell.dofs + chain.cell.host
-    resonator = site * chain.cell.dofs + chain.cell.resonator
-
-    def rate(t, y):
-        acceleration = -(stiffness @ y[:n])
-        acceleration[0] += force * np.cos(omega * t)
-        push = contact.force(y[resonator] - y[host], chain.clearances[0])
-        acceleration[resonator] -= push
-        acceleration[host] += push
-        return np.concatenate([y[n:], acceleration / masses])
-
-    # A longer step could pass over a contact.
-    solved = solve_ivp(rate, (0, 2 * np.pi / omega), state, "DOP853", rtol=1e-9, atol=1e-12, max_step=2e-4)
-    return solved.y[:, -1]
 
 
 def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
@@ -187,80 +102,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
-    """A steady state in contact, on a curve over the frequency, returns after one period of SciPy's integration."""
-    case = nfrc_case(
-        lattice={"cells": 6},
-        contacts={"sites": [3]},
-        source="force",
-        infinite=False,
-        over="frequency",
-        range=[2000.0, 2010.0],
-        fixed=[14.0],
-        harmonics=9,
-        largest_step=1.0,
-    )
-    curve = curve_of(case, tmp_path)
-    assert curve.complete, curve.ended.sentence
-
-    last = curve.points[-1]
-    assert last.measures.episodes == 2
-    assert last.measures.frequency == pytest.approx(2010)
-    # The shares are NaN: no energy leaves a lattice with ends, and these contacts lose none.
-    assert np.isnan(measure(curve, "share")).all()
-
-    few = SteadyStates(case, 1.0, 14.0)
-    many = SteadyStates(varied(case, harmonics=41), 1.0, 14.0)
-    start = np.ravel(motion_at(many, refined(few, many, last.xi), np.arange(6)))
-    end = after_a_period(case.model().chain, case.laws(1.0)[0], site=2, omega=2010.0, state=start, force=14.0)
-
-    u = slice(0, 24)
-    assert np.abs(end[u] - start[u]).max() < 1e-5 * np.abs(start[u]).max()
-
-
-@pytest.mark.slow
-def test_a_steady_state_is_where_a_long_run_ends():
-    """A long run from rest, with a lossy site under a force, ends with the first harmonic of the steady state."""
-    omega = 1023.27
-    drive = {"waveform": "harmonic", "cell": 230, "frequency": omega}
-    table = {
-        "name": "x",
-        # The lattice is so long that no wave comes back from its ends during the run.
-        "lattice": LATTICE | {"cells": 500},
-        "contacts": CONTACTS | {"sites": [250], "restitution": 0.3},
-        "drive": drive,
-    }
-
-    def states(**options: Any) -> SteadyStates:
-        common = {"source": "force", "largest_step": 1.0, "fixed": [omega]}
-        return SteadyStates(NfrcCase.from_table(table | {"nfrc": common | options}), 0.3, omega)
-
-    amplitude = 1.6 * states().parameter.scale
-    few = states(harmonics=9, range=[amplitude, 99.0])
-    many = states(harmonics=61, range=[amplitude, 99.0])
-    measures = many.measured(refined(few, many, first_state(few).xi))
-    assert measures.unstable == 0
-    assert measures.episodes == 4
-
-    # With fewer samples in a period, high harmonics would alias to the first.
-    samples = 64
-    period = 2 * np.pi / omega
-    case = Case.from_table(
-        table
-        | {
-            "drive": drive | {"amplitude": amplitude, "ramp": 40 * period},
-            "time": {"engine": "propagator", "end": 180 * period, "sample_interval": period / samples},
-            "output": {"window": [250, 250]},
-        }
-    )
-    u = run_of(case)["displacement"].values[-1 - 8 * samples : -1, 0]
-
-    found = first_harmonic(u[:, 2] - u[:, 1], samples)
-    assert found == pytest.approx(abs(measures.harmonics[0, 1]), rel=5e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("nfrc", [{}, {"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
+@pytest.mark.parametrize("nfrc", [{"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
 def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     """The shares satisfy T + R + U + L = 1, and a wave from the other side of mirrored sites has the same curve.
 
@@ -297,90 +139,6 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
 
     (picture,) = draw("branches", [tmp_path / "forward"])
     assert picture.exists()
-
-
-@pytest.mark.slow
-def test_what_a_force_gives_a_lattice_with_ends_is_lost(tmp_path):
-    """In a lattice with ends, which no energy leaves, sites dissipate all of the work in every state with contact."""
-    sites = THREE | {"sites": [3, 5, 8]}
-    options = {"source": "force", "infinite": False, "fixed": [2000.0]}
-    linear = SteadyStates(nfrc_case({"cells": 12}, sites, **options), 0.7, 2000.0).linear_motion(2000.0)
-    touching = min(sites["clearance"] / np.abs(linear.harmonics[:, 1]))
-
-    options |= {"range": [0.999 * touching, 1.02 * touching], "points": 4, "harmonics": 5}
-    curve = curve_of(nfrc_case({"cells": 12}, sites, **options), tmp_path)
-
-    touches = measure(curve, "episodes") > 0
-    assert touches.any()
-    assert measure(curve, "share")[touches, 3] == pytest.approx(1.0, abs=1e-8)
-
-
-@pytest.mark.slow
-def test_a_curve_goes_on_to_the_same_bits(tmp_path):
-    whole = tmp_path / "whole"
-    parts = tmp_path / "parts"
-    whole.mkdir()
-    parts.mkdir()
-    case = nfrc_case(harmonics=5, restitutions=[0.7], range=[0.999, 1.0005], first_step=2e-4, largest_step=3e-4)
-    curve = curve_of(case, whole)
-
-    (first,) = follow_all(varied(case, points=3), parts, MPI.COMM_SELF)
-    assert not first.complete
-    assert "increase nfrc.points" in first.ended.sentence
-
-    (second,) = follow_all(case, parts, MPI.COMM_SELF, resume=True)
-    assert second.complete
-
-    name = f"branch-{curve.name}"
-    assert_same_bits(datasets(whole / f"{name}.h5"), datasets(parts / f"{name}.h5"))
-    assert (whole / f"{name}.csv").read_text() == (parts / f"{name}.csv").read_text()
-
-    again = read_branch(whole / f"{name}.h5")
-    assert again.complete
-    assert np.array_equal(measure(again, "share"), measure(curve, "share"))
-
-    (picture,) = draw("branches", [whole])
-    assert picture.name == f"{name}.png"
-
-
-def test_sites_may_have_a_restitution_of_their_own(tmp_path):
-    """Equal restitutions in a list over sites give the curve of one for all, in a file that can be read and drawn."""
-    options = {"harmonics": 5, "range": [0.999, 1.0005], "first_step": 2e-4, "largest_step": 3e-4, "points": 3}
-    common = curve_of(nfrc_case(restitutions=[0.7], **options), tmp_path / "common")
-    each = nfrc_case(contacts={"each": {"restitution": [0.7]}}, **options)
-    curve = curve_of(each, tmp_path / "each")
-
-    assert np.array_equal([point.xi for point in curve.points], [point.xi for point in common.points])
-    assert read_branch(tmp_path / f"each/branch-{curve.name}.h5").case == each.to_toml()
-    assert draw("branches", [tmp_path / "each"])
-
-
-def test_a_resumed_curve_finds_two_folds_in_its_first_step(tmp_path):
-    """Two folds in one step are found, to the same bits, also by a command that goes on from the beginning of it.
-
-    That they may lie there shows in the direction of the point before. An oscillator with hardening springs has two
-    folds close together, at an amplitude little above that of the first fold at all.
-    """
-    table = CUBIC_OSCILLATOR | {
-        "drive": {"waveform": "harmonic", "amplitude": 0.05138, "frequency": 1.0, "cell": 1, "mass": 1},
-        "time": {"end": 100.0},
-        "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.05138], "harmonics": 3},
-    }
-    case = NfrcCase.from_table(table)
-    (whole,) = follow_all(case, None, MPI.COMM_SELF)
-    folds = [point for point in whole.points if point.kind == "fold"]
-    assert len(folds) == 2
-    # The number of a special point is that of the regular one after it.
-    assert folds[0].index == folds[1].index
-
-    # As many states as there are before the step with the folds, of which the start has the number 0.
-    (part,) = follow_all(varied(case, points=folds[0].index), tmp_path, MPI.COMM_SELF)
-    assert part.points[-1].index == folds[0].index - 1
-    (resumed,) = follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
-
-    assert [point.kind for point in resumed.points] == [point.kind for point in whole.points]
-    for name in ("xi", "tangent", "step", "next_step"):
-        assert np.array_equal(resumed.column(name), whole.column(name)), name
 
 
 def test_sweeps_jump_between_stable_states():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.models import CLEARANCE, OUT_OF_PHASE, reduced_model
-from tests.reference_flows import FiniteDifferences, Tsrk
+from tests.reference_flows import FiniteDifferences
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting
 
@@ -53,28 +53,6 @@ def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
 
     u, _ = superposed(system.stiffness, system.masses, np.zeros(2), u, v, point.period / 4 - separation[0])
     assert np.abs(u).max() <= 1e-12 * np.abs(point.x).max()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["bilinear", "hertz"])
-@pytest.mark.parametrize(("flow", "accuracy"), [(Tsrk, 1e-11)])
-def test_other_flows_agree(flow, accuracy, law, request):
-    """Orbits by PETSc's TSRK are those of the compiled flow."""
-    branch = request.getfixturevalue(law)
-    other = Shooting(flow(branch.problem.system), MAPS["quarter"], tolerance=1e-12)
-
-    for energy in (0.1, 10.0, 1e4, 1e8):
-        point = branch.at_energy(energy)
-        frame = other.relative_frame(point.x, point.period)
-        # The second unknown is held, and the search begins off the orbit, so that there is something to correct.
-        row = np.array([0.0, 1.0, 0.0])
-        attempt = frame.solve(frame.xi + 1e-6 * (1 - row), row, row @ frame.xi)
-        assert attempt.converged, attempt.history
-
-        found = frame.measures(attempt)
-        assert found.energy == pytest.approx(point.energy, rel=accuracy)
-        assert found.frequency == pytest.approx(point.frequency, rel=accuracy)
-        assert found.episodes == point.episodes
 
 
 @pytest.mark.parametrize("shooting", ["half", "whole"])

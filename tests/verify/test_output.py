@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
-from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.io import chunks
-from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
-from vipetsc.io.hdf5 import StoredArrays, read_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.store import FieldMemory, RunMemory
+from vipetsc.io.store import RunMemory
 
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
@@ -97,55 +94,6 @@ def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
     assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
 
 
-def test_episodes_stand_in_the_order_of_their_onsets():
-    """Episodes from ranks and chunks are sorted by their onsets, and by their sites where onsets are equal."""
-    given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
-    memory = RunMemory()
-    memory.begin("")
-    memory.recording = Recording(given, (), 2)
-    for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
-        log = np.zeros(len(sites), EPISODE)
-        log["site"] = sites
-        log["onset"] = onsets
-        log["loss"] = np.arange(len(sites))
-        chunk = dict.fromkeys(SAMPLED, np.zeros(1)) | {LOSSES: np.zeros((1, 3)), "impacts": log}
-        memory.append(chunk)
-    memory.finish({}, {})
-    run = memory.dataset
-
-    assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
-    assert run["impacts/site"].values.tolist() == [1, 2, 1, 1, 3]
-    assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]
-
-
-def test_arrays_come_back_as_they_were(tmp_path):
-    """Arrays have their types and shapes again, all or those that are asked for."""
-    arrays = {
-        "a": np.arange(6.0).reshape(2, 3)[:, ::2],
-        "b": np.array(7),
-        "c": np.zeros((0, 4)),
-        "d": np.array([1, -1]),
-        "energy/e": np.zeros(3, [("time", float), ("site", int)]),
-    }
-    path = tmp_path / "x.h5"
-    save_arrays(path, arrays)
-    back = StoredArrays(path)
-
-    assert {*back} == {*arrays}
-    for name, values in arrays.items():
-        assert back[name].dtype == values.dtype
-        np.testing.assert_array_equal(back[name], values)
-    assert read_arrays(path, ["d"]).keys() == {"d"}
-    assert [p.name for p in tmp_path.iterdir()] == ["x.h5"]
-
-    with pytest.raises(OSError, match=r"x\.h5 cannot be read: .*f"):
-        read_arrays(path, ["f"])
-    content = path.read_bytes()
-    path.write_bytes(content[:-1])
-    with pytest.raises(OSError, match=r"x\.h5 cannot be read"):
-        StoredArrays(path)
-
-
 def test_contacts_that_still_last_at_the_end_are_logged(folder):
     """A run that ends within a contact logs it, without a separation."""
     simulate(small_case(), folder / "whole")
@@ -165,21 +113,3 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
     assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
     assert np.isnan(cut["impacts/separation"]).any()
     assert result.statistics["episodes"] == expected.sum()
-
-
-def test_runs_in_a_common_memory_have_the_bits_of_runs_in_their_own():
-    """Runs that reuse one memory for their fields have the bits of runs with memory of their own.
-
-    The second run is shorter and finds the values of the first in the common memory.
-    """
-    fields = FieldMemory()
-    own = RunMemory()
-    own_runs = []
-    for case in (small_case(), small_case(contacts={"clearance": 1.0}, time={"end": 0.02})):
-        common = RunMemory(fields=fields)
-        for memory in (common, own):
-            simulate(case, memory)
-        own_runs.append(own.dataset)
-        assert common.dataset is not None
-        assert common.dataset.equals(own.dataset)
-    assert not np.may_share_memory(own_runs[0]["velocity"].values, own_runs[1]["velocity"].values)

@@ -10,7 +10,6 @@ import pytest
 
 from tests.conftest import StopAt, simulated, small_case
 from vipetsc.case import Case, CaseError
-from vipetsc.case.schema import only_looks
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.ts.time_stepper import TimeStepper
@@ -31,14 +30,6 @@ def test_options_are_stored_and_go_with_the_case(folder):
 
     assert not {name for name in PETSc.Options().getAll() if name.startswith("ts_")}
     assert simulate(small_case(**SHORT), folder / "plain").statistics["method"] == "8vr"
-
-
-def test_a_case_without_options_reads_and_writes_as_before():
-    assert "petsc" not in small_case().to_toml()
-
-    # Numbers become texts, as in PETSc's database.
-    options = small_case(petsc={"ts_rtol": 1e-9, "ts_max_reject": 3}).petsc.model_dump()
-    assert options == {"ts_rtol": "1e-09", "ts_max_reject": "3"}
 
 
 def test_a_run_does_not_go_on_with_other_options(folder):
@@ -89,20 +80,6 @@ def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, 
     assert main(["validate", "--set", f"petsc.{name}={value}"]) == 2
     with pytest.raises(CaseError):
         simulate(small_case(petsc={name: value}), out)
-
-
-def test_what_only_looks_is_no_part_of_a_case():
-    looks = ("log_view", "info", "malloc_debug", "ts_monitor", "ts_adapt_monitor", "options_left", "ts_view")
-    # Those of PetscAttachDebugger: where the debugger is shown, and on which ranks.
-    for name in (*looks, "start_in_debugger", "debug_terminal", "debugger_ranks", "debugger_pause", "display"):
-        assert only_looks(name)
-    for name in ("ts_rk_type", "ts_adapt_clip", "log_veiw", "ts_moniter", "ts_max_snes_failures"):
-        assert not only_looks(name)
-
-
-def test_verbs_without_time_stepping_take_no_options(capsys):
-    assert main(["bands"], {"ts_rk_type": "5dp"}) == 2
-    assert "-ts_rk_type: bands does not accept PETSc options" in capsys.readouterr().err
 
 
 def test_a_case_with_options_is_stepped():

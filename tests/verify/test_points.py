@@ -5,18 +5,13 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
+from tests.conftest import run_of, small_case
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.dynamics import recorded_sizes, simulate
-from vipetsc.io import export
-from vipetsc.io.read import open_run
 from vipetsc.spectra import histories
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.reanalysis import measure_run
 
 FREQUENCY = 900.0
 FORCE = 2.0
@@ -93,17 +88,6 @@ def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
         steady_run.isel(time=slice(0, 1350)), ["motion"], options=AnalysisTable.model_validate({"steady_periods": 8})
     )
     assert np.isfinite(brief["steady_drift/tip"])
-
-
-def test_peak_and_rms_are_those_of_the_samples(steady_run):
-    """Peak and rms are those of all samples; the rms of the steady part alone is the amplitude over sqrt(2)."""
-    measured = analyse(steady_run, ["motion"])
-    velocity = steady_run["points/velocity"].sel(point="tip").values
-
-    assert float(measured["peak_velocity/tip"]) == np.abs(velocity).max()
-    assert float(measured["rms_velocity/tip"]) == pytest.approx(np.sqrt((velocity**2).mean()), rel=1e-14)
-    last = velocity[-1396:]  # 40 periods of 0.00698 s
-    assert np.sqrt((last**2).mean()) == pytest.approx(float(measured["steady_velocity/tip"]) / np.sqrt(2), rel=2e-3)
 
 
 def test_transmission_by_part_is_that_of_each_frequency():
@@ -218,101 +202,3 @@ def _burst(drive, t: float) -> float:
         return 0.0
     phase = drive.frequency * t
     return drive.window_amplitude * (1 - np.cos(phase / drive.cycles)) * np.sin(phase)
-
-
-CUBIC_SPRINGS = [
-    {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True, "quadratic": -1e7, "cubic": 1e10},
-    {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 1e9},
-]
-# RING has nonlinear springs. BEADS are pressed together and never part.
-RING = {
-    "lattice": {"cell": DIATOMIC | {"springs": CUBIC_SPRINGS}, "cells": 9, "ends": "periodic"},
-    "drive": {"amplitude": 20.0, "cycles": 4, "frequency": 500.0, "cell": 9},
-    "time": {"end": 0.03, "samples": 3001},
-    "output": {
-        "points": [{"name": f"c{cell}m{mass}", "cell": cell, "mass": mass} for cell in (1, 9) for mass in (1, 2)]
-    },
-}
-BEADS = {
-    "lattice": {"cells": 12, "ends": "free", "cell": {"masses": [2e-3]}},
-    "contacts": {
-        "law": "hertz",
-        "stiffness": 7e9,
-        "sites": {"first": 1, "last": 11, "count": 11},
-        "next_cell": True,
-        "side": "minus",
-        "clearance": 0.0,
-        "precompression": 1e-5,
-    },
-    "drive": {"amplitude": 10.0, "cycles": 2, "frequency": 1e4},
-    "time": {"end": 2e-3, "samples": 2001},
-    "output": {"points": [{"name": f"bead{cell}", "cell": cell} for cell in (1, 2, 7)], "forces": True},
-}
-
-
-@pytest.mark.parametrize("table", [RING, BEADS], ids=["ring", "beads"])
-def test_velocities_change_by_the_accelerations(table):
-    """The integral of the acceleration by Simpson's rule is the change of velocity, also with nonlinear forces."""
-    run = run_of(Case.from_table(table))
-    a = run["points/acceleration"].values
-    v = run["points/velocity"].values
-    dt = float(run["time"][1])
-
-    # The error of Simpson's rule, of fourth order, is 1e-6 of the velocity at these intervals.
-    change = dt / 3 * (a[:-2] + 4 * a[1:-1] + a[2:])
-    # Every point moves.
-    assert np.abs(a).max(axis=0).min() > 0
-    assert np.abs(v[2:] - v[:-2] - change).max() < 1e-6 * np.abs(v).max()
-
-
-def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypatch):
-    """Records of points do not depend on windows and strides, nor others on points, and a stop changes no bit."""
-    time = {"end": 0.03, "engine": "propagator"}
-    whole = small_case(time=time, output=IMPACTS["output"])
-    # Points outside the window and between its cells are recorded as well.
-    thin = small_case(time=time, output=IMPACTS["output"] | {"window": [3, 15], "every": 3, "stride": 4})
-    plain = small_case(time=time)
-    for name, case in (("whole", whole), ("thin", thin), ("plain", plain)):
-        assert simulate(case, tmp_path / name).complete
-    runs = {name: datasets(tmp_path / name / "run.h5") for name in ("whole", "thin", "plain")}
-
-    points = {name for name in runs["whole"] if name.startswith("points/")} | {"sites/force"}
-    assert {"points/displacement", "points/velocity", "points/acceleration"} < points
-    assert_same_bits({name: runs["whole"][name] for name in points}, {name: runs["thin"][name] for name in points})
-    assert {name: values.tobytes() for name, values in runs["plain"].items()}.items() <= {
-        name: values.tobytes() for name, values in runs["whole"].items()
-    }.items()
-
-    assert np.count_nonzero(runs["whole"]["sites/force"]) > 0
-    # With several chunks the run can be stopped between two of them.
-    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 40)
-    assert simulate(whole, tmp_path / "stopped", stop=StopAt(2)).resumable
-    assert simulate(whole, tmp_path / "stopped").complete
-    assert_same_bits(runs["whole"], datasets(tmp_path / "stopped" / "run.h5"))
-
-
-def test_export_writes_histories_forces_and_numbers(tmp_path):
-    """Exported CSV files have a column for each point and site with every digit, and a table of all measures."""
-    case = small_case(
-        time={"end": 0.02, "engine": "propagator"}, output=IMPACTS["output"] | {"transmission": [["c1m1", "c6m2"]]}
-    )
-    simulate(case, tmp_path)
-    measure_run(tmp_path)
-    export.write_curves(tmp_path)
-
-    def read(name: str) -> pd.DataFrame:
-        # The default parser of pandas loses the last bit.
-        return pd.read_csv(tmp_path / "curves" / name, float_precision="round_trip")
-
-    with open_run(tmp_path / "run.h5") as run:
-        velocity = run["points/velocity"].sel(point="c6m2").values
-        assert read("run-points.csv")["c6m2 velocity (m/s)"].values.tobytes() == velocity.tobytes()
-        force = run["sites/force"].values
-        assert read("run-forces.csv")["force of site 2 (N)"].values.tobytes() == force[:, 1].tobytes()
-
-    numbers = read("analysis-measures.csv").set_index("measure")
-    assert numbers.loc["peak_velocity/c6m2", "value"] == np.abs(velocity).max()
-    assert numbers.loc["peak_velocity/c6m2", "unit"] == "m/s"
-    assert "band_transmission/c1m1-c6m2 band 2" in numbers.index
-    summary = json.loads((tmp_path / "summary.json").read_text())["measures"]
-    assert summary["peak_velocity/c6m2"] == np.abs(velocity).max()

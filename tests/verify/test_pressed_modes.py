@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from tests.condensed_branches import condensed_branch
@@ -17,12 +17,12 @@ from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact
 from vipetsc.lattice.elements import contacts, joined_stiffness
-from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_of
+from vipetsc.modes.branches.condensed import Condensed, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.flow import MAPS, Dop853Flow
-from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
+from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import ContactPair, System
 from vipetsc.studies.linear_modes import pressed_contacts
 
@@ -151,97 +151,6 @@ BEADS = 3
 BEAD = 0.01
 GRAIN = 1e6
 PRESSED = 1e-4
-GRAINS: dict[str, Any] = {
-    "name": "grains",
-    "lattice": {"cells": BEADS, "cell": {"masses": [BEAD], "springs": []}},
-    "contacts": {
-        "law": "hertz",
-        "stiffness": GRAIN,
-        "sites": [1, 1, 2, 3],
-        "clearance": 0.0,
-        "precompression": PRESSED,
-        # The contacts are those at the left wall, of two pairs of neighbours, and at the right wall.
-        "each": {
-            "pair": [[0, 1], [1, 1], [1, 1], [0, 1]],
-            "next_cell": [False, True, True, False],
-            "side": ["minus", "minus", "minus", "plus"],
-        },
-    },
-    "nnm": {"system": "chain", "modes": [2], "tolerance": 1e-12, "first_step": 0.1, "largest_step": 0.3, "points": 20},
-}
-
-
-def grain_forces(u: np.ndarray) -> np.ndarray:
-    """Forces (bead,) in N on a chain of grains between walls, which are pressed together at rest, for ``u`` in m."""
-    pressed = np.maximum(PRESSED - np.diff(u, prepend=0.0, append=0.0), 0.0) ** 1.5
-    return GRAIN * (pressed[:-1] - pressed[1:])
-
-
-@pytest.fixture(scope="module")
-def grains():
-    """The shooting problem of a chain of grains, and the branch of its second mode."""
-    case = NnmCase.from_table(GRAINS)
-    problem = ShootingMethod(case).shooting
-    start = linear_start(problem, 1, problem.system.grazing_energy(1) / 100)
-    return problem, [start, *Continuation(problem, start, case.nnm)]
-
-
-def test_grains_have_the_modes_of_a_chain_of_springs(grains):
-    """Pressed grains are springs of the slope s of Hertz's force: omega_n = 2 sqrt(s/m) sin(n pi/(2 N + 2))."""
-    problem, points = grains
-    slope = 1.5 * GRAIN * np.sqrt(PRESSED)
-    exact = 2 * np.sqrt(slope / BEAD) * np.sin(np.arange(1, BEADS + 1) * np.pi / (2 * BEADS + 2))
-    assert problem.system.linear_modes()[0] == pytest.approx(exact, rel=1e-12)
-    # The branch tends to the mode at small amplitudes: at a tenth of the depth its frequency differs by at most 1 %.
-    assert 2 * np.pi * points[0].frequency == pytest.approx(exact[1], rel=1e-2)
-    # Hertz's law is nonlinear at any amplitude, so that the frequency is not exactly that of the linearised chain.
-    assert points[0].frequency != pytest.approx(exact[1] / (2 * np.pi), rel=1e-5)
-
-
-def test_orbits_of_grains_return_by_scipy(grains):
-    """Orbits return after their period in SciPy's integration of equations written here, before and after opening."""
-    problem, points = grains
-    # Contacts have opened on the last orbit.
-    assert points[-1].episodes >= 2
-    for point in (points[4], points[-1]):
-        start = np.append(point.x, 0 * point.x)
-        motion = solve_ivp(
-            lambda t, y: np.append(y[BEADS:], grain_forces(y[:BEADS]) / BEAD),
-            (0.0, point.period),
-            start,
-            method="DOP853",
-            # An unstable orbit magnifies the errors of the integration within the period.
-            rtol=1e-11,
-            atol=1e-15,
-        )
-        end = motion.y[:, -1]
-        assert np.abs(end[:BEADS] - point.x).max() < 1e-6 * np.abs(point.x).max()
-        # The orbit starts from rest, and must be at rest again.
-        kinetic = BEAD * end[BEADS:] @ end[BEADS:] / 2
-        assert kinetic < 1e-10 * point.energy
-    u, v = sample_orbit(problem, points[-1])
-    energies = [problem.system.energy(*state) for state in zip(u, v, strict=True)]
-    assert np.ptp(energies) < 1e-10 * points[-1].energy
-
-
-def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
-    """Harmonic balance in the contacts finds the orbits of shooting, in a chain without any other springs."""
-    problem, _ = grains
-    case = NnmCase.from_table(GRAINS | {"nnm": GRAINS["nnm"] | {"method": "condensed", "truncation": 1e-6}})
-    condensed = Condensed.from_case(case)
-    system = problem.system
-    omega, shapes = system.linear_modes()
-    # The branch begins at 0.8 of the energy at which a contact opens, and its next points pass that energy.
-    amplitude = np.sqrt(2 * 0.8 * system.grazing_energy(1)) / omega[1]
-    start = condensed.motions.from_mode(system.contact_rows @ shapes[:, 1] * amplitude, float(omega[1]))
-    point = [start, *Continuation(condensed.motions, start, case.nnm.model_copy(update={"points": 6}))][-1]
-    assert point.episodes
-
-    u = np.concatenate(list(state_of(condensed.motions, point, 1).values()))
-    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
-    orbit = corrected(problem, u, point.period)
-    assert orbit.period == pytest.approx(point.period, rel=1e-7)
-    assert orbit.episodes == point.episodes
 
 
 @pytest.mark.parametrize("resonators", [False, True])
@@ -304,16 +213,6 @@ def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
     assert len(points) == 4
 
 
-def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
-    """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u`` (dof,) in m."""
-    frame = problem.frame_at("relative", u, period, np.empty(0))
-    # The amplitude is held, and the period is free.
-    row = np.append(u / np.linalg.norm(u), 0.0)
-    attempt = frame.solve(frame.xi, row, row @ frame.xi)
-    assert attempt.converged
-    return frame.measures(attempt)
-
-
 SITES: dict[str, Any] = {
     "name": "sites",
     "lattice": {"cells": 14, "cell": TWO_MASS_CELL},
@@ -327,8 +226,6 @@ SITES: dict[str, Any] = {
     },
     "nnm": {"system": "chain", "modes": [28], "tolerance": 1e-12},
 }
-# The frequency in rad/s of a breather whose contact opens, between the bands and the linear mode of a pressed site.
-OPENING = 8000.0
 
 
 def test_the_state_at_rest_is_that_of_a_run():
@@ -348,30 +245,6 @@ def test_the_state_at_rest_is_that_of_a_run():
     assert np.abs(rest).max() == 0
     assert np.all(nnm.forces(np.zeros(nnm.dofs)) == 0)
     assert nnm.energy(np.zeros(nnm.dofs), np.zeros(nnm.dofs)) == 0
-
-
-@pytest.fixture(scope="module")
-def opening():
-    """The condensed problem, the breather of the first site, whose contact opens, and the lattice's dense system."""
-    nnm = {"system": "condensed", "start_frequency": [OPENING], "truncation": 1e-6, "tolerance": 1e-11}
-    case = NnmCase.from_table(SITES | {"nnm": nnm})
-    condensed = Condensed.from_case(case)
-    point = condensed.motions.in_gap(OPENING, np.array([1.0, 0.0]))
-    return condensed, point, System.from_chain(case.chain(), [*condensed.motions.forces.contacts])
-
-
-def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
-    """A breather by Bloch waves is the one by all modes of the lattice, and returns after its period in the flow."""
-    condensed, point, system = opening
-    assert point.episodes == 1
-    by_modes = condensed_system(system, condensed.motions.control).in_gap(OPENING, np.array([1.0, 0.0]))
-    assert by_modes.x == pytest.approx(point.x, abs=1e-9 * np.abs(point.x).max())
-    assert by_modes.energy == pytest.approx(point.energy, rel=1e-9)
-
-    u = np.concatenate(list(state_of(condensed.motions, point, 2).values()))
-    end = Dop853Flow(system).arc(np.append(u, 0 * u), point.period, point.period).end
-    assert np.abs(end[: len(u)] - u).max() < 1e-4 * np.abs(u).max()
-    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
 
 
 def test_a_stop_that_touches_among_pressed_ones_is_refused():

@@ -8,24 +8,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from tests.faults.mutations import run_shortly
 from tests.unrecorded import unrecorded_samples
-from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.io.store import RunMemory
-
-
-def test_a_lattice_without_contacts_is_stepped():
-    """A cell of one's own without contacts is driven for three samples without an error."""
-    springs = [{"start": 1, "end": 1, "stiffness": 3.0, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 4.0}]
-    cell = {"masses": [1.0, 2.0], "springs": springs, "contact": [1, 2]}
-    table = {"lattice": {"cells": 20, "cell": cell}, "drive": {"frequency": 1.0}, "time": {"end": 10.0}}
-
-    assert run_shortly(Case.from_table(table), samples=3) == ""
 
 
 def test_contacts_that_cannot_be_followed_end_the_run():

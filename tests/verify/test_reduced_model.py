@@ -8,16 +8,13 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_contact, reduced_model
+from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, reduced_model
 from tests.verify.conftest import follow
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.endings import Ending
-from vipetsc.lattice import Chain, four_band
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch_checks import BranchMonitor
 from vipetsc.modes.continuation.arclength import Continuation, locate
 from vipetsc.modes.shooting import resonance
-from vipetsc.modes.system import System
 
 
 def test_linear_modes_and_limits():
@@ -62,15 +59,6 @@ def test_bilinear_folds_and_stability(bilinear):
             assert point.multiplier > 1.01
         elif not first <= point.index <= second:
             assert point.multiplier == pytest.approx(1, abs=1e-6)
-
-
-def test_folds_do_not_depend_on_the_steps(bilinear):
-    """A branch with other steps has its folds at the same energies and frequencies."""
-    again = follow(reduced_model(), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.1], largest_step=0.05, chart="relative")
-
-    for fold, other in zip(bilinear.of_kind("fold-energy"), again.of_kind("fold-energy"), strict=True):
-        assert other.energy == pytest.approx(fold.energy, rel=1e-9)
-        assert other.frequency == pytest.approx(fold.frequency, rel=1e-8)
 
 
 def test_bilinear_approaches_its_limit(bilinear):
@@ -162,19 +150,3 @@ def test_both_directions_give_the_same_curve():
     turns = np.sum(np.diff(np.sign(np.diff(energies))) != 0)
     assert turns == 2
     assert energies[-1] == pytest.approx(GRAZING_ENERGY[OUT_OF_PHASE], rel=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["bilinear", "hertz"])
-@pytest.mark.parametrize("mode", [0, 1])
-def test_three_cells_through_grazing(law, mode):
-    """A lattice with three contacts grazes at the energy at which its linear mode touches the first of them."""
-    chain = Chain(four_band(), 3, "fixed", (0, 1, 2), (10**-2.65, 10**-2.7, 10**-2.75))
-    system = System.from_chain(chain, [Stops.both(four_band_contact(law), gap) for gap in chain.clearances])
-    graze = system.grazing_energy(mode)
-
-    branch = follow(system, mode, graze / 2, energy=[0.0, 1.05 * graze], points=400)
-
-    assert branch.points[-1].energy > 1.05 * graze
-    assert branch.of_kind("grazing")[0].energy == pytest.approx(graze, rel=1e-10)
-    assert max(point.residual for point in branch.points) <= 1e-12

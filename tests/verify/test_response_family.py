@@ -9,18 +9,14 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-import xarray as xr
 
 import vipetsc
 from tests.rigs import TWO_MASSES
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.reading import put
-from vipetsc.figures import response_family
-from vipetsc.figures.nfrc import responses_in
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
-from vipetsc.figures.style import LeftOut
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.sweeps import measure
 
@@ -70,47 +66,6 @@ def test_files_and_legends_name_the_keys(family):
     assert legend[0] == "contact clearance 0.7 m, lattice cell masses[1] 1 kg"
     assert len(set(legend)) == 4
     assert unit_of("lattice.cell.springs[1].stiffness", {}) == "N/m"
-
-
-@pytest.mark.parametrize(("unstable", "last"), [(2, []), (-1, ["undecided"])])
-def test_the_legend_of_a_family_names_undecided_states_behind_the_curves(family, monkeypatch, unstable, last):
-    folder, _ = family
-    paths = sorted(folder.glob("branch-*.h5"))
-    curves = responses_in(paths)
-    for curve in curves[1:3]:
-        curve["unstable"][1] = unstable
-    monkeypatch.setattr(response_family, "responses_in", lambda paths: curves)
-    figure = response_family.response_family(paths)
-    (legend,) = figure.subfigs[1].legends
-    assert [text.get_text() for text in legend.get_texts()] == [*legend_of(curves), *last]
-
-
-def test_curves_that_differ_by_what_is_fixed_have_it_in_the_legend():
-    curves = []
-    for fixed in (0.1, 0.2):
-        curve = xr.Dataset({"amplitude": ("point", [fixed]), "frequency": ("point", [1.0])})
-        curves.append(curve.assign_attrs(over="frequency", restitution=1.0, case=family_case({MASS: [1.0]}).to_toml()))
-    assert [text.replace("\u00a0", " ") for text in legend_of(curves)] == ["amplitude 0.1 m", "amplitude 0.2 m"]
-
-
-def test_a_folder_with_one_curve_has_no_common_picture(family, tmp_path):
-    folder, _ = family
-    single = sorted(folder.glob("branch-*.h5"))[0]
-    (tmp_path / single.name).write_bytes(single.read_bytes())
-    left_out = LeftOut()
-    assert [path.stem for path in draw("branches", [tmp_path], left_out=left_out)] == [single.stem]
-    assert left_out.reasons["responses"] == {"responses": "needs several curves of nfrc"}
-
-
-def test_curves_of_several_folders_have_a_common_picture(family, tmp_path):
-    """Folders with one curve each have a common picture."""
-    folder, _ = family
-    folders = []
-    for path in sorted(folder.glob("branch-*.h5"))[:2]:
-        folders.append(tmp_path / path.stem)
-        folders[-1].mkdir()
-        (folders[-1] / path.name).write_bytes(path.read_bytes())
-    assert [path.stem for path in draw("branches", folders, ["responses"])] == ["responses"]
 
 
 def test_a_family_is_read_back_and_goes_on(family):

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import vipetsc
-from tests.conftest import assert_same_bits, datasets, run_of
+from tests.conftest import run_of
 from tests.rigs import OUTPUT, TWO_MASSES, followed, rate_of
 from tests.steady_states import motion_at, nfrc_case
 from tests.verify.test_smooth_springs import DUFFING
@@ -21,11 +21,9 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.io.export import write_curves
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
-from vipetsc.spectra.responses import OUTPUTS
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -107,20 +105,6 @@ def test_walls_hold_the_masses_that_are_tied_to_them():
     np.testing.assert_allclose(outputs["first_wall_force"], expected, rtol=1e-9)
 
 
-def test_a_lossy_stop_has_the_same_force_on_either_side():
-    """A lossy stop on the other side has the same largest force: the motion is mirrored, half a period later."""
-    options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [1.25], "harmonics": 31}
-    forces = []
-    for side in ("plus", "minus"):
-        contacts = TWO_MASSES["contacts"] | {"restitution": 0.6, "side": side}
-        case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": options, "output": OUTPUT})
-        states = SteadyStates(case, 0.6, 1.25)
-        forces.append(states.measured(first_state(states).xi).outputs["largest_force"][0])
-    # The comparison would hold trivially if both forces were zero.
-    assert forces[0] > 1
-    assert forces[1] == pytest.approx(forces[0], rel=1e-8)
-
-
 def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
     """Below contact named masses of an infinite lattice move as the Bloch wave does.
 
@@ -164,34 +148,6 @@ def test_files_name_the_masses(curve):
     assert [float(row["share/lost"]) for row in columns] == share.tolist()
 
     assert {picture.stem.partition("-")[0] for picture in draw("branches", [curve])} == {"branch", "outputs"}
-
-
-def test_a_curve_with_outputs_goes_on_to_the_same_bits(curve, tmp_path):
-    (path,) = curve.glob("branch-*.h5")
-    case = NfrcCase.from_toml(read_branch(path).case)
-    # The curve is followed halfway, and the same command then continues it.
-    few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 3})})
-    follow_all(few, tmp_path, MPI.COMM_SELF)
-    table = (tmp_path / path.name).with_suffix(".csv")
-    table.unlink()
-    follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
-    assert_same_bits(datasets(path), datasets(tmp_path / path.name))
-    assert table.read_text() == path.with_suffix(".csv").read_text()
-
-    # The table of a complete curve is written from its file.
-    table.unlink()
-    follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
-    assert table.read_text() == path.with_suffix(".csv").read_text()
-
-
-def test_a_case_without_output_has_none(tmp_path):
-    nfrc = TWO_MASSES["nfrc"] | {"harmonics": 3, "points": 2}
-    _, points = followed(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), tmp_path / "rig")
-    assert points[0].measured.outputs == {}
-    (path,) = (tmp_path / "rig").glob("*.h5")
-    with vipetsc.open(path) as data:
-        assert not OUTPUTS.keys() & data.variables.keys()
-    assert [picture.stem.partition("-")[0] for picture in draw("branches", [tmp_path / "rig"])] == ["branch"]
 
 
 def test_harmonics_are_those_of_a_run_a_quarter_of_a_period_earlier(tmp_path):

@@ -9,12 +9,10 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-import vipetsc
 from tests.rigs import TWO_MASSES, period_map
 from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.reading import put
-from vipetsc.figures.registry import draw
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.branches.sweeps import parameter_values
@@ -150,27 +148,3 @@ def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp
         elastic = first_state(equations(alone))
         expected = equations(alone).measured(elastic.xi).harmonics
         np.testing.assert_allclose(curve.points[-1].measured.harmonics, expected, atol=1e-10)
-
-
-def test_files_have_the_values_of_the_key_with_its_unit(clearances, tmp_path):
-    _, folder, curve = clearances
-    with vipetsc.open(folder / f"branch-{curve.name}.h5") as data:
-        assert data.attrs["over"] == "contacts.clearance"
-        assert data["parameter"].attrs["units"] == "m"
-        np.testing.assert_array_equal(data["parameter"].values, parameter_values(curve))
-    header, first, *_ = (folder / f"branch-{curve.name}.csv").read_text().splitlines()
-    assert float(first.split(",")[header.split(",").index("parameter")]) == 0.125
-    assert [path.stem for path in draw("branches", [folder])] == [f"branch-{curve.name}"]
-
-
-@pytest.mark.slow
-def test_a_curve_goes_on_to_the_same_bits(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    whole.mkdir()
-    parts.mkdir()
-    (at_once,) = follow_all(over("contacts.stiffness", 10.0, 20.0, CLOSER, points=7), whole, MPI.COMM_SELF)
-    follow_all(over("contacts.stiffness", 10.0, 20.0, CLOSER, points=4), parts, MPI.COMM_SELF)
-    more = over("contacts.stiffness", 10.0, 20.0, CLOSER, points=7)
-    assert NfrcCase.from_toml(more.to_toml()) == more
-    (resumed,) = follow_all(more, parts, MPI.COMM_SELF, resume=True)
-    assert [point.xi.tolist() for point in resumed.points] == [point.xi.tolist() for point in at_once.points]

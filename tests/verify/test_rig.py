@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 
 from tests.conftest import run_of
-from tests.rigs import OUTPUT, TWO_MASSES, after_a_period, followed, period_map
+from tests.rigs import OUTPUT, TWO_MASSES, after_a_period, followed
 from tests.steady_states import motion_at
 from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.lattice.chain import Pair
-from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.response.condensation import stops_of
 from vipetsc.modes.response.state import Response
@@ -65,12 +61,6 @@ def two_masses(tmp_path_factory):
     return followed(NfrcCase.from_table(first), tmp_path_factory.mktemp("rig") / "two")
 
 
-@pytest.fixture(scope="module")
-def ten_cells(tmp_path_factory):
-    """The steady states of ten cells that differ, and the points of their curve."""
-    return followed(NfrcCase.from_table(TEN_CELLS), tmp_path_factory.mktemp("rig") / "ten")
-
-
 def test_what_follows_from_the_lattice_is_filled_in():
     """Whether a lattice is infinite and its motion symmetric follows from its ends, dashpots and stops."""
     case = NfrcCase.from_table(TWO_MASSES)
@@ -112,32 +102,6 @@ def test_without_dashpots_it_is_that_of_bloch_waves():
     np.testing.assert_allclose(modal[:, :, :2], waves[:, :, :2], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(modal[1:], waves[1:], rtol=1e-8, atol=1e-10)
     assert np.isrealobj(modal)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rig", ["two_masses", "ten_cells"])
-def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(rig, request):
-    """A state returns after a period of time integration, and Hill's method counts its multipliers beyond 1."""
-    states, points = request.getfixturevalue(rig)
-    cells = np.arange(states.case.lattice.cells)
-    touching = [point for point in points if point.measured.episodes]
-    chosen = [touching[i] for i in np.linspace(0, len(touching) - 1, 10 if rig == "two_masses" else 5).astype(int)]
-    assert len(touching) > 10
-
-    unstable = set()
-    for point in chosen:
-        u, v = motion_at(states, point.xi, cells)
-        state = np.concatenate([u.ravel(), v.ravel()])
-        # The map of ten cells has 40 columns, so that multipliers are computed for two states only.
-        if rig == "two_masses" or point in chosen[::4]:
-            end, values = period_map(states, point, state)
-            assert point.measured.unstable == np.count_nonzero(np.abs(values) > 1.001)
-            unstable.add(point.measured.unstable)
-        else:
-            end = after_a_period(states, point, state)
-        # Forces of bilinear contacts have kinks, so that the error falls as a power of the number of harmonics.
-        assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
-    assert rig == "ten_cells" or len(unstable) > 1
 
 
 def test_errors_fall_as_harmonics_are_added(two_masses):
@@ -208,21 +172,6 @@ def test_a_lossy_run_settles_into_the_response():
     assert measured.outputs["largest_force"] == pytest.approx(run["impacts/force"].values[-1], rel=5e-3)
     speeds = np.sqrt(np.mean(run["points/velocity"].values[-64:] ** 2, axis=0))
     assert measured.outputs["transmission"] == pytest.approx(speeds[1] / speeds[0], rel=1e-3)
-
-
-def test_curves_of_a_case_have_one_compliance():
-    """All curves of a case use one compliance, so that the modes of the lattice are computed once."""
-    nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.1, 0.2], "restitutions": [1.0, 0.7]}
-    method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}))
-    assert len({id(method.problem(job).compliance) for job in range(4)}) == 1
-
-
-def test_a_curve_that_has_used_up_its_points_tells_their_number():
-    """The start is one of the points of a curve: with nfrc.points = 3 it has three, and its ending says so."""
-    case = NfrcCase.from_table(TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"points": 3}})
-    (curve,) = follow_all(case, None, MPI.COMM_SELF)
-    assert len(curve.regular()) == 3
-    assert curve.ended.sentence == "3 points reached: increase nfrc.points and resume to continue"
 
 
 def test_a_drive_that_moves_no_contact_has_no_unit_of_amplitude_and_a_motion_at_rest():

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from vipetsc import Case, Sweep
-from vipetsc.case import CaseError
 from vipetsc.dynamics.run import simulate
 from vipetsc.figures.sections import sections_of
 from vipetsc.io.read import open_ensemble, open_run, whole_members
@@ -84,27 +83,6 @@ def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, follo
     assert simulate(again).dataset["displacement"].values[-1, 0, 0] == ends[order[1]][1][0]
     for before, after in pairwise(order):
         assert ends[after][0].tolist() == ends[before][1].tolist()
-
-
-def test_a_longer_member_keeps_whole_samples_a_period(tmp_path):
-    """``run FOLDER --member N --set time.end=...`` counts samples by the period, as the sweep does."""
-    sweep = {"measures": ["motion"], "drive": {"frequency": [2.3, 2.4]}}
-    for follow, omegas in (({}, (2.3, 2.4)), ({"follow": "up", "fields": True}, (2.3,))):
-        plan = Sweep.from_table(IMPACT | {"sweep": sweep | follow})
-        for number, omega in enumerate(omegas):
-            for override, samples in (("time.end=77.7", 16), ("time.samples_per_period=12", 12)):
-                case = plan.case_in(tmp_path, number, [override])
-                assert 2 * np.pi / omega / case.time.sample_interval == pytest.approx(samples, rel=1e-12)
-                assert case.time.end * omega / (2 * np.pi) == pytest.approx(round(case.time.end * omega / 2 / np.pi))
-
-
-def test_an_invalid_member_of_runs_that_follow_one_another_is_refused():
-    """The next run cannot begin where it would have ended."""
-    invalid = Sweep.from_table(
-        IMPACT | {"sweep": {"follow": "up", "fields": True, "drive": {"amplitude": [1.0, 1e300]}}}
-    )
-    with pytest.raises(CaseError, match=r"drive\.amplitude = 1e"):
-        invalid.tried()
 
 
 def test_the_spectrum_of_a_sine_has_its_amplitude():

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import with_sections
-from tests.rigs import OUTPUT, TWO_MASSES, after_a_period
-from tests.steady_states import motion_at
+from tests.rigs import OUTPUT, TWO_MASSES
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.modes.response.condensation import driven_points
-from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -75,22 +72,3 @@ def test_two_forces_on_one_mass_are_one():
     halves = first_state(states_of(rig(half, half, range=[1.4, 2.0], harmonics=15)))
     assert abs(whole.xi[:-1]).max() > 1.05  # clearances: the state is in contact
     np.testing.assert_allclose(halves.xi, whole.xi, atol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("drives", [(FORCE, BEYOND), (LEFT, FORCE)], ids=["forces", "wall and force"])
-def test_states_with_contact_repeat_themselves_in_time(drives):
-    """A steady state in contact under two drives returns after a period by SciPy; loads have the case's ratios."""
-    # The amplitudes are large enough for contact.
-    larger = [drive | {"amplitude": 4 * drive["amplitude"]} for drive in drives]
-    states = states_of(rig(*larger, range=[1.45, 2.0]))
-    ratio = drives[1]["amplitude"] / drives[0]["amplitude"]
-    # A wall acts through its spring of 1.5 N/m.
-    weights = [1.0, ratio] if drives[0] is FORCE else [1.5, ratio]
-    assert driven_points(states.case).weights.tolist() == pytest.approx(weights)
-
-    point: Response = first_state(states)
-    assert states.measured(point.xi).episodes > 0
-    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
-    # The error is that of the harmonics that are left out.
-    assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()

@@ -9,14 +9,12 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.rigs import OUTPUT, followed, period_map
+from tests.rigs import OUTPUT, followed
 from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.figures.registry import draw
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, nonlinear_springs
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -48,14 +46,6 @@ def chain_of(count: int, spring: dict[str, Any], **nfrc: Any) -> dict[str, Any]:
     return DUFFING | {"lattice": lattice | {"damping": {"mass": 0.1}}, "nfrc": options}
 
 
-def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
-    """The relative error with which a state returns after a period by SciPy, and the number of multipliers beyond 1."""
-    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
-    period = period_map(states, point, state)
-    grows = np.abs(period.multipliers) > 1.001
-    return float(np.abs(period.end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
-
-
 @pytest.fixture(scope="module")
 def duffing(tmp_path_factory):
     """The folder, the steady states and the points of the curve of Duffing's oscillator."""
@@ -80,21 +70,6 @@ def test_its_first_harmonic_is_that_of_duffings_oscillator(duffing):
         assert left == pytest.approx(0.01, rel=1e-9)
 
 
-def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(duffing):
-    """States of Duffing's oscillator return after a period by SciPy, and have its number of multipliers beyond 1."""
-    _, states, points = duffing
-    assert [point.kind for point in points].count("fold") == 2
-    unstable = set()
-    regular = [point for point in points if point.kind == "regular"]
-    for number in np.linspace(0, len(regular) - 1, 10).astype(int):
-        error, growing = misses(states, regular[number])
-        assert error < 1e-6
-        assert regular[number].measured.unstable == growing
-        unstable.add(growing)
-    # States between the folds, which are unstable, are among those tried.
-    assert unstable == {0, 1}
-
-
 def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
     """The folds are at the largest frequency left of the backbone and the least one right of it, to 1 %.
 
@@ -110,40 +85,6 @@ def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
         right = np.sqrt(middle + width)
     found = sorted(states.drive(point.xi[-1])[0] for point in points if point.kind == "fold")
     np.testing.assert_allclose(found, [np.nanmin(right), np.nanmax(left)], rtol=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("count", "spring", "omega", "amplitude"),
-    [(2, {"cubic": 2.0}, 0.8, 0.3), (3, {"cubic": 1.0, "quadratic": 0.4}, 0.9, 0.2), (2, {"cubic": -0.2}, 0.8, 0.1)],
-)
-def test_chains_come_back_after_a_period(count, spring, omega, amplitude):
-    """States of chains return after a period and are stable as their multipliers are.
-
-    Springs harden or soften. Those with a quadratic part give a mean and even harmonics.
-    """
-    options = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega], "harmonics": 15}
-    case = NfrcCase.from_table(chain_of(count, spring, **options))
-    assert case.nfrc.symmetric is ("quadratic" not in spring)
-    states = SteadyStates(case, 1.0, omega)
-    point = first_state(states)
-    error, growing = misses(states, point)
-    assert error < 1e-6
-    assert states.measured(point.xi).unstable == growing
-
-
-def test_a_stop_beside_a_nonlinear_spring():
-    """A state with a nonlinear spring and a stop returns after a period by SciPy."""
-    options = {"over": "amplitude", "range": [0.3, 0.4], "fixed": [0.8], "harmonics": 41}
-    case = NfrcCase.from_table(chain_of(2, {"cubic": 1.0}, **options) | {"contacts": STOP})
-    states = SteadyStates(case, 1.0, 0.8)
-    point = first_state(states)
-    measured = states.measured(point.xi)
-    assert measured.episodes == 1
-    assert measured.largest.shape == measured.closed.shape == (1,)
-    assert measured.outputs["largest_elongation"].shape == (3,)
-    error, _ = misses(states, point)
-    # Harmonics of the motion with a bilinear contact fall as k^-4, so that 41 of them leave an error of this size.
-    assert error < 1e-3
 
 
 def test_walls_feel_the_whole_force_of_their_springs():
@@ -195,19 +136,6 @@ def test_elongations_are_those_of_every_nonlinear_spring(ends):
         order.append(counts[number])
         counts[number] += 1
     np.testing.assert_allclose(found, expected[np.ix_(order, order)], atol=1e-10)
-
-
-def test_files_and_pictures_have_the_springs(duffing, tmp_path):
-    folder, _, points = duffing
-    (path,) = folder.glob("branch-*.csv")
-    header = path.read_text().splitlines()[0].split(",")
-    assert [name for name in header if name.startswith("largest_elongation")] == [
-        "largest_elongation/0.1",
-        "largest_elongation/1.1",
-    ]
-    assert len(draw("branches", [folder])) == 1
-    # Between two walls the mass stretches one spring as it shortens the other.
-    np.testing.assert_allclose(*points[10].measured.outputs["largest_elongation"])
 
 
 def test_a_curve_over_a_cubic_coefficient(tmp_path):

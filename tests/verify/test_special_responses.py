@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,16 +12,12 @@ import numpy as np
 import pytest
 
 import vipetsc
-from tests.conftest import assert_same_bits, datasets
 from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.verbs.branch_verbs import curve_rows
 from vipetsc.figures.nfrc import frequency_response
-from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.continuation.arclength import locate
-from vipetsc.modes.response.equations import SteadyFrame
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.stability import Hill, Stability
@@ -116,93 +110,9 @@ def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_pat
     assert kinds["all regular"] == kinds["stability regular"]
 
 
-@pytest.mark.slow
-def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, monkeypatch):
-    """A pair that cannot be followed is located by the number of multipliers beyond 1, and has no sideband."""
-    states, points = with_pair
-    places = [i for i, point in enumerate(points) if point.kind == "neimark-sacker"]
-    at = [points[place].measured.frequency for place in places]
-    monkeypatch.setattr("vipetsc.modes.response.steady.SteadyStates.growing_pairs", lambda self, xi: [])
-    # Only the steps in which the pair passes are searched again.
-    counted = [point for place in places for point in locate(states, points[place - 1], points[place + 1])]
-    assert [point.kind for point in counted] == ["neimark-sacker"] * 2
-    np.testing.assert_allclose([point.measured.frequency for point in counted], at, rtol=1e-9)
-    assert np.isnan([point.measured.sideband for point in counted]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", ["step", "special point"])
-def test_a_place_without_a_unique_tangent_is_passed(place, tmp_path, monkeypatch):
-    """A step that ends where the derivative is singular is taken again, shorter; a special point there is left out."""
-    tangent_at = SteadyFrame.tangent_at
-    asked = 0
-
-    def singular(self, xi):
-        nonlocal asked
-        caller = sys._getframe(1).f_code.co_name
-        if caller == ("_corrected" if place == "step" else "at"):
-            asked += 1
-            if asked == 3:
-                raise np.linalg.LinAlgError("Singular matrix")
-        return tangent_at(self, xi)
-
-    monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
-    (curve,) = follow_all(case_of(FLIP, harmonics=15), tmp_path, MPI.COMM_SELF)
-    assert asked > 3
-    assert curve.complete
-
-
-def test_a_curve_whose_start_has_no_unique_tangent_fails_with_the_reason(tmp_path, monkeypatch):
-    """Where the derivative at the first state is singular, the curve ends, and the command does not."""
-
-    def singular(self, xi):
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    monkeypatch.setattr(SteadyFrame, "tangent_at", singular)
-    (curve,) = follow_all(case_of(FLIP), tmp_path, MPI.COMM_SELF)
-    assert curve.ended.sentence == "failed: Singular matrix"
-
-
 def labels_in(path: Path) -> list[str]:
     """The labels of all that the picture of the curve in ``path`` shows."""
     return [label for axes in frequency_response([path]).axes for label in axes.get_legend_handles_labels()[1]]
-
-
-def test_special_points_are_in_files_and_pictures(tmp_path):
-    case = case_of(FLIP, harmonics=15)
-    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
-    path = tmp_path / f"branch-{curve.name}.h5"
-    points = list(csv.DictReader(path.with_suffix(".csv").open()))
-    special = [row for row in points if row["kind"] != "regular"]
-    assert [(row["kind"], row["sideband"]) for row in special] == [("period-doubling", "0.5")] * 2
-    with vipetsc.open(path) as data:
-        assert data["kind"].attrs["flag_meanings"].split()[3] == "period-doubling"
-    rows = dict(curve_rows(case, curve))
-    assert rows["period doubling"].startswith("1.08")
-    assert "undecided" not in rows
-    labels = labels_in(path)
-    assert "period doubling" in labels
-    assert "undecided" not in labels
-
-    # A curve that is resumed has the same points.
-    parts = tmp_path / "parts"
-    parts.mkdir()
-    few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 8})})
-    follow_all(few, parts, MPI.COMM_SELF)
-    follow_all(case, parts, MPI.COMM_SELF, resume=True)
-    assert_same_bits(datasets(path), datasets(parts / path.name))
-    assert len(read_branch(path).points) == len(points)
-
-
-def test_undecided_states_have_no_special_points_between_them(tmp_path, monkeypatch):
-    states, points = followed(case_of(FLIP, harmonics=9), tmp_path / "rig")
-    place = next(i for i, point in enumerate(points) if point.kind == "period-doubling")
-    left, right = points[place - 1], points[place + 1]
-    assert [kind.name for kind in StabilityChanges(states, left, right).kinds()] == ["period-doubling"]
-
-    undecided = states.stability(left.xi)._replace(unstable=-1)
-    monkeypatch.setattr(states, "stability", lambda xi: undecided)
-    assert list(StabilityChanges(states, left, right).kinds()) == []
 
 
 def test_undecided_states_are_named_in_tables_files_and_pictures(tmp_path):

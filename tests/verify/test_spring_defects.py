@@ -9,19 +9,12 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from tests.conftest import run_of
-from tests.rigs import after_a_period
-from tests.steady_states import motion_at
 from vipetsc.case import Case, NnmCase
-from vipetsc.case.nfrc import NfrcCase
 from vipetsc.dynamics import simulate
-from vipetsc.identification.motion import SampledModel
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import linear_modes, nonlinear_springs, spring_laws
-from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.system import System
 
 pytestmark = pytest.mark.parallel(1)
@@ -90,73 +83,6 @@ def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
     return forces, energy
 
 
-@pytest.fixture(scope="module", params=["ts", "propagator"])
-def run(request):
-    """The run by either engine."""
-    run = run_of(changed(time=TABLE["time"] | {"engine": request.param}))
-    # An engine that refuses the case would be replaced by the other one.
-    assert run.attrs["statistics"]["engine"] == request.param
-    return run
-
-
-@pytest.fixture(scope="module")
-def exact(run) -> np.ndarray:
-    """Displacements, then velocities (time, 2 mass) by SciPy, from the run's first sample on."""
-    masses = np.tile(MASSES, CELLS)
-    # The integration begins with the run's first sample; other tests check how [initial] becomes that state.
-    begin = np.concatenate([run[name].values[0].ravel() for name in ("displacement", "velocity")])
-
-    def rate(_: float, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([y[len(masses) :], forces_and_energy(y[: len(masses)])[0] / masses])
-
-    return solve_ivp(rate, (0, 0.02), begin, "DOP853", run["time"].values, rtol=1e-12, atol=1e-14).y.T
-
-
-def test_the_motion_is_that_of_scipy(run, exact):
-    """The run's displacements are those by SciPy, to 1e-8 of the largest one."""
-    u = run["displacement"].values.reshape(len(run["time"]), -1)
-    assert np.abs(u - exact[:, : 2 * CELLS]).max() < 1e-8 * np.abs(u).max()
-
-
-def test_the_motion_of_identification_is_that_of_scipy(run, exact):
-    """The motion that identification compares with a record is that by SciPy, from a state that it is given."""
-    case = changed()
-    state = tuple(part.reshape(CELLS, 2) for part in np.split(exact[0], 2))
-    times = run["time"].values
-    motion = SampledModel(case, case.model(), range(2 * CELLS)).respond(times, 0.0, state).motion
-    assert np.abs(motion[:, :, 0] - exact[:, : 2 * CELLS]).max() < 1e-8 * np.abs(exact[:, : 2 * CELLS]).max()
-
-
-def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
-    """The spring energy is the sum of k z^2/2 + q z^3/3 + c z^4/4, and the energy of the run is conserved."""
-    u = run["displacement"].values.reshape(len(run["time"]), -1)
-    energies = np.array([forces_and_energy(row)[1] for row in u])
-    stiffness = changed().model().chain.stiffness_matrix()
-    linear = [row @ (stiffness @ row) / 2 for row in u]
-    np.testing.assert_allclose(run["energy/spring"], energies, rtol=1e-12)
-    # The nonlinear terms are large enough for a run without them to fail.
-    assert np.abs(energies - linear).max() > 0.05 * energies.max()
-    total = run["energy/kinetic"] + run["energy/spring"]
-    np.testing.assert_allclose(total, total[0], rtol=1e-9)
-
-
-def test_points_accelerate_by_the_springs_that_they_have(run):
-    """The acceleration of a point is the force of its springs over its mass."""
-    u = run["displacement"].values.reshape(len(run["time"]), -1)
-    forces = np.array([forces_and_energy(row)[0] for row in u])
-    # The points are mass 2 of cell 6 and mass 1 of cell 12.
-    expected = forces[:, [11, 22]] / [MASSES[1], MASSES[0]]
-    np.testing.assert_allclose(run["points/acceleration"], expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_the_file_says_which_springs_differ(run):
-    assert run["lattice/cubic"].values[5].tolist() == [0.0, 4e9]
-    assert run["lattice/quadratic"].values[8].tolist() == [-2e6, 0.0]
-    # Stiffnesses, which are equal in all cells, are not stored for each cell.
-    assert "lattice/stiffness" not in run
-    assert Case.from_toml(run.attrs["case"]).model().chain == changed().model().chain
-
-
 @pytest.mark.parametrize("term", ["quadratic", "cubic"])
 def test_equal_lists_are_the_lattice_of_equal_cells(term):
     """Equal coefficients in a list give the bits of equal cells, and zeros in all cells but one those of one spring."""
@@ -214,43 +140,6 @@ def test_the_system_of_normal_modes_has_the_springs():
     np.testing.assert_allclose(system.forces(u), -forces, rtol=1e-10, atol=1e-10 * np.abs(forces).max())
     assert system.energy(u, 0 * u) == pytest.approx(energy, rel=1e-12)
     assert not system.odd
-
-
-def test_steady_states_come_back_after_a_period():
-    """A steady state with even harmonics, by quadratic springs, returns after a period of SciPy's to 1e-6."""
-    lattice = TABLE["lattice"] | {"damping": {"mass": 200.0}}
-    drive = {"waveform": "harmonic", "amplitude": 6.0, "frequency": 900.0, "cell": 7, "mass": 1}
-    options = {"source": "force", "over": "amplitude", "range": [6.0, 8.0], "fixed": [900.0], "harmonics": 15}
-    table = {"name": "defects", "lattice": lattice, "contacts": {"sites": []}, "drive": drive, "time": {"end": 0.1}}
-    case = NfrcCase.from_table(table | {"nfrc": options})
-    # With quadratic springs the motion has a mean and even harmonics, which a symmetric series lacks.
-    assert case.nfrc.symmetric is False
-    states = SteadyStates(case, 1.0, 900.0)
-    point = first_state(states)
-    assert states.measured(point.xi).outputs["largest_elongation"].shape == (3,)
-    motion = motion_at(states, point.xi, np.arange(CELLS))
-    state = np.concatenate([part.ravel() for part in motion])
-    end = after_a_period(states, point, state)
-    assert np.abs(end - state).max() < 1e-6 * np.abs(state).max()
-
-
-def test_scattered_coefficients_are_drawn_cell_by_cell():
-    lattice = {"profiles": {"springs[2].cubic": [4e9] * CELLS}}
-    disorder = {"seed": 3, "cells": {"springs[2].cubic": {"relative": 0.1}}}
-    cubic = changed(lattice=lattice, disorder=disorder).model().chain.spring_terms(0, CELLS).cubic
-    assert np.all(cubic[:, 0] == 0.0)
-    assert len(np.unique(cubic[:, 1])) == CELLS
-    # The deviation of twelve draws is uncertain by a fifth.
-    assert np.std(cubic[:, 1] / 4e9) == pytest.approx(0.1, rel=0.5)
-
-
-WALL = {"waveform": "harmonic", "amplitude": 1e-4, "frequency": 900.0, "end": "right"}
-
-
-def test_a_right_wall_moves_a_linear_spring():
-    """A right wall with a linear spring may move, whatever springs there are elsewhere."""
-    profiles = {"springs[1].cubic": {"cells": [9], "value": 1e10}}
-    assert Case.from_table(TABLE | {"drive": WALL, "initial": {}, "lattice": TABLE["lattice"] | {"profiles": profiles}})
 
 
 @pytest.mark.parametrize(

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 
 from vipetsc.case import NnmCase
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting, linear_start
@@ -43,31 +40,6 @@ CASE: dict[str, Any] = {
         },
     },
 }
-
-
-def rates(t: float, y: np.ndarray) -> list[float]:
-    """The derivative of the state y = (u1, u2, v1, v2)."""
-    first, second = y[:2]
-    link = second - first + STIFFNESS * (max(second - first + DEPTH, 0.0) ** 1.5 - DEPTH**1.5)
-    return [y[2], y[3], link - first - QUADRATIC * first**2 - CUBIC * first**3, -link]
-
-
-def test_a_pressed_contact_beside_a_smooth_spring_has_a_branch():
-    """The branch of the slow mode begins near it, and its orbits, in which the contact is closed, return by SciPy."""
-    case = NnmCase.from_table(CASE)
-    (branch,) = follow_all(case, None, MPI.COMM_SELF)
-    assert branch.ended.sentence.startswith("6 points reached")
-    first, *_, last = branch.regular()
-    assert first.period == pytest.approx(2 * np.pi * np.sqrt(2.0), rel=1e-4)
-    # Both masses as one on the soft spring have the frequency omega (1 + (3 c/8 - 5 q^2/12) A^2), A^2 = 2 E, which the
-    # contact changes little: dT/dE is that slope at any energy at which the branch begins.
-    slope = -2.0 * (3 * CUBIC / 8 - 5 * QUADRATIC**2 / 12) * first.period
-    assert (last.period - first.period) / (last.energy - first.energy) == pytest.approx(slope, rel=0.01)
-    assert last.energy > 3 * first.energy
-    for point in (first, last):
-        start = np.append(point.x, [0.0, 0.0])
-        end = solve_ivp(rates, (0.0, point.period), start, method="DOP853", rtol=1e-12, atol=1e-16).y[:, -1]
-        assert end == pytest.approx(start, abs=1e-8 * np.abs(start).max())
 
 
 def test_two_masses_on_a_stiff_spring_have_the_period_of_one():

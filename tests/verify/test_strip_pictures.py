@@ -11,7 +11,7 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.figures import strips
 from vipetsc.figures.movie_frames import Shot, check
-from vipetsc.figures.style import NoPicture, rc_style
+from vipetsc.figures.style import rc_style
 from vipetsc.io.export import write_xdmf
 from vipetsc.io.impacts import impacts
 from vipetsc.io.read import open_run
@@ -99,15 +99,6 @@ def test_pictures_and_movies_show_the_cells(folder):
             film = strips.StripMovie(run, shot, check(run, shot))
             assert film.frame(0).shape == film.frame(1).shape
             assert np.any(film.frame(len(film.content.time) - 1).copy() != film.frame(0))
-
-
-def test_a_chain_has_no_picture_of_a_strip(tmp_path):
-    assert simulate(
-        Case.from_table(table(rows=1) | {"contacts": {"sites": []}, "drive": {"frequency": 1500.0, "place": [3, 1]}}),
-        tmp_path,
-    ).complete
-    with open_run(tmp_path / "run.h5") as run, pytest.raises(NoPicture, match="two rows"):
-        strips.snapshots(run, None)
 
 
 def test_export_names_cells_and_rows(folder):

@@ -13,25 +13,6 @@ from vipetsc.studies.analysis import analyse
 pytestmark = pytest.mark.parallel(1)
 
 
-def test_a_struck_bead_gives_its_velocity_to_the_next():
-    """A struck bead gives its whole velocity to an equal one, by conservation of momentum and energy."""
-    case = Case(
-        lattice={"cells": 2, "ends": "free", "cell": {"masses": [2.05e-3]}},
-        contacts={"stiffness": 7.4e9, "sites": [1], "next_cell": True, "side": "minus", "clearance": 1e-6},
-        initial={"kind": "velocity", "cell": 1, "velocity": 0.5},
-        time={"end": 2e-4, "sample_interval": 1e-6},
-    )
-    data, result = simulated(case)
-    velocity = data["velocity"].values[:, :, 0]
-    assert velocity[0].tolist() == [0.5, 0.0]
-    assert velocity[-1] == pytest.approx([0.0, 0.5], abs=1e-9)
-    assert result.statistics["episodes"] == 1
-    # The work begins with the initial energy.
-    assert data["energy/work"].values[0] == pytest.approx(0.5 * 2.05e-3 * 0.5**2)
-    # Contact begins when the struck bead has passed the clearance.
-    assert data["impacts/onset"].values[0] == pytest.approx(1e-6 / 0.5)
-
-
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_a_struck_chain_moves_as_its_modes(engine):
     """A struck lattice without contacts moves as the sum of its modes, phi_j (phi_j^T M v0) sin(w_j t)/w_j."""
@@ -58,19 +39,6 @@ def test_a_struck_chain_moves_as_its_modes(engine):
     parts = shapes.T @ (masses * velocity)
     exact = np.sin(np.outer(data["time"].values, omega)) * (parts / omega) @ shapes.T
     assert data["displacement"].values.reshape(-1, 24) == pytest.approx(exact, abs=1e-9 * np.abs(exact).max())
-
-
-def test_its_measures_are_taken():
-    """A run that begins with a velocity is measured as others are."""
-    case = Case(
-        lattice={"cells": 24},
-        contacts={"sites": [6, 12], "clearance": 1e-5},
-        initial={"kind": "velocity", "cell": 1, "velocity": 0.5},
-        time={"end": 0.02},
-    )
-    data, _ = simulated(case)
-    analysis = analyse(data)
-    assert {"kinetic_energy", "dispersion", "modal/energy"} & {*map(str, analysis.data_vars)}
 
 
 @pytest.mark.filterwarnings("error")

@@ -11,20 +11,18 @@ import pytest
 from scipy.integrate import trapezoid
 
 from tests.hertz_branch import GRAZING, write_branch
-from vipetsc.case import Case, Sweep
-from vipetsc.figures import runs, transfer_curves
+from vipetsc.case import Sweep
+from vipetsc.figures import transfer_curves
 from vipetsc.figures.panels import block_means
 from vipetsc.figures.registry import FIGURES
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
-from vipetsc.figures.transfer import ROOM, closing_error
-from vipetsc.io.netcdf import open_netcdf
+from vipetsc.figures.transfer import closing_error
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.paper.pages import PAGES
 from vipetsc.studies.backbone import initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 
-NAMES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
 AMPLITUDES = [1.0, 2.0, 30.0, 60.0, 120.0, 240.0, 500.0]
 TABLE = {
     "lattice": {"preset": "four-band", "reading": "calibrated", "cells": 20},
@@ -98,14 +96,6 @@ def panel(figure, text):
     """The only axes of a figure whose title contains ``text``."""
     (found,) = [a for a in figure.axes if text in a.get_title(loc="left")]
     return found
-
-
-@pytest.mark.slow
-def test_values_of_a_relation_have_units_and_names(reduced):
-    with open_netcdf(reduced / "backbone.h5", "relation") as relation:
-        names = {str(name).rpartition("/")[2] for name in relation.variables}
-        assert {"energy", "ibtet", "fitted"} <= names
-        assert all(item.attrs["units"] and item.attrs["long_name"] for item in relation.variables.values())
 
 
 @pytest.mark.slow
@@ -196,25 +186,6 @@ def test_backbone_is_aligned_exactly(reduced):
     assert abs(residual @ np.log(red[0])) < 1e-8
 
 
-def test_backbone_of_another_sweep_is_passed_over(reduced, tmp_path):
-    for name in ("ensemble.h5", "backbone.h5"):
-        (tmp_path / name).write_bytes((reduced / name).read_bytes())
-    with h5py.File(tmp_path / "backbone.h5", "r+") as file:
-        file.attrs["case"] = "another"
-    assert not offered_figures("ibtet_backbone", tmp_path)
-
-
-def test_reduced_sweeps_have_no_pictures_of_fields(reduced):
-    for name in ("transfer", "transfer_dispersions", "phase_regimes"):
-        assert not offered_figures(name, reduced)
-
-
-@pytest.mark.slow
-def test_whole_members_alone_make_no_curves(whole):
-    for name in ("ibtet", "ibtet_backbone"):
-        assert not offered_figures(name, whole)
-
-
 @pytest.mark.slow
 def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures):
     assert list(transfer_pictures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
@@ -238,37 +209,6 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures)
             shown = panel(figure, f"({tag})").images[0]
             np.testing.assert_allclose(shown.get_array(), block_means(file["bands/kinetic_energy"][band].T), rtol=1e-6)
         assert shown.get_extent()[1] == pytest.approx(file["bands/sample"][-1], rel=0.02)
-
-
-@pytest.mark.slow
-def test_transfer_spectrum_is_that_of_the_cells_velocity(whole, transfer_pictures):
-    figure = transfer_pictures["hertz-calibrated-1-site-4-cycles-60N"]
-    axes = panel(figure, "cell 10")
-    with open_run(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "run.h5") as run:
-        velocity = run["velocity"][:, 9].values
-        driven = 1e-3 * Case.of(run).model().drive.frequency
-
-    (inset,) = axes.child_axes
-    for mass, line in enumerate(inset.lines):
-        np.testing.assert_array_equal(line.get_ydata(), velocity[:, mass])
-
-    x, y = lines(panel(figure, "cell 5"))["mass 1"]
-    assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
-
-    # The common axis has room above the larger of both peaks.
-    spectra = [curve for cell in ("cell 5", "cell 10") for curve in lines(panel(figure, cell)).items()]
-    peak = max(values.max() for name, (_, values) in spectra if name.startswith("mass"))
-    assert axes.get_ylim()[1] == pytest.approx(ROOM * peak)
-
-
-@pytest.mark.slow
-def test_dispersions_stand_by_law_and_amplitude(whole):
-    (figure,) = offered_figures("transfer_dispersions", whole).values()
-    found = all_axes(figure)
-    assert [a.get_title(loc="left") for a in found] == ["(a) Hertz, 1 N", "(b) Hertz, 60 N"]
-    for axes, value in zip(found, open_ensemble(whole)["ibtet"].values.ravel(), strict=True):
-        assert axes.texts[0].get_text() == f"IBTET {value:.2g}"
-        assert axes.images[0].get_array().max() == pytest.approx(1.0)
 
 
 @pytest.mark.slow
@@ -331,33 +271,3 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     resonator, host = (line.get_xydata().T for line in second.lines)
     np.testing.assert_array_equal(resonator[0], 1e3 * motion.displacement[:, 1])
     np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
-
-
-@pytest.mark.slow
-def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
-    # A portrait this short contains the largest displacement only if it is taken around it.
-    monkeypatch.setattr(transfer_curves, "PERIODS", 0.1)
-    folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
-    with open_run(folder / "run.h5") as run:
-        u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
-    shown = contact_motion(folder).displacement
-
-    assert np.abs(shown[:, 1] - shown[:, 0]).max() >= np.abs(u[:, 2] - u[:, 1]).max()
-    assert len(shown) < 0.1 * len(u) * runs.REFINE
-
-
-@pytest.mark.slow
-def test_regimes_without_an_ensemble(whole):
-    (figure,) = offered_figures("phase_regimes", whole).values()
-
-    # The figure has the two points without a curve.
-    assert len(all_axes(figure)[0].lines) == 2
-
-
-def test_curves_of_a_sweep(reduced):
-    ensemble = open_ensemble(reduced)
-    found = list(curves(ensemble))
-    assert [Sweep.of(ensemble).case(number).contacts.law for _, number in found] == ["hertz", "bilinear"]
-    assert [curve["law"].item() for curve, _ in found] == ["hertz", "bilinear"]
-    assert list(curves(ensemble, "wavenumber")) == []
-    assert member_folder(ensemble.isel(law=0, amplitude=3)).parent == reduced

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
 from tests.breathers import breather_chain
-from tests.condensed_branches import condensed_branch
 from tests.models import CLEARANCE, four_band_contact
 from tests.unlike_lattices import independent_lattice, unlike_case
 from vipetsc.case.nnm import NnmTable
@@ -75,76 +72,6 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
         assert point.period == pytest.approx(2 * half, rel=1e-11)
 
 
-def test_free_masses_with_a_stop_between_them_move_about_their_centre():
-    """Two free masses with a stop between them have the period of their reduced mass, and their centre rests."""
-    pair = ContactPair(0, 1, 0.1, Contact("bilinear", STOP), np.inf)
-    # The reduced mass of the two is MASS.
-    system = System.assemble([MASS * 3, MASS * 1.5], [(0, 1, SPRING)], [pair])
-    problem = Shooting(Dop853Flow(system), MAPS["half"])
-    start = linear_start(problem, 1, 0.4 * SPRING * 0.1**2)
-    points = [start, *Continuation(problem, start, NnmTable(points=20, largest_step=0.3, first_step=0.1))]
-
-    assert points[-1].episodes == 1
-    for point in points:
-        half = time_on_one_side(point.energy, 0.1) + time_on_one_side(point.energy, np.inf)
-        assert point.period == pytest.approx(2 * half, rel=1e-11)
-        assert abs(system.masses @ point.x) < 1e-12 * np.abs(point.x).max()
-
-
-def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
-    """A condensed motion with mean and even harmonics has the exact period of a stop on one side."""
-    system = mass_between_stops(0.1, np.inf)
-    _, points = condensed_branch(system, 0, 0.49 * SPRING * 0.1**2, truncation=1e-6, points=14, largest_step=0.2)
-
-    assert points[-1].episodes == 1
-    for point in points:
-        half = time_on_one_side(point.energy, 0.1) + time_on_one_side(point.energy, np.inf)
-        assert point.period == pytest.approx(2 * half, rel=1e-5)
-    # The mean displacement is away from the stop.
-    assert points[-1].x[0] < -1e-3 * 0.1
-
-
-def test_the_time_with_a_contact_closed_is_that_of_shooting():
-    """Two masses that meet stops at different times have contact for the time that shooting counts."""
-    law = Contact("bilinear", STOP)
-    pairs = [ContactPair(None, mass, clearance, law, np.inf) for mass, clearance in enumerate((0.5, 0.45))]
-    system = System.assemble([1.0, 1.2], [(None, 0, 10.0), (0, 1, 10.0), (None, 1, 10.0)], pairs)
-    energy = 0.9 * system.grazing_energy(1)
-    problem, points = condensed_branch(system, 1, energy, truncation=1e-6, points=30, largest_step=0.2)
-    point = points[-1]
-    assert point.episodes == 2
-
-    u = np.concatenate(list(state_of(problem, point, 2).values()))
-    frame = Shooting(Dop853Flow(system), MAPS["half"], 1e-12).relative_frame(u, point.period)
-    row = np.append(u / np.linalg.norm(u), 0.0)
-    orbit = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
-    assert orbit.period == pytest.approx(point.period, rel=1e-5)
-    assert point.closed == pytest.approx(orbit.closed, rel=1e-4)
-
-
-def test_the_other_side_has_the_mirrored_orbits():
-    """Every orbit of a lattice is mirrored if the clearances of the two sides of each contact are exchanged."""
-    case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)
-    system = System.from_case(case)
-    contacts = []
-    for pair in system.contacts:
-        contacts.append(replace(pair, clearance=pair.stops.minus, clearance_minus=pair.stops.plus))
-    mirrored = Shooting(Dop853Flow(replace(system, contacts=tuple(contacts))), MAPS["half"])
-    problem = Shooting(Dop853Flow(system), MAPS["half"])
-
-    start = linear_start(problem, 3, 2e-4)
-    points = list(Continuation(problem, start, case.nnm))
-    # The orbits have contacts at several sites and on both sides.
-    assert points[-1].episodes >= 3
-    for point in points[::10]:
-        frame = mirrored.frame_at("relative", -point.x, point.period)
-        assert np.abs(frame.residual(frame.xi)).max() < 1e-12
-        arc = mirrored.arc(-point.x, point.period)
-        assert arc.episodes == point.episodes
-        # The third column is the side of each change.
-        assert np.array_equal(arc.events[:, 2], -problem.arc(point.x, point.period).events[:, 2])
-
-
 @pytest.fixture(scope="module")
 def unlike_branch(tmp_path_factory):
     """The shooting problem of a lattice whose cells and sites differ, and the branch of a mode."""
@@ -171,32 +98,6 @@ def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_bran
         assert np.abs(motion[1, -1] - v[begin]).max() < 1e-8 * np.abs(v).max()
 
 
-@pytest.mark.slow
-def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch):
-    """Shooting corrects a motion by harmonic balance at three different sites to an orbit close to it."""
-    shooting, _ = unlike_branch
-    system = shooting.system
-    case = unlike_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2)
-    problem = condensed_system(system, case.nnm)
-    omega, shapes = system.linear_modes()
-    # The start is the linear mode at an energy at which the branch has contacts.
-    z = system.contact_rows @ shapes[:, 3] * np.sqrt(2 * 2.1e-4) / omega[3]
-    start = problem.from_mode(z, float(omega[3]))
-    point = list(Continuation(problem, start, case.nnm))[-1]
-    assert point.episodes
-
-    u = np.concatenate(list(state_of(problem, point, 2).values()))
-    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
-    frame = shooting.frame_at("relative", u, point.period)
-    row = np.append(u / np.linalg.norm(u), 0.0)
-    # The amplitude is held; period and shape are free.
-    attempt = frame.solve(frame.xi, row, row @ frame.xi)
-    assert attempt.converged
-    x, period = frame.chart.decode(attempt.xi)
-    assert np.abs(x - u).max() < 1e-4 * np.abs(u).max()
-    assert period == pytest.approx(point.period, rel=1e-6)
-
-
 @pytest.fixture(scope="module")
 def one_sided():
     """The chain, the stops and the breather of a site with a stop on one side, by shooting."""
@@ -210,15 +111,6 @@ def one_sided():
     attempt = frame.solve(frame.xi, np.append(np.zeros(len(u)), 1.0), 1.0)
     assert attempt.converged
     return chain, stops, frame.measures(attempt)
-
-
-def test_a_breather_on_one_side_closes(one_sided):
-    """A breather with a stop on one side, found by half a period, returns after the whole one."""
-    chain, stops, point = one_sided
-    dense = Dop853Flow(System.from_chain(chain, stops))
-    end = dense.arc(np.append(point.x, 0 * point.x), point.period, point.period).end
-    assert np.abs(end[: len(point.x)] - point.x).max() < 1e-8 * np.abs(point.x).max()
-    assert point.episodes == 1
 
 
 def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided):
