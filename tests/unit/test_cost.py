@@ -9,24 +9,9 @@ import numpy as np
 import pytest
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.cost import estimate, expected_episodes
-from vipetsc.dynamics.plan import RunPlan
+from vipetsc.dynamics.cost import expected_episodes
 
 CYCLES = 10
-
-
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
-    """One rank is as fast as two for the built-in lattice, as was measured, and slower for one ten times as long."""
-    short = Case.load(overrides=[f"time.engine={engine}"])
-    long = short.varied(overrides=["lattice.cells=3000"])
-
-    for case, is_worth_it in ((short, False), (long, True)):
-        alone = estimate(RunPlan.of(case), 1)
-        on_two = estimate(RunPlan.of(case), 2)
-        assert ("one rank would be as fast" in on_two.faster) is not is_worth_it
-        assert on_two.seconds == pytest.approx(alone.seconds / (1 + is_worth_it))
-        assert "one rank" not in alone.faster
 
 
 def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: float) -> Model:

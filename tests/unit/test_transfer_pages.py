@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import transfer, wavenumber_bins
-from vipetsc.figures.registry import FIGURES, specified_drawings
-from vipetsc.figures.style import Drawing, rc_style
+from vipetsc.figures.registry import FIGURES
+from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_ensemble
@@ -88,70 +86,6 @@ def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, m
         (axes,) = figure.axes
         (lattice,) = [line for line in axes.lines if line.get_label() == "lattice"]
         np.testing.assert_allclose(lattice.get_ydata(), transfer_of(restitution), rtol=1e-12)
-
-
-def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
-    """Return a member with a spectrum over wavenumber and frequency, and a warning that names it."""
-    case = Case.load(
-        overrides=[
-            "lattice.cells=20",
-            "contacts.sites=[9]",
-            f"contacts.restitution={restitution}",
-            f"drive.amplitude={amplitude}",
-        ]
-    )
-
-    spectrum = xr.DataArray(
-        np.outer(np.arange(1.0, 6.0), np.ones(9)),
-        {"wavenumber": np.linspace(0, np.pi, 5), "frequency": np.linspace(0, 3000.0, 9)},
-    )
-    # The warning of each run contains its name, by which the test finds it on the page.
-    about = {"warnings": json.dumps([f"the run {folder}"])}
-    analysis = xr.Dataset({"dispersion": spectrum, "ibtet": 0.01 * amplitude})
-    varied = f"contacts.restitution {restitution}"
-    return MemberRun(Path(folder), case, case.model(), xr.Dataset(attrs=about), analysis, varied)
-
-
-class MembersInMemory(Files):
-    """Given members by their folders, in place of members that ``Files`` reads."""
-
-    def __init__(self, *members: MemberRun) -> None:
-        super().__init__()
-        self._opened = {member.folder: member for member in members}
-
-
-def dispersions(monkeypatch, *members: MemberRun) -> list[Drawing]:
-    monkeypatch.setattr(transfer, "transfer_members", lambda sweeps: iter(members))
-    sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
-    return list(specified_drawings(FIGURES["transfer_dispersions"], [sweep], MembersInMemory(*members)))
-
-
-def titles(figure: Figure) -> list[str]:
-    panels = [axes for axes in figure.axes if axes.axison and axes.get_label() != "<colorbar>"]
-    return [" ".join(axes.get_title(loc="left").split()) for axes in panels]
-
-
-def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkeypatch):
-    """Two amplitudes of one restitution have a page; single members of two other restitutions have one page together.
-
-    Each page has the warnings of its own members.
-    """
-    members = [member_of("a", 10, 0.5), member_of("b", 20, 0.5), member_of("c", 10, 0.7), member_of("d", 30, 0.9)]
-    table, page = dispersions(monkeypatch, *members)
-    assert table.stem.endswith("contacts.restitution-0.5")
-    assert page.stem == "transfer_dispersions-members-1-to-2"
-
-    figures = [table.draw(), page.draw()]
-    assert titles(figures[0]) == ["(a) Hertz, 10 N", "(b) Hertz, 20 N"]
-    assert [title.rpartition("contacts.")[2] for title in titles(figures[1])] == [
-        "restitution 0.7, 10 N",
-        "restitution 0.9, 30 N",
-    ]
-    # The warnings differ in letters, since those that differ in numbers alone are merged.
-    assert [figure.get_label().splitlines() for figure in figures] == [
-        ["Hertz, 10 N: the run a", "Hertz, 20 N: the run b"],
-        [f"{member.labels.member}: the run {member.folder}" for member in members[2:]],
-    ]
 
 
 def test_amplitudes_of_a_moved_wall_are_in_metres():

@@ -15,7 +15,7 @@ from vipetsc.endings import Ending
 from vipetsc.figures.frequency_energy import backbone
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
-from vipetsc.modes.branches.files import read_branch, table, to_dataset, write_branch
+from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
 
 NAME = "branch-out-of-phase"
@@ -35,11 +35,6 @@ def branch(short_branch) -> Branch:
         findings=["a", "b"],
         extra=sampled(short_branch.problem, points[-1:]),
     )
-
-
-def table_of(branch: Branch) -> str:
-    """Return the CSV table of a branch as text."""
-    return table(to_dataset(branch), branch.kind)
 
 
 def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False, **nnm) -> Branch:
@@ -109,20 +104,3 @@ def test_both_directions_are_two_branches(tmp_path):
         assert drawn.get_xlim() == (min(expected), max(expected))
         curve = max((line.get_xdata() for line in drawn.lines), key=len)
         assert np.abs(np.subtract.outer(expected, curve) / curve).min(axis=1).max() < 1e-12
-
-
-def test_a_table_that_cannot_be_written_costs_no_branch(tmp_path, monkeypatch, caplog):
-    """A complete branch whose table cannot be written is read and not followed again; a warning gives the reason."""
-    short = {"energy": [0.0, 0.0295], "locate": False}
-    whole = follow(tmp_path, **short)
-    (tmp_path / f"{NAME}.csv").unlink()
-
-    def refuse(*_):
-        raise OSError("the disk is full")
-
-    monkeypatch.setattr("vipetsc.modes.branches.follow.restore_table", refuse)
-    followed = []
-    branch = follow(tmp_path, lambda *_: followed.append(1), resume=True, **short)
-    assert not followed
-    assert table_of(branch) == table_of(whole)
-    assert "the table of branch out-of-phase is not written: the disk is full" in caplog.text

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy
 
-from vipetsc.case import Case, Sweep
+from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.section import CaseError
-from vipetsc.lattice import bloch, pass_bands
+from vipetsc.lattice import bloch
 
 ELEMENTS = 20
 LENGTH = 0.4  # m, of a cell
@@ -160,23 +160,3 @@ def test_other_matrices_are_refused(matrices, cell, sections, word, tmp_path):
     given["drive"] |= sections.get("drive", {})
     with pytest.raises(CaseError, match=word):
         Case.from_table(given)
-
-
-def test_members_of_a_sweep_have_their_own_matrices(tmp_path):
-    """Names of matrices that a sweep varies replace those of the case, whose springs were filled in before."""
-    blocks = {"M": np.eye(2), "K": np.array([[3.0, -1.0], [-1.0, 3.0]]), "K_next": np.array([[0.0, 0.0], [-1.0, 0.0]])}
-    for name, size in (("soft", 1.0), ("stiff", 4.0)):
-        np.savez(tmp_path / f"{name}.npz", **{key: size * value for key, value in blocks.items()} | {"M": np.eye(2)})
-    case = {
-        "lattice": {"cells": 8, "cell": {"matrices": str(tmp_path / "soft.npz")}},
-        "contacts": {"sites": []},
-        "drive": {"waveform": "harmonic", "frequency": 1.5, "amplitude": 1.0},
-        "time": {"end": 10.0},
-    }
-    names = [str(tmp_path / "stiff.npz"), str(tmp_path / "soft.npz")]
-    plan = Sweep.from_table(case | {"sweep": {"lattice": {"cell": {"matrices": names}}}})
-    tops = [pass_bands(plan.case(number).lattice.unit_cell())[-1].high for number in range(2)]
-    assert tops[0] == pytest.approx(2 * tops[1])
-
-    with pytest.raises(CaseError, match="boundary"):
-        Case.from_table(case).varied(lattice={"cell": {"boundary": [[1], [2]]}})

@@ -125,52 +125,6 @@ def test_a_packet_comes_back_as_computed():
     assert energy[-1] / energy[0] == pytest.approx(computed, rel=0.1)
 
 
-def test_an_absorbing_end_is_found_for_the_drive():
-    """A case that gives only a reflection gets the cells and the strength of an end that keeps it for its drive."""
-    case = small_case(lattice={"cells": 90, "absorbing": {"reflection": 1e-4}}, drive={"cycles": 30})
-    end = case.lattice.absorbing
-    drive = case.drive
-    chain = case.model().chain
-    assert np.flatnonzero(chain.differs).tolist() == list(range(90 - end.cells, 90))
-    assert reflection(chain, drive.frequency, end.cells + 1) < 1e-4
-    assert Case.from_toml(case.to_toml()) == case
-
-
-def test_profiles_defects_and_scatter_of_a_case():
-    """Values of profiles are exact, and scattered quantities have their deviation, drawn anew for another seed only."""
-    cells = {
-        "masses[1]": {"relative": 0.02},
-        "springs[3].stiffness": {"absolute": 50.0},
-        "masses[4]": {"relative": 0.02},
-    }
-    scattered = {"seed": 3, "cells": cells}
-    profiles = {
-        "masses[2]": {"cells": [3], "factor": 2.0},
-        "springs[1].stiffness": {"first": 2e4, "last": 3e4},
-        "springs[4].damping": [0.1] * 24,
-    }
-    lattice = {"profiles": profiles, "damping": {"mass": 5.0}}
-    case = small_case(lattice=lattice, disorder=scattered)
-    varied = case.model().chain.variation
-    cell = case.model().chain.cell
-
-    assert varied.masses[2, 1] == 2 * cell.masses[1]
-    assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
-    assert varied.damping[:, 3] == pytest.approx(0.1)
-    assert varied.grounding == pytest.approx(5.0 * varied.masses)
-    # Masses 1 and 4 are scattered by the same deviation, but by draws of their own.
-    assert np.all(varied.masses[:, 0] != varied.masses[:, 3])
-    # The bounds are wide enough for the deviation of 24 draws from a distribution of deviation 0.02.
-    assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
-    assert Case.from_toml(case.to_toml()) == case
-    assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
-
-    # Another seed draws other values, and leaves those of profiles.
-    other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
-    assert np.all(other.masses[:, 0] != varied.masses[:, 0])
-    assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
-
-
 def lossy(cell, loss):
     """``cell`` with dashpots fitted to a ``loss``, a table of loss factors by band number."""
     grounding, springs = fitted_dashpots(cell, tuple(loss.items()))

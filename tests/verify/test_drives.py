@@ -45,51 +45,6 @@ def relative_error(values: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs(values - expected).max() / np.abs(expected).max())
 
 
-def by_transfer_function(case: Case) -> np.ndarray:
-    """Displacements (time, cell, dof) in m, the inverse transform of (K - w^2 M)^-1 F(w).
-
-    The frequencies w lie on a line below the real axis, which keeps them away from the poles.
-    """
-    model = case.model()
-    chain = model.chain
-    drive = model.drive
-    count = 30_000
-    # The transform's period is three times the run. What a discrete transform wraps round is damped by exp(-25) on the
-    # line.
-    length = 3 * model.end
-    decay = 25 / length
-    time = np.arange(count) * length / count
-    omega = 2 * np.pi * np.fft.rfftfreq(count, length / count) - 1j * decay
-    force = np.fft.rfft(drive.force(time) * np.exp(-decay * time))
-
-    root = 1 / np.sqrt(chain.masses())
-    squared, modes = np.linalg.eigh(chain.stiffness_matrix().toarray() * root[:, None] * root)
-    driven = model.drive_cell * chain.cell.dofs + model.drive_mass
-    push = modes[driven] * root[driven]
-    amplitudes = np.fft.irfft(force[:, None] * push / (squared - omega[:, None] ** 2), count, axis=0)
-
-    # Every sample of the run is at an instant of the transform.
-    samples = np.arange(model.samples) * model.sample_interval
-    rows = np.rint(samples * count / length).astype(int)
-    np.testing.assert_allclose(time[rows], samples, atol=1e-12)
-
-    fields = (amplitudes[rows] * np.exp(decay * time[rows])[:, None]) @ (modes * root[:, None]).T
-    return fields.reshape(len(rows), chain.cells, -1)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_chirp_meets_the_transfer_function(engine):
-    """The response to a chirp is the inverse transform of the lattice's transfer function times that of the force."""
-    chirp = {"waveform": "chirp", "amplitude": 5.0, "frequency": 700.0, "bandwidth": 900.0, "duration": 0.02}
-    time = {"end": 0.03, "engine": engine, "sample_interval": 1.2e-4, "rtol": 1e-11}
-    case = case_of(chirp | {"cell": 4, "mass": 2}, time=time)
-
-    run = run_of(case)
-
-    assert relative_error(run["displacement"].values, by_transfer_function(case)) < 1e-8
-    assert ledger_error(run) < 1e-9
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_burst_from_a_file_is_the_burst_to_the_splines_error(engine, tmp_path):
     """A cubic spline through samples has an error of fourth order: twice as many samples divide it by 16."""

@@ -12,12 +12,9 @@ from tests.independent_lattice import ScipyLattice, Stop
 from tests.models import TWO_MASS_CELL
 from tests.steady_states import motion_at, refined
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.modes.continuation.arclength import Continuation, Geometry
-from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.response import steps
-from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
-from vipetsc.modes.response.steps import TurningSteps, first_state
+from vipetsc.modes.response.steps import first_state
 from vipetsc.parallel import StoppedError
 
 CLEARANCE = 1e-4
@@ -44,25 +41,6 @@ def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
         return SteadyStates(case, RESTITUTION, omega)
 
     return states(touches * states(1e-3).parameter.scale)
-
-
-def test_a_curve_that_cannot_go_on_says_what_was_wrong_with_the_last_step():
-    """A step is refused for its turn or for its correction; one that is too short to be tried says so."""
-    states = states_from(1000.0, touches=0.5)
-    rule = TurningSteps(states, points=10)
-    state = Response(xi=np.zeros(states.balance.size + 1), step=0.1)
-    turned = rule.judge(state, state, Geometry(corrector=0.01, turn=0.3))
-    moved = rule.judge(state, state, Geometry(corrector=0.2, turn=0.01))
-    unknown = rule.judge(state, state, Geometry(corrector=np.nan, turn=0.01))
-
-    assert turned.why == "the curve turns too sharply (0.3 rad)"
-    assert moved.why == "the correction is too long (0.2 of the step)"
-    assert not any(verdict.accepted for verdict in (turned, moved, unknown))
-    assert rule.judge(state, state, Geometry(corrector=0.1, turn=0.25)).accepted
-
-    curve = Continuation(states, first_state(states), rule, step=1e-10)
-    with pytest.raises(ContinuationError, match=r": the next step, 1e-10, is below nfrc\.smallest_step; increase"):
-        next(iter(curve))
 
 
 def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: np.ndarray) -> np.ndarray:

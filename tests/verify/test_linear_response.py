@@ -11,7 +11,6 @@ import pytest
 from tests.rigs import TWO_MASSES
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.main import main
-from vipetsc.figures.response_outputs import response_outputs
 from vipetsc.io.read import open_results
 
 POINTS = {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 3}], "transmission": [["near", "far"]]}
@@ -102,26 +101,3 @@ def test_a_frequency_at_an_undamped_resonance_is_named(tmp_path):
     with curve_of(case, tmp_path / "undamped") as curve:
         (warning,) = json.loads(curve.attrs["warnings"])
     assert "2.1213" in warning and "2.56" not in warning
-
-
-def test_a_grid_may_have_one_point(tmp_path):
-    """The only point is the beginning of the range."""
-    with curve_of(table(drive=FORCE, nfrc=OVER | {"infinite": False, "points": 1}), tmp_path) as curve:
-        assert curve["frequency"].values.tolist() == [0.4]
-
-
-def test_the_linear_response_lies_behind_a_nonlinear_one(tmp_path):
-    """States that touch no stop are linear motions, which the file has beside them; others are not."""
-    case = copy.deepcopy(TWO_MASSES)
-    case |= {"output": POINTS | {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}]}}
-    case["nfrc"] |= {"range": [0.6, 1.4], "fixed": [0.1], "points": 200}
-    with curve_of(case, tmp_path) as curve:
-        free = curve["episodes"].values == 0
-        assert free.any() and not free.all()
-        for name, at in (("peak_displacement", 1), ("lag", 0), ("transmission", 0), ("largest", 0)):
-            here = np.interp(curve["frequency"], curve["linear"], curve[f"linear_{name}"][:, at])
-            states = curve[name].values[:, at]
-            np.testing.assert_allclose(states[free], here[free], rtol=5e-3)
-            assert np.abs(states / here - 1)[~free].max() > 0.02
-        figure = response_outputs([tmp_path / "out" / f"branch-{curve.attrs['name']}.h5"])
-        assert all("linear" in axes.get_legend_handles_labels()[1] for axes in figure.axes)

@@ -162,52 +162,6 @@ def test_an_observer_is_given_and_goes_on_with_the_run(folder):
     assert_same_bits(run, datasets(folder / "stopped" / "run.h5"))
 
 
-class Halves(Observer):
-    """An observer that sums the recorded fields of each sample, and ends the run at sample 100, within a block."""
-
-    name = "test-halves"
-    longest = 40
-
-    def begin(self, setup):
-        super().begin(setup)
-        self.sums = []
-
-    def observe(self, block):
-        fields = block.samples.fields[:, : block.samples.recorded_rows(len(block))]
-        self.sums += fields.sum(axis=(0, 2, 3)).tolist()
-        if 100 in range(block.first, block.first + len(block)):
-            raise RunawayError("far enough", 100 - block.first)
-
-    def statistics(self):
-        return {"sums": self.sums}
-
-
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_what_an_observer_refuses_within_a_block_is_not_recorded(folder, engine):
-    case = small_case(time={"end": 0.03, "engine": engine}, output={"stride": 3})
-    assert simulate(case, folder / "whole").complete
-
-    result = simulate(case, folder / "run", observers=[Halves])
-    last = case.model().sample_interval * 99
-    assert result.sentence.startswith("far enough, at t = 0.02 s")
-    assert result.sentence.endswith(f"last good sample: t = {last:.6g} s")
-    assert result.statistics["samples"] == 100
-
-    run = datasets(folder / "run" / "run.h5")
-    whole = datasets(folder / "whole" / "run.h5")
-    # Of 100 samples every third is recorded, from the first on.
-    assert run["velocity"].shape[0] == run["field_time"].size == 34
-    # Onsets that the engine computed after the last good sample are not recorded.
-    before = whole["impacts/onset"] <= last + 4e-4
-    assert run["impacts/onset"].tolist() == whole["impacts/onset"][before].tolist()
-    assert 0 < run["impacts/onset"].size < whole["impacts/onset"].size
-    for name in ("time", "field_time", "velocity", "displacement", "energy/kinetic", "energy/dissipated_by_site"):
-        assert run[name].tobytes() == whole[name][: len(run[name])].tobytes(), name
-
-    sums = sum(run[name].sum(axis=(1, 2)) for name in ("velocity", "displacement"))
-    np.testing.assert_allclose(result.statistics["sums"][:34], sums, rtol=1e-10, atol=1e-12)
-
-
 def test_a_loss_of_dashpots_that_falls_is_an_error_of_the_balance():
     """The largest fall below any earlier value counts, also across blocks and a checkpoint."""
     ledger = begun(Ledger)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.conftest import simulated, small_case
 from tests.models import THREE_MASS_CELL
 from vipetsc.case import Case
 from vipetsc.contact.law import create_contacts
-from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.taylor import first_onset
-from vipetsc.lattice import Contact, pass_bands
-from vipetsc.lattice.chain import Chain
+from vipetsc.lattice import Contact
 
 
 def with_engine(case: Case, engine: str, **time) -> Case:
@@ -168,87 +166,3 @@ def test_no_onset_is_missed(coefficients, length, clearance):
         assert np.all(w[s < onset] <= limit)
         at_onset = abs(np.polynomial.polynomial.polyval(onset, jet))
         assert at_onset == pytest.approx(clearance, rel=1e-9)
-
-
-@pytest.mark.parametrize("interval", [1e-4, 5e-4])
-def test_rows_near_an_end_turn_into_the_stencil(interval):
-    """Cells as far from a wall as the powers reach have the interior's rows, but for entries that meet the wall."""
-    chain = small_case().model().chain
-    series = StepSeries(chain, interval, 1e-14)
-    interior = StepSeries(Chain(chain.cell, 200, "fixed"), interval, 1e-14).interior()
-
-    r = series.reach
-    end = series.stencil(series.cut(*series.power_rows([r - 1]), 1 - r, 2 * r))
-
-    # The last of the end's cells meets the wall only in its farthest entries.
-    np.testing.assert_allclose(end[:, :, r:], interior[:, :, r + 1 :][:, :, :r], rtol=1e-9, atol=1e-9)
-
-
-@st.composite
-def cases(draw) -> Case:
-    """Cases of small lattices with random cells, ends, sites, drives and sample intervals."""
-    # There are few masses and cells, as an example takes a second by ``ts``.
-    dofs = draw(st.integers(2, 3))
-    masses = [draw(st.floats(0.002, 0.02)) for _ in range(dofs)]
-    stiffness = st.floats(2e3, 3e4)
-    leaving = draw(st.sampled_from([1, dofs]))
-    springs = [{"start": leaving, "end": 1, "stiffness": draw(stiffness), "next_cell": True}]
-    springs += [{"start": mass, "end": mass + 1, "stiffness": draw(stiffness)} for mass in range(1, dofs)]
-    cells = draw(st.integers(5, 24))
-    sites = draw(st.lists(st.integers(1, cells), min_size=1, max_size=4, unique=True))
-    table = {
-        "lattice": {
-            "cells": cells,
-            "ends": draw(st.sampled_from(["fixed", "free", "periodic"])),
-            "cell": {"masses": masses, "springs": springs, "contact": [1, 2]},
-        },
-        "contacts": {
-            "law": draw(st.sampled_from(["hertz", "bilinear"])),
-            "restitution": draw(st.sampled_from([1.0, 0.7, 0.3])),
-            "sites": sorted(sites),
-            "stiffness": draw(st.floats(1e5, 1e7)),
-            "adhesion": draw(st.sampled_from(["allow", "clip"])),
-            "clearance": 1.0,
-        },
-        "drive": {
-            "amplitude": draw(st.floats(0.1, 100.0)),
-            "frequency": draw(st.floats(300.0, 3000.0)),
-            "cycles": draw(st.integers(1, 6)),
-            "cell": draw(st.integers(1, cells)),
-            "mass": draw(st.integers(1, dofs)),
-        },
-        "time": {"end": 0.03},
-    }
-    case = Case.from_table(table)
-
-    # Clearances that the wave reaches, and samples that the bands allow, follow only from a resolved case.
-    clearance = case.model().scale * draw(st.floats(0.05, 1.0))
-    nyquist = np.pi / pass_bands(case.lattice.unit_cell())[-1].high
-    table["contacts"]["clearance"] = clearance
-    table["time"]["sample_interval"] = nyquist * draw(st.floats(0.1, 0.95))
-    return Case.from_table(table)
-
-
-@pytest.mark.slow
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
-@given(cases())
-def test_both_engines_agree_on_random_lattices(case):
-    """Both engines agree on random lattices up to the fifth impact, or the propagator refuses them with a note."""
-    theirs, _ = simulated(with_engine(case, "ts", rtol=1e-11))
-    ours, result = simulated(with_engine(case, "propagator"))
-
-    if result.statistics["engine"] == "ts":
-        assert result.statistics["engine_note"]
-        return
-
-    # Impacts magnify differences, so that runs are compared up to the fifth impact only.
-    onsets = theirs["impacts/onset"].values
-    few = min(5, len(onsets), len(ours["impacts/onset"]))
-    last = onsets[few] if len(onsets) > few else np.inf
-    before = theirs["time"].values <= last
-
-    np.testing.assert_array_equal(theirs["impacts/site"][:few], ours["impacts/site"][:few])
-    np.testing.assert_allclose(onsets[:few], ours["impacts/onset"][:few], rtol=0, atol=1e-8)
-    exact = theirs["velocity"].values
-    assert relative((exact - ours["velocity"].values)[before], exact[before]) < 1e-6
-    assert result.statistics["ledger_error"] < 1e-8

@@ -14,7 +14,6 @@ import vipetsc
 from tests.rigs import TWO_MASSES
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.reading import put
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
@@ -99,17 +98,3 @@ def test_what_follows_from_a_key_is_that_of_each_member():
     assert first == pytest.approx(0.1)
     assert 0 < second < 0.1
     assert [curve.name for curve in losses.every_curve()] == ["damping-no-1-r1-0.2", "damping-no-2-r1-0.2"]
-
-
-def test_a_path_leads_to_an_entry_of_a_list():
-    table = {"cell": {"masses": [1.0, 2.0], "springs": [{"stiffness": 3.0}]}, "profiles": {}}
-    assert put(table, "cell.masses[2]", 4.0) == []
-    assert put(table, "cell.springs[1].stiffness", 5.0) == []
-    assert put(table, "profiles.masses[1]", [1.0]) == []
-    assert table["cell"] == {"masses": [1.0, 4.0], "springs": [{"stiffness": 5.0}]}
-    # The name of a profile has brackets itself.
-    assert table["profiles"] == {"masses[1]": [1.0]}
-    assert [str(problem) for problem in put(table, "cell.springs[3].stiffness", 1.0)] == [
-        "cell.springs[3].stiffness = 1.0: cell.springs[3] does not exist"
-    ]
-    assert "not removed" in put(table, "cell.masses[1]", None)[0].remedy

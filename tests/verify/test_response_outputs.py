@@ -5,23 +5,16 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import vipetsc
-from tests.conftest import run_of
 from tests.rigs import OUTPUT, TWO_MASSES, followed, rate_of
 from tests.steady_states import motion_at, nfrc_case
-from tests.verify.test_smooth_springs import DUFFING
-from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.io.export import write_curves
-from vipetsc.io.netcdf import open_netcdf
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -148,22 +141,3 @@ def test_files_name_the_masses(curve):
     assert [float(row["share/lost"]) for row in columns] == share.tolist()
 
     assert {picture.stem.partition("-")[0] for picture in draw("branches", [curve])} == {"branch", "outputs"}
-
-
-def test_harmonics_are_those_of_a_run_a_quarter_of_a_period_earlier(tmp_path):
-    """With (-i)^k, as the file's attribute says, a curve's harmonics are those of a run, whose drive is a sine."""
-    table = DUFFING | {"nfrc": DUFFING["nfrc"] | {"range": [0.5, 0.52], "points": 1}}
-    (curve,) = follow_all(NfrcCase.from_table(table), tmp_path, MPI.COMM_SELF)
-    with open_netcdf(tmp_path / f"branch-{curve.name}.h5", "branch", ("phase",)) as file:
-        assert "(-i)^k" in file.attrs["phase"]
-        z = file["spring_harmonics"].values[0, 0] + 1j * file["spring_harmonics_imaginary"].values[0, 0]
-        omega = float(file["frequency"].values[0])
-
-    drive = DUFFING["drive"] | {"frequency": omega}
-    periods = 2 * np.pi / omega
-    time = {"end": 60 * periods, "sample_interval": periods / 64}
-    run = run_of(Case.from_table({k: v for k, v in DUFFING.items() if k != "nfrc"} | {"drive": drive, "time": time}))
-    u = run["displacement"].values[-64:, 0, 0]
-    phase = omega * run["time"].values[-64:]
-    first = 2 * np.mean(u * np.exp(-1j * phase))
-    assert first == pytest.approx(-1j * z[1], rel=1e-2)

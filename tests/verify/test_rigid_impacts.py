@@ -243,51 +243,6 @@ def test_the_exponent_of_the_impact_oscillator_is_that_of_its_multipliers():
     assert result.statistics["lyapunov"] == pytest.approx(np.log(0.8) * 2.4 / (2 * np.pi), rel=0.1)
 
 
-NEXT = [6, 12, 18]  # sites of which no two share a mass
-ROW = [11, 12, 13]
-CUBIC = {"profiles": {"springs[2].cubic": {"cells": [12, 13], "value": 3e10}}, "damping": None}
-
-
-@pytest.mark.parametrize(
-    "create",
-    [
-        lambda engine: pairs(engine, 0.7),
-        lambda engine: pairs(engine, 0.0),
-        lambda engine: joined(engine, NEXT, 0.0),
-        lambda engine: joined(engine, NEXT, 0.5, "periodic"),
-        lambda engine: joined(engine, ROW, 0.0),
-        lambda engine: joined(engine, ROW, 0.5),
-        lambda engine: joined(engine, ROW, 1.0, time={"end": 0.025}),
-        lambda engine: small_case(
-            contacts={
-                "sites": [6, 12, 13],
-                "each": {"law": ["rigid", "hertz", "rigid"], "restitution": [0.0, 0.7, 0.3]},
-            },
-            time={"engine": engine, "end": 0.03},
-            output={"forces": True},
-        ),
-        lambda engine: joined(engine, NEXT, 0.0, lattice=CUBIC),
-    ],
-)
-def test_both_engines_agree(create):
-    """Lattices of 24 cells whose sites bounce and stick: motions agree to 1e-9, and so do reactions."""
-    runs = []
-    for engine in ("ts", "propagator"):
-        result = simulate(create(engine))
-        assert result.complete, result.sentence
-        assert result.statistics["engine"] == engine
-        runs.append(result.dataset)
-    one, other = runs
-    for name in ("displacement", "velocity", "sites/force"):
-        largest = np.abs(one[name].values).max()
-        np.testing.assert_allclose(other[name].values, one[name].values, rtol=0, atol=1e-9 * largest)
-    # All impacts but the last of a series, which end it at the shortest flight.
-    for data in runs:
-        assert np.count_nonzero(data["impacts/impulse"].values > 1e-6 * data["impacts/impulse"].values.max()) > 5
-    total = [data["impacts/impulse"].values.sum() for data in runs]
-    assert total[1] == pytest.approx(total[0], rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("changes", "key"),
     [

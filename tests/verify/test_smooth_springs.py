@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 
 from tests.rigs import OUTPUT, followed
 from tests.steady_states import motion_at
-from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, nonlinear_springs
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -102,53 +97,3 @@ def test_walls_feel_the_whole_force_of_their_springs():
     z = np.stack([left, -right])
     force = z + 0.5 * z**2 + 2.0 * z**3
     np.testing.assert_allclose(outputs["largest_wall_force"], np.abs(force).max(axis=1), rtol=1e-4)
-
-
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_elongations_are_those_of_every_nonlinear_spring(ends):
-    """The compliance of elongations is b^T (K - om^2 M)^-1 b, with a column of b for each nonlinear spring."""
-    springs = (Spring(0, 1, 1.0, cubic=1.0), Spring(1, 0, 2.0, offset=1, quadratic=1.0))
-    chain = Chain(UnitCell((1.0, 0.5), springs, host=0, resonator=1), 3, ends, sites=(1,), clearances=(1.0,))
-    rows = []
-    for cell in range(3):
-        rows.append({2 * cell: -1.0, 2 * cell + 1: 1.0})
-    for cell in {"fixed": range(-1, 3), "free": range(2), "periodic": range(3)}[ends]:
-        row = {}
-        if cell >= 0:
-            row[2 * cell + 1] = -1.0
-        if cell < 2 or ends == "periodic":
-            row[2 * (cell + 1) % 6] = 1.0
-        rows.append(row)
-    b = np.zeros((6, len(rows)))
-    for column, row in enumerate(rows):
-        for mass, sign in row.items():
-            b[mass, column] = sign
-
-    springs = nonlinear_springs(chain)
-    assert len(springs.cell) == len(rows)
-    found = ModalCompliance(chain).at(0.7)[0][1:, 1:]
-    dynamic = chain.stiffness_matrix().toarray() - 0.49 * np.diag(chain.masses())
-    expected = b.T @ np.linalg.solve(dynamic, b)
-    # The package numbers springs cell by cell, those within the cell and those to the next one in turn.
-    counts = [0, 3]
-    order = []
-    for number in springs.number:
-        order.append(counts[number])
-        counts[number] += 1
-    np.testing.assert_allclose(found, expected[np.ix_(order, order)], atol=1e-10)
-
-
-def test_a_curve_over_a_cubic_coefficient(tmp_path):
-    """A curve over the cubic coefficient begins with the linear response and decreases as the spring hardens."""
-    options = {"over": "lattice.cell.springs[1].cubic", "range": [1e-4, 0.5], "largest_step": 1.0}
-    drive = DUFFING["drive"] | {"frequency": 0.8}
-    case = NfrcCase.from_table(DUFFING | {"drive": drive, "nfrc": DUFFING["nfrc"] | options})
-    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
-    first, last = (curve.points[i].measured.outputs["spring_harmonics"][0, 1] for i in (0, -1))
-    assert first == pytest.approx((0.1 / (1 - 0.64 + 0.08j)).real, rel=1e-3)
-    # A spring that hardens moves the resonance away from this frequency, which lies below it.
-    assert last < first
-
-    with pytest.raises(CaseError, match="begin at another value"):
-        from_zero = DUFFING["nfrc"] | options | {"range": [0.0, 0.5]}
-        NfrcCase.from_table(DUFFING | {"contacts": STOP, "nfrc": from_zero})

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-import vipetsc
 from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.cli.verbs.branch_verbs import curve_rows
-from vipetsc.figures.nfrc import frequency_response
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.stability import Hill, Stability
@@ -93,43 +86,6 @@ def test_folds_are_no_branch_points(tmp_path):
     assert "branch-point" not in kinds
     fold = next(point for point in points if point.kind == "fold")
     assert np.abs(multipliers_at(states, fold) - 1).min() < 5e-3
-
-
-@pytest.mark.slow
-def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_path):
-    """Only ``special_points = "all"`` locates points between unstable states; regular points are as many either way."""
-    changes = {"contacts": {"clearance": 0.05, "side": "both"}, "nfrc": {"range": [1.6, 1.7]}}
-    kinds = {}
-    for asked in ("stability", "all"):
-        _, points = followed(case_of(changes, harmonics=15, special_points=asked), tmp_path / asked)
-        kinds[asked] = [(point.kind, point.measured.unstable) for point in points if point.kind != "regular"]
-        regular = [point for point in points if point.kind in ("regular", "fold")]
-        kinds[asked + " regular"] = len(regular)
-    assert any(unstable > 0 for kind, unstable in kinds["all"] if kind != "fold")
-    assert all(unstable == 0 for kind, unstable in kinds["stability"] if kind != "fold")
-    assert kinds["all regular"] == kinds["stability regular"]
-
-
-def labels_in(path: Path) -> list[str]:
-    """The labels of all that the picture of the curve in ``path`` shows."""
-    return [label for axes in frequency_response([path]).axes for label in axes.get_legend_handles_labels()[1]]
-
-
-def test_undecided_states_are_named_in_tables_files_and_pictures(tmp_path):
-    """A motion of three harmonics has too few orders for perturbations in contact: no state counts as stable."""
-    case = case_of(FLIP, harmonics=3)
-    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
-    count = len(curve.points)
-    rows = dict(curve_rows(case, curve))
-    assert rows["stable"] == f"0 of {count} points"
-    assert rows["undecided"] == f"{count} points; more than nfrc.harmonics = 3 may decide them"
-
-    with vipetsc.open(tmp_path / f"branch-{curve.name}.h5") as data:
-        assert (data["unstable"].values == -1).all()
-        assert np.isnan(data["growth"].values).all()
-    labels = labels_in(tmp_path / f"branch-{curve.name}.h5")
-    assert "undecided" in labels
-    assert "unstable" not in labels
 
 
 class States:

@@ -6,7 +6,6 @@ images, direct solutions of long lattices, and a run that ends before waves come
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,24 +54,6 @@ def test_compliances_are_those_of_a_long_damped_lattice(omega):
     expected = rows @ spsolve(dynamic.astype(complex), rows.T.astype(complex))
     found = WaveCompliance(chain, infinite=True).at(omega)[0]
     assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
-
-
-def test_the_ends_of_a_ring_do_not_join_an_infinite_lattice():
-    """In an infinite lattice the compliance of a contact with the next cell is the same in every cell."""
-    pair = (Pair(1, 0, offset=1),)
-    last = Chain(CELL, 5, "periodic", (4,), (1e-4,), pairs=pair)
-    inner = replace(last, sites=(1,))
-    answers = [WaveCompliance(chain, infinite=True).at(1000.0) for chain in (last, inner)]
-    assert answers[0] == pytest.approx(answers[1], rel=1e-12)
-
-
-def test_the_relative_motions_of_a_wave_are_differences_of_its_field():
-    """A wave's relative motion at a contact is the difference of its field at the two masses, and 1 at the first."""
-    chain = Chain(CELL, 1000, "fixed", SITES, (1e-4,) * 4, pairs=PAIRS)
-    wave = WaveCompliance(chain, infinite=True).incident(1000.0, 1, -1)
-    field = wave.field(range(chain.cells)).ravel()
-    assert wave.relative == pytest.approx(rows_of(chain) @ field, rel=1e-12)
-    assert wave.relative[0] == pytest.approx(1.0)
 
 
 GROUND = {"pair": [0, 2], "sites": [12, 14]}
