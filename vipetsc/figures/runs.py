@@ -110,10 +110,10 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     *maps, side = figure.subplots(1, len(spectra) + 1, sharey=True, width_ratios=widths)
     # The pass bands are shaded, so that the energy that each has received can be read off the sums.
     panels.shade_bands(side, ((band.low, band.high) for band in pass_bands(cell)))
-    for axes, tag, (name, spectrum) in zip(maps, "ab", spectra.items(), strict=False):
+    for axes, (name, spectrum) in zip(maps, spectra.items(), strict=True):
         text = CELLS[str(name)]
         image = panels.dispersion_map(axes, spectrum, norm, cell)
-        axes.set_title(f"({tag}) {text}")
+        axes.set_title(text)
         axes.label_outer()
         energy = np.maximum(spectrum.sum("wavenumber"), 1e-300)
         look = {"lw": 0.7, "label": text.split()[0].lower(), **style.CURVES[str(name)]}
@@ -123,7 +123,8 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     _mark_drive(side, model)
     largest = float(spectra.sum("wavenumber").to_array().max()) or 1.0
     side.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
-    side.set_title(f"({'abc'[len(spectra)]}) Sum over κ")
+    side.set_title("Sum over κ")
+    panels.label_panels([*maps, side])
     side.legend(loc="lower right")
     return figure
 

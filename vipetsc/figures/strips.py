@@ -1,6 +1,5 @@
 """Pictures and movies of a run on a strip of the plane: its motion over the cells (i, j), and over wave vectors."""
 
-from string import ascii_lowercase
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -195,12 +194,14 @@ def snapshots(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     height = shape[0] * (style.PAGE - 1.2) / shape[1] / strip.ratio
     figure = style.new_figure(style.PAGE, min(height + 0.25 * shape[0] + 0.4, 9.0))
     grid = figure.subplots(*shape, squeeze=False, sharex=True, sharey=True)
-    for tag, axes, field, row in zip(ascii_lowercase, grid.flat, fields, rows, strict=False):
+    for axes, field, row in zip(grid.flat, fields, rows, strict=False):
         mesh = strip.draw(axes, field, norm, "RdBu_r")
-        axes.set_title(f"({tag}) t = {time[row]:.4g} s" if len(rows) > 1 else f"t = {time[row]:.4g} s")
+        axes.set_title(f"t = {time[row]:.4g} s")
         axes.label_outer()
     for axes in grid.flat[len(rows) :]:
         axes.set_axis_off()
+    if len(rows) > 1:
+        panels.label_panels(grid.flat[: len(rows)])
     panels.colour_bar(mesh, grid, "Displacement (m)", extend="neither", aspect=40)
     if strip.plane.dofs > 1:
         style.add_note(figure, f"degree of freedom 1 of the {strip.plane.dofs} of each cell")

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
-from vipetsc.figures.panels import ROMAN, recorded_sites
+from vipetsc.figures.panels import label_panels, recorded_sites
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.swept_axes import SweptAxis, in_pi
 from vipetsc.io.netcdf import naming_spoilt, open_netcdf
@@ -173,14 +173,9 @@ class AmplitudeSeries(NamedTuple):
         """Return a figure with a column of panels (row, column) for each amplitude, lettered and headed."""
         figure = style.new_figure(style.PAGE, height, self.title)
         grid = figure.subplots(rows, len(self.runs), squeeze=False, **shared)
-        for (row, column), panel in np.ndenumerate(grid):
-            tag = "abc"[column]
-            if rows > 1:
-                tag += f".{ROMAN[row]}"
-            title = f"({tag})"
-            if row == 0:
-                title += f" {self.headings[column]}"
-            panel.set_title(title)
+        for panel, heading in zip(grid[0], self.headings, strict=True):
+            panel.set_title(heading)
+        label_panels(grid)
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
-from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
+from vipetsc.figures.panels import label_panels, note, quantile_band, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
 from vipetsc.figures.series import Series
 from vipetsc.figures.style import Drawing
@@ -85,11 +85,10 @@ def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable
     varied = str(shown[0].data.get("varied", ""))
     figure = style.new_figure(width, 2.9, Labels.of(shown[0].case, varied).page)
     grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for tag, axes, curve in zip(ascii_lowercase, grid, shown, strict=False):
-        title = panel(axes, curve)
-        if len(shown) > 1:
-            title = f"({tag}) {title}"
-        axes.set_title(title)
+    for axes, curve in zip(grid, shown, strict=True):
+        axes.set_title(panel(axes, curve))
+    if len(shown) > 1:
+        label_panels(grid)
     grid[0].set_ylabel(ylabel)
     return figure
 
