@@ -54,7 +54,7 @@ Solver = Callable[[Case], Solution]
 def parameters(model: Model) -> str:
     """The lattice of ``model`` as text that the peers read; raises ValueError for what they do not know."""
     chain = model.chain
-    contact = model.contact
+    contact = model.chain.sites[0].law
     drive = model.drive
     # Refused here, not by each peer.
     if contact.restitution != 1 or chain.ends == "periodic":
@@ -72,7 +72,7 @@ def parameters(model: Model) -> str:
         *(c[:4] for c in couplings),
         ("contact", int(contact.law == "hertz"), contact.stiffness, chain.cell.host, chain.cell.resonator),
         ("sites", len(chain.sites)),
-        *zip(chain.sites, chain.clearances, strict=True),
+        *((site.cell, site.clearance) for site in chain.sites),
         ("drive", model.drive_cell, model.drive_mass, drive.window_amplitude, drive.frequency, drive.cycles),
     ]
     return "".join(" ".join(map(str, line)) + "\n" for line in lines)
@@ -204,8 +204,8 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
 
 def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Hosts and resonators (site,) as indices of masses, and the clearances (site,) in m."""
-    first = np.array(chain.sites, int) * chain.cell.dofs
-    return first + chain.cell.host, first + chain.cell.resonator, np.array(chain.clearances)
+    first = chain.sites.cells * chain.cell.dofs
+    return first + chain.cell.host, first + chain.cell.resonator, chain.sites.clearances
 
 
 def plain_right_hand_side(model: Model) -> RightHandSide:
@@ -215,7 +215,7 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
     n = inverse_mass.size
     host, resonator, clearance = _pairs(model.chain)
     driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
-    contact = model.contact
+    contact = model.chain.sites[0].law
     drive = model.drive
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
@@ -233,7 +233,7 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
 def compiled_right_hand_side(model: Model) -> RightHandSide:
     """The right-hand side of ``model``, compiled by numba."""
     driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
-    return _compile(model.chain, model.contact, model.drive, driven)
+    return _compile(model.chain, model.chain.sites[0].law, model.drive, driven)
 
 
 @cache

@@ -113,8 +113,8 @@ def contact_law(case: Case) -> Figure:
     cell = model.chain.cell
     host = cell.masses[cell.host]
     resonator = cell.masses[cell.resonator]
-    law = model.used_laws[0]
-    clearance = model.chain.clearances[-1]
+    law = model.chain.sites[-1].law
+    clearance = model.chain.sites[-1].clearance
 
     figure = style.new_figure(style.PAGE, 2.6)
     left, right = figure.subplots(1, 2)

@@ -127,7 +127,7 @@ class Budget:
         """Run the lattice under ``amplitude``; the dataset has the cells of the sites. ``contacts`` change the case."""
         chain = self.case.model().chain
         # Files count cells from 1; the last site's contact may be with the cell after it, if there is one.
-        output = {"window": [min(chain.sites) + 1, min(max(chain.sites) + 2, chain.cells)]}
+        output = {"window": [int(chain.sites.cells.min()) + 1, min(int(chain.sites.cells.max()) + 2, chain.cells)]}
         case: Case = self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=output)
         if contacts:
             case = case.varied(contacts=contacts)
@@ -136,7 +136,8 @@ class Budget:
     def _motion(self, run: xr.Dataset) -> PairMotion:
         """The relative motion at the sites in a ``run`` as of `_run`."""
         chain = self.case.model().chain
-        return PairMotion.between(run, [site - min(chain.sites) for site in chain.sites], chain.contact_pairs)
+        cells = chain.sites.cells
+        return PairMotion.between(run, (cells - cells.min()).tolist(), chain.sites.pairs)
 
     def simulation(self, amplitude: float) -> Simulation:
         """Simulate the lattice under ``amplitude``; the waves that arrive at the sites, and the times of contact."""

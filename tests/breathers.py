@@ -7,6 +7,7 @@ from typing import Any
 from tests.models import CLEARANCE
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Chain, four_band
+from vipetsc.lattice.sites import sites_at
 
 # A breather of 1600 rad/s, in the gap between bands 2 and 3, decays within few cells.
 BREATHER_CELLS = 14
@@ -16,7 +17,8 @@ BREATHER_FREQUENCY = 1600.0
 
 def breather_chain(ends: str = "fixed", sites: tuple[int, ...] = (BREATHER_SITE,)) -> Chain:
     """The calibrated four-band lattice of 14 cells with contacts at ``sites``."""
-    return Chain(four_band("calibrated"), BREATHER_CELLS, ends, sites, (CLEARANCE,) * len(sites))
+    cell = four_band("calibrated")
+    return Chain(cell, BREATHER_CELLS, ends, sites_at(sites, cell.pair, clearances=CLEARANCE))
 
 
 def breather_case(**nnm: Any) -> NnmCase:

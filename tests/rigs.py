@@ -59,15 +59,14 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
     for (cell, mass), weight in zip(states.points, states.weights, strict=True):
         drive[cell * d + mass] += weight * amplitude
     # Clearances, and with them the loads at rest, are those of the case, not those that the response was computed with.
-    gaps = states.case.model().gaps
     joins = []
-    for site, pair, stops, (plus, minus) in zip(
-        chain.sites, chain.contact_pairs, states.forces.contacts, gaps, strict=True
-    ):
-        host = site * d + pair.host if pair.host >= 0 else None
+    for site, stops in zip(chain.sites, states.forces.contacts, strict=True):
+        pair = site.pair
+        plus, minus = site.gaps
+        host = site.cell * d + pair.host if pair.host >= 0 else None
         sides = [(side, gap) for side, gap in ((1, plus), (-1, minus)) if gap < np.inf]
         load = sum(side * stops.law.elastic_force(-gap) for side, gap in sides)
-        joins.append((host, (site + pair.offset) % chain.cells * d + pair.resonator, stops.law, sides, load))
+        joins.append((host, (site.cell + pair.offset) % chain.cells * d + pair.resonator, stops.law, sides, load))
 
     beyond = []
     for cell, number in itertools.product(range(-1, chain.cells), range(len(chain.cell.springs))):

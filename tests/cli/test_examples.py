@@ -65,7 +65,7 @@ def test_a_copied_case_has_its_modules(in_process, tmp_path, monkeypatch):
     assert copied.contacts == shipped.contacts
     # The comment in the case says that at this depth the force is twice that of the linear law, k x.
     depth = 0.32e-3
-    law = copied.model().contact
+    law = copied.model().chain.sites[0].law
     assert law.elastic_force(depth) == pytest.approx(2 * 2e5 * depth, rel=0.02)
     # The force at a number is a number, and the force at an array has the array's shape.
     assert np.shape(law.elastic_force(depth)) == ()

@@ -47,7 +47,7 @@ def test_a_record_becomes_a_case(in_process, case, tmp_path):
 
     found = Case.load(out / "identified.toml")
     assert found.name == "lab-identified"
-    assert found.model().chain.clearances[0] == pytest.approx(5e-4, rel=0.02)
+    assert found.model().chain.sites[0].clearance == pytest.approx(5e-4, rel=0.02)
     again = in_process("identify", case, "--out", out)
     assert again.returncode == 0
     assert "clearance 1" in again.stdout

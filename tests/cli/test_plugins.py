@@ -78,7 +78,7 @@ def test_a_run_uses_and_records_the_parts(folder, out):
     """The results use every registered part, record its module and hash, and have the registered figure."""
     with open(out / "run.h5") as run:
         case = Case.of(run)
-        law = case.model().contact
+        law = case.model().chain.sites[0].law
         # Without contacts the law and the measure would not be used.
         assert len(run["impacts/onset"]) > 4
         longest = float((run["impacts/separation"] - run["impacts/onset"]).max())

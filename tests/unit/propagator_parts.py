@@ -47,7 +47,7 @@ def chain_parts(ends: str, interval: float, tolerance: float, sites: tuple[int, 
 def mass_on_stop(damping: float = 0.0) -> Record:
     """Return a mass on a bilinear stop at w = 1 m: w - 1 = SPEED sin(RATE t)/RATE unless it is damped."""
     interval = 1e-4
-    contact = small_case(contacts={"law": "bilinear"}).model().contact
+    contact = small_case(contacts={"law": "bilinear"}).model().chain.sites[0].law
     contacts = create_contacts(contact, [1.0])
     contacts["mode"] = CLOSED
     contacts["approach"] = SPEED

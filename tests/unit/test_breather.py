@@ -19,6 +19,7 @@ from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band, pass_bands
 from vipetsc.lattice.compliance.moments import SeriesCompliance
+from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
@@ -134,7 +135,8 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
 @pytest.mark.parametrize("sites", [(3, 20, 150, 299), (0,), (150, 152)])
 def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
     """The series in 1/omega^2 is the compliance above twice the highest frequency of the bands."""
-    chain = Chain(four_band("calibrated"), 300, ends, sites, (CLEARANCE,) * len(sites))
+    cell = four_band("calibrated")
+    chain = Chain(cell, 300, ends, sites_at(sites, cell.pair, clearances=CLEARANCE))
     # The series takes over at twice the highest frequency.
     omega = pass_bands(chain.cell)[-1].high * np.array([0.5, 2.01, 3.0, 20.0 - 1e-3j])
     exact = WaveCompliance(chain).at(omega)

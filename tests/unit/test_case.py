@@ -50,7 +50,7 @@ def test_the_builtin_case_has_the_papers_contacts_and_drive():
     np.testing.assert_allclose(case.contacts.clearance, np.geomspace(10**-2.65, 10**-2.75, 5), rtol=1e-12)
     assert case.contacts.stiffness == pytest.approx(5180269.459, rel=1e-9)
     assert case.drive.frequency == pytest.approx(1023.27, abs=5e-3)
-    assert case.model().contact == Contact("hertz", case.contacts.stiffness, 0.7, "allow", 0.0)
+    assert case.model().chain.sites[0].law == Contact("hertz", case.contacts.stiffness, 0.7, "allow", 0.0)
 
 
 def test_the_builtin_case_lasts_until_the_wave_has_crossed():

@@ -17,7 +17,7 @@ from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase, Sweep
 from vipetsc.case.html import cell_svg
 from vipetsc.lattice import Spring, UnitCell, four_band
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.studies.one_site import make_law
 from vipetsc.studies.prediction import predict

@@ -25,7 +25,7 @@ def test_clusters_that_cannot_touch_are_left_alone():
     taylor = np.zeros((4, 2 * series.terms))
     state = np.zeros((2 * layout.dofs, layout.cells))
     resonator = model.chain.cell.resonator
-    clearance = model.chain.clearances[1]
+    clearance = model.chain.sites[1].clearance
     for displacement, expected in ((0.9 * clearance, []), (1.001 * clearance, [2]), (np.nan, [2])):
         # The cell with index 11 holds the second site, whose group is the third one.
         state[resonator, 11] = displacement

@@ -9,6 +9,7 @@ import pytest
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
 from vipetsc.lattice.compliance.by_waves import WaveCompliance
 from vipetsc.lattice.compliance.dense import DenseCompliance
+from vipetsc.lattice.sites import sites_at
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -37,7 +38,7 @@ DRIVEN = 1023.27
 
 def chain_of(cell: UnitCell, cells: int, sites: Sequence[int], ends: str = "fixed") -> Chain:
     """Return a chain with contacts at ``sites``, whose clearances do not matter here."""
-    return Chain(cell, cells, ends, tuple(sites), (1e-3,) * len(sites))
+    return Chain(cell, cells, ends, sites_at(sites, cell.pair, clearances=1e-3))
 
 
 def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
@@ -49,7 +50,7 @@ def site_rows(chain: Chain) -> np.ndarray:
     """Return rows (site, mass of the chain) that yield w = u_resonator - u_host from displacements."""
     cell = chain.cell
     rows = np.zeros((len(chain.sites), chain.cells * cell.dofs))
-    for row, site in zip(rows, chain.sites, strict=True):
+    for row, site in zip(rows, chain.sites.cells, strict=True):
         row[site * cell.dofs + cell.resonator] = 1
         row[site * cell.dofs + cell.host] = -1
     return rows
@@ -142,7 +143,7 @@ def test_linear_scatterers_conserve_the_energy_but_for_what_they_take(name, band
     assert leaving.sum() + taken == pytest.approx(wave.flux, rel=1e-11)
     assert leaving.min() >= 0
     # The displacements by the incident wave and the springs' forces have the same w.
-    u = wave.field(chain.sites) + compliance.field(omega, spring * w, chain.sites)
+    u = wave.field(chain.sites.cells) + compliance.field(omega, spring * w, chain.sites.cells)
     assert np.allclose(u[:, cell.resonator] - u[:, cell.host], w, rtol=1e-11)
 
 

@@ -28,8 +28,9 @@ def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: flo
         "time": {"end": 0.2},
     }
     model = Case.from_table(table).model()
-    gaps = np.where(np.isfinite(model.gaps), model.scale / over, np.inf)
-    return replace(model, gaps=tuple(map(tuple, gaps.tolist())))
+    gaps = np.where(np.isfinite(model.chain.sites.gaps), model.scale / over, np.inf)
+    sites = sites_at(model.chain.sites.cells, model.chain.sites.pairs, gaps=gaps)
+    return replace(model, chain=replace(model.chain, sites=sites))
 
 
 @pytest.mark.parametrize(

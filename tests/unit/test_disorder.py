@@ -112,7 +112,7 @@ def test_the_clearances_of_the_two_sides_are_drawn_independently():
         assert len(set(drawn)) == 10
         assert drawn == pytest.approx(minus, rel=0.3)
         assert np.all(np.abs(np.divide(drawn, minus) - np.divide(equal, CLEARANCE)) > 1e-4)
-        assert [gap for _, gap in case.model().gaps] == drawn
+        assert case.model().chain.sites.gaps[:, 1].tolist() == drawn
         assert Case.from_toml(case.to_toml()) == case
 
     one = draw({"sites": [5], "clearance": CLEARANCE, "clearance_minus": 3e-3}, **scatter).contacts

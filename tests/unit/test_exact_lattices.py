@@ -17,7 +17,7 @@ from vipetsc.dynamics.propagator.groups import group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.taylor import evaluate
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 
 pytestmark = pytest.mark.slow
 
@@ -80,9 +80,9 @@ def with_any_pairs(model: Model) -> Model:
     """Return the model with contacts of ``PAIRS``, a second one in cell 12, and one in the last cell."""
     ends_on_ring = model.chain.ends == "periodic"
     pairs = PAIRS | {CELLS - 1: Pair(2, 0, offset=1) if ends_on_ring else Pair(-1, 3)}
-    sites = (*pairs, 11)
-    chain = replace(model.chain, sites=sites, pairs=(*pairs.values(), Pair(-1, 2)), clearances=(1e-4,) * len(sites))
-    return replace(model, chain=chain, gaps=((1e-4, 1e-4),) * len(sites))
+    law = model.chain.sites[0].law
+    sites = sites_at([*pairs, 11], [*pairs.values(), Pair(-1, 2)], law, clearances=1e-4)
+    return replace(model, chain=replace(model.chain, sites=sites))
 
 
 def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
@@ -94,8 +94,8 @@ def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
             drive = model.drives[-1 - number]
             form[drive.mass, drive.cell] = 1
             continue
-        pair = chain.contact_pairs[number]
-        cell = chain.sites[number]
+        cell = chain.sites[number].cell
+        pair = chain.sites[number].pair
         form[pair.resonator, (cell + pair.offset) % chain.cells] += 1
         if pair.host >= 0:
             form[pair.host, cell] -= 1

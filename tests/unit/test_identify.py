@@ -168,8 +168,8 @@ def test_parameters_go_into_the_case(tmp_path):
 
     case = plan.case_of([7e-4, 0.5, 0.6, 0.8, 0.003, 0.2, 33.0, 5e-4])
     chain = case.model().chain
-    assert chain.clearances == (7e-4, 4e-4, 7e-4)
-    assert [law.restitution for law in case.model().laws] == [0.5, 0.6, 0.8]
+    assert chain.sites.clearances.tolist() == [7e-4, 4e-4, 7e-4]
+    assert [site.law.restitution for site in case.model().chain.sites] == [0.5, 0.6, 0.8]
     assert chain.cell.masses[1] == 0.003
     assert [spring.damping for spring in chain.cell.springs][:2] == [0.2, 0.0]
     assert case.drive.amplitude == 33.0
@@ -195,12 +195,12 @@ def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
     assert [parameter.name for parameter in plan.parameters] == ["clearance_minus 1+2", "grounding 3"]
     # Values that neither the case nor the start has.
     model = plan.case_of([7e-4, 2e-3]).model()
-    assert model.gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 9e-4))
+    assert model.chain.sites.gaps.tolist() == [[5e-4, 7e-4], [4e-4, 7e-4], [3e-4, 9e-4]]
     assert model.chain.cell.grounding == (0.0, 0.0, 2e-3, 0.0)
 
     unknowns = [{"quantity": "clearance_minus"} | bounds]
     plan = IdentifyCase.from_table(identify_table(base, record, unknowns=unknowns))
-    assert plan.case_of([7e-4]).model().gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 7e-4))
+    assert plan.case_of([7e-4]).model().chain.sites.gaps.tolist() == [[5e-4, 7e-4], [4e-4, 7e-4], [3e-4, 7e-4]]
 
 
 def test_coordinates_and_values_are_inverse(tmp_path):

@@ -52,11 +52,11 @@ def test_bodies_are_what_springs_and_pressed_contacts_hold_together():
     """Numbers of bodies are those of the ground, then of grain and resonator of each cell."""
     between, ground = Pair(0, 0, offset=1), Pair(-1, 0)
     pressed, apart = (-1e-5, np.inf), (1e-5, np.inf)
-    assert bodies_of(chain_of((between,)), [apart]) == [0, 1, 1, 2, 2]
-    assert bodies_of(chain_of((between,)), [pressed]) == [0, 1, 1, 1, 1]
-    assert bodies_of(chain_of((between, ground)), [pressed, pressed]) == [0, 0, 0, 0, 0]
-    assert bodies_of(chain_of((between, ground)), [apart, pressed]) == [0, 0, 0, 1, 1]
-    assert bodies_of(chain_of((between,)), [(1e-5, 1e-5)]) == [0, 1, 1, 2, 2]
+    assert bodies_with([between], [apart]) == [0, 1, 1, 2, 2]
+    assert bodies_with([between], [pressed]) == [0, 1, 1, 1, 1]
+    assert bodies_with([between, ground], [pressed, pressed]) == [0, 0, 0, 0, 0]
+    assert bodies_with([between, ground], [apart, pressed]) == [0, 0, 0, 1, 1]
+    assert bodies_with([between], [(1e-5, 1e-5)]) == [0, 1, 1, 2, 2]
 
 
 def modes_case(modes: list[int], contacts: dict[str, Any] | None = None, ends: str = "free") -> dict[str, Any]:

@@ -19,6 +19,7 @@ from vipetsc.lattice import (
     pass_bands,
 )
 from vipetsc.lattice.drive import impulse
+from vipetsc.lattice.sites import sites_at
 from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.spectra.modal_energies import cluster_samples
 
@@ -64,7 +65,7 @@ def test_energies_sum_up_and_modes_turn_freely(name, ends, cells):
 
     The free motion is computed by a matrix exponential.
     """
-    chain = Chain(CELLS[name], cells, ends, (1,), (1e-3,))
+    chain = Chain(CELLS[name], cells, ends, sites_at([1], CELLS[name].pair))
     parts = ModalParts.of(chain)
     u, v = random_fields(chain)
     energies = parts.energies(u, v, range(3))

@@ -16,7 +16,7 @@ from vipetsc.figures.transfer_curves import TransferCurve, _of_contact, _superpo
 from vipetsc.figures.warning_lines import warned
 from vipetsc.io.errors import ResultFileError
 from vipetsc.io.netcdf import write_netcdf
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.lattice.topology import Topology
 
 
@@ -163,7 +163,7 @@ def test_a_portrait_shows_the_masses_that_its_contact_joins(pair, host, resonato
         {"displacement": (("time", "cell", "dof"), motion[None]), "sites/cell": ("site", [3])},
         {"cell": np.arange(1, 6)},
     )
-    model = SimpleNamespace(chain=SimpleNamespace(contact_pairs=(pair,), topology=Topology(5)))
+    model = SimpleNamespace(chain=SimpleNamespace(sites=sites_at([2], pair), topology=Topology(5)))
     assert _of_contact(run, model, "displacement").tolist() == [[host, resonator]]
 
 

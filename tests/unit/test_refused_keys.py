@@ -38,7 +38,7 @@ def test_a_clearance_of_the_side_minus_is_taken_where_one_site_has_a_stop_there(
     """``clearance_minus`` is accepted if at least one site has a stop on that side."""
     case = small_case(contacts={"sites": [4, 9], "clearance": 3e-5, "clearance_minus": 1e-5,
                                 "each": {"side": ["plus", "both"]}})  # fmt: skip
-    assert case.model().gaps[1] == (3e-5, 1e-5)
+    assert case.model().chain.sites[1].gaps == (3e-5, 1e-5)
 
 
 def test_what_follows_in_other_lines_of_an_override_is_refused():

@@ -18,7 +18,7 @@ from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs, register
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 
 CELLS = 7
 SITES = (0, 3, 4, 6)
@@ -51,10 +51,10 @@ class Motion(NamedTuple):
         return np.array([self.u[cell, mass], self.v[cell, mass]])
 
 
-def lattice(ends: str, pairs: tuple[Pair, ...] = ()) -> Model:
+def lattice(ends: str, pairs: Pair | tuple[Pair, ...] = CELL.pair) -> Model:
     """Return a short lattice with dashpots, nonlinear springs, four contacts and three drives."""
     model = small_case(lattice={"cells": 24}, contacts={"sites": [1]}).model()
-    chain = Chain(CELL, CELLS, ends, SITES, (CLEARANCE,) * len(SITES), pairs=pairs)
+    chain = Chain(CELL, CELLS, ends, sites_at(SITES, pairs, LAW, clearances=CLEARANCE))
     wave = model.drives[0].waveform
     # The first drive acts on the host of the second site, the others on masses near it that are not in contact.
     targets = [(SITES[1], CELL.host), (SITES[1], 0), (SITES[1] - 1, CELL.resonator)]
@@ -63,8 +63,7 @@ def lattice(ends: str, pairs: tuple[Pair, ...] = ()) -> Model:
         Drive(replace(wave, amplitude=factor * wave.amplitude), cell=cell, mass=mass)
         for (cell, mass), factor in zip(targets, factors, strict=True)
     ]
-    gaps = ((CLEARANCE, CLEARANCE),) * len(SITES)
-    return replace(model, chain=chain, contact=LAW, drives=tuple(drives), gaps=gaps)
+    return replace(model, chain=chain, drives=tuple(drives))
 
 
 def random_motion(model: Model) -> Motion:
@@ -88,7 +87,7 @@ def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[floa
     forces = [0.0] * len(SITES)
     powers = [0.0] * len(SITES)
     for i, (side, approach) in enumerate(zip(sides, approaches, strict=True)):
-        pair = chain.contact_pairs[i]
+        pair = chain.sites[i].pair
         host = motion.at(SITES[i], pair.host)
         resonator = motion.at(SITES[i] + pair.offset, pair.resonator)
         w, rate = side * (resonator - host)
@@ -127,7 +126,7 @@ def accelerations(model: Model, motion: Motion) -> np.ndarray:
                 force[right, spring.end] -= pull
 
     forces, _ = contact_forces(chain, motion)
-    for i, pair in enumerate(chain.contact_pairs[:3]):
+    for i, pair in enumerate(chain.sites.pairs[:3]):
         push = forces[i] - PRELOADS[i]
         if pair.host >= 0:
             force[SITES[i], pair.host] += push
@@ -177,7 +176,7 @@ def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
 
 
 PAIRS = {
-    "the cell's pair": (),
+    "the cell's pair": CELL.pair,
     # The pairs are to ground, to the next cell, and within the cell.
     "any pair": (Pair(-1, 0), Pair(2, 1, offset=1), Pair(0, 2), Pair(1, 2)),
 }
@@ -225,7 +224,7 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
         found = evaluate(model, motion)
         expected = np.zeros((len(SITES), 3))
         acceleration = accelerations(model, motion)
-        for i, pair in enumerate(model.chain.contact_pairs):
+        for i, pair in enumerate(model.chain.sites.pairs):
             right = (SITES[i] + pair.offset) % CELLS
             host = motion.at(SITES[i], pair.host)
             expected[i, :2] = motion.at(right, pair.resonator) - host
@@ -234,7 +233,7 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
                 expected[i, 2] -= acceleration[SITES[i], pair.host]
 
         seen = np.full((len(SITES), 3), np.nan)
-        if pairs:
+        if model.chain.has_own_pairs:
             observe_pairs(found.y, found.rates, found.lattice, seen)
         else:
             # As the engine calls it, by the address of what PETSc gets.

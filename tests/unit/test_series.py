@@ -77,6 +77,6 @@ def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
 )
 def test_the_first_onset_is_met_to_rounding(series, clearances, length, onset):
     """The first onset of a polynomial motion is its first root at a clearance, in closed form."""
-    site = create_contacts(small_case().model().contact, [clearances])[0]
+    site = create_contacts(small_case().model().chain.sites[0].law, [clearances])[0]
     # A distance from the clearance below the tolerance of a landing, 2e-13 here, counts as an onset.
     assert first_onset(np.array(series), site, length) == pytest.approx(onset, rel=2e-10, abs=1e-14)

@@ -198,7 +198,7 @@ def test_places_are_cells_and_masses():
     case = Case.from_table(table)
     assert (case.drive.cell, case.drive.mass) == (3, 2)
     assert case.contacts.sites == [4, 4, 9]
-    assert [tuple(pair) for pair in case.model().chain.pairs] == [(-1, 0, 0), (-1, 4, 0), (-1, 2, 0)]
+    assert [tuple(site.pair) for site in case.model().chain.sites] == [(-1, 0, 0), (-1, 4, 0), (-1, 2, 0)]
     assert (case.output.points[0].cell, case.output.points[0].mass) == (12, 5)
     assert (case.initial.cell, case.initial.mass) == (2, 4)
     assert Case.from_toml(case.to_toml()) == case
@@ -209,7 +209,7 @@ def test_masses_and_offsets_of_contacts_count_in_the_cell_of_the_plane():
     contacts = {"clearance": 1e-4, "stiffness": 1e8, "places": [[2, 3]], "pair": [2, 1]}
     for offset, pair in (([0, 0], (5, 4, 0)), ([0, 1], (5, 0, 0)), ([1, 0], (5, 4, 1))):
         case = Case.from_table(table | {"contacts": contacts | {"offset": offset}})
-        assert tuple(case.model().chain.pairs[0]) == pair
+        assert tuple(case.model().chain.sites[0].pair) == pair
 
 
 PATTERNS = {

@@ -40,7 +40,7 @@ def test_a_struck_lattice_has_no_frequency_of_a_drive():
     # The cell of the motion is that of the fastest mass.
     assert case.drive.cell == 5
 
-    contact = case.model().contact
+    contact = case.model().chain.sites[0].law
     frequency = np.pi / contact.impact_time(0.5, MASS / 2)
     assert case.initial.frequency == pytest.approx(frequency)
     assert case.initial.amplitude == pytest.approx(0.5 / frequency)

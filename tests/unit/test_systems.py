@@ -112,7 +112,7 @@ def test_a_contact_that_symmetry_keeps_at_rest_is_never_touched():
     """Where all cells of a ring move alike no contact between cells moves, but for rounding."""
     springs = (Spring(0, 0, 1e4, offset=1), Spring(0, 1, 5e3))
     cell = UnitCell((4e-3, 2e-3), springs, host=0, resonator=1)
-    chain = Chain(cell, 12, "periodic", sites=(5, 7), pairs=(Pair(0, 0, offset=1),) * 2)
+    chain = Chain(cell, 12, "periodic", sites=sites_at([5, 7], Pair(0, 0, offset=1)))
     system = System.from_chain(chain, [Stops.both(Contact("hertz", 1e7), 1e-4)] * 2)
 
     # The modes of cells that move alike: the ring as a whole, and resonators against hosts, the lowest of their band.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Chain, Spring, Topology, UnitCell, contacts, nonlinear_springs
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.elements import incidence
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.lattice.topology import NOTHING, WALL
 
 
@@ -42,13 +42,13 @@ def test_springs_are_those_of_the_stiffness(ends, cells):
 
 def test_contacts_join_the_masses_of_their_pairs():
     pairs = (Pair(-1, 1), Pair(0, 1), Pair(1, 0, offset=1))
-    chain = Chain(CUBIC, 4, "periodic", sites=(1, 2, 3), clearances=(1.0,) * 3, pairs=pairs)
+    chain = Chain(CUBIC, 4, "periodic", sites=sites_at([1, 2, 3], pairs))
     assert contacts(chain).mass_pairs() == [(WALL, 3), (4, 5), (7, 0)]
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_a_contact_with_the_next_cell_needs_one(ends):
-    chain = Chain(CUBIC, 4, ends, sites=(1, 3), clearances=(1.0, 1.0), pairs=(Pair(0, 1), Pair(0, 1, offset=1)))
+    chain = Chain(CUBIC, 4, ends, sites=sites_at([1, 3], [Pair(0, 1), Pair(0, 1, offset=1)]))
     for ask in (contacts, Chain.reduced_masses):
         with pytest.raises(ValueError, match="site 2 in cell 4"):
             ask(chain)

@@ -59,7 +59,7 @@ def test_a_case_with_units_is_the_case_in_si():
     assert texts.to_toml() == numbers.to_toml()
 
     spread = small_case(contacts={"clearance": {"first": "1 mm", "last": "2 mm"}})
-    assert spread.model().chain.clearances[0] == 1e-3
+    assert spread.model().chain.sites[0].clearance == 1e-3
     assert small_case(contacts=LINEAR | {"stiffness": "3 kN/m"}).contacts.stiffness == 3000.0
     lattice = {"preset": "four-band", "ends": "fixed", "cells": 24}
     moved = Case.from_table({"lattice": lattice, "drive": WALL | {"amplitude": "1 mm"}, "time": {"end": 0.05}})

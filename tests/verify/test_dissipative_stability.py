@@ -21,9 +21,9 @@ class ForcedCell:
         model = states.case.model()
         chain = model.chain
         dofs = chain.cell.dofs
-        first = chain.sites[0] * dofs
+        first = chain.sites[0].cell * dofs
         self.contact = states.forces.contacts[0].law
-        self.clearance = chain.clearances[0]
+        self.clearance = chain.sites[0].clearance
         self.masses = chain.masses()
         self.stiffness = chain.stiffness_matrix().toarray()
         self.pair = np.zeros(len(self.masses))

@@ -9,6 +9,7 @@ import pytest
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, UnitCell
+from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.response.over_key import KeyedCase
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -103,7 +104,7 @@ def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
     Both modes have frequency 0, and so has any combination. The dashpot couples all modes but those of one mass each.
     """
     cell = UnitCell((1.0, 2.0), (), 0, 1, grounding=(0.3, 0.0))
-    chain = Chain(cell, 1, "free", sites=(0,), clearances=(0.1,))
+    chain = Chain(cell, 1, "free", sites=sites_at([0], cell.pair))
     omega = 0.7
     found = ModalCompliance(chain).at(omega)[0, 0, 0]
     assert found == pytest.approx(1 / (0.3j * omega - omega**2) - 1 / (2 * omega**2), rel=1e-12)

@@ -66,10 +66,10 @@ def test_kinetic_energies_are_of_the_masses_there_are(runs):
 def test_a_site_is_of_the_masses_of_its_cell():
     """A contact's reduced mass is 1/(1/m1 + 1/m2) with the masses of its own cell, or the mass against the ground."""
     chain = laboratory().model().chain
-    masses = chain.variation.masses[list(chain.sites)]
+    masses = chain.variation.masses[chain.sites.cells]
     assert chain.reduced_masses() == pytest.approx(1 / (1 / masses[:, 1] + 1 / masses[:, 2]))
 
     # The reduced mass of a contact with the ground is the mass itself.
     joined = small_case(contacts={"sites": [4, 24], "pair": [0, 3], "clearance": 1e-4, "side": "plus"}).model().chain
-    assert joined.pairs[0] == Pair(-1, 2)
+    assert joined.sites[0].pair == Pair(-1, 2)
     assert joined.reduced_masses() == [joined.cell.masses[2]] * 2

@@ -20,7 +20,7 @@ from vipetsc.lattice import (
     pass_bands,
     waves_at,
 )
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -53,7 +53,7 @@ SMOOTH["lattice"]["cell"] = SMOOTH["lattice"]["cell"] | {"springs": [SPRINGS[0] 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_with_both_ends_open_the_lattice_is_endless(ends):
     """With both ends open the compliance is that of Bloch waves, in bands, gaps, at rest and for growing motions."""
-    chain = Chain(CELL, 9, ends, sites=(2, 6), clearances=(1.0, 1.0))
+    chain = Chain(CELL, 9, ends, sites=sites_at([2, 6], CELL.pair))
     here = OpenCompliance(chain, ((0, 0),), open_ends=("left", "right"))
     endless = WaveCompliance(chain, ((0, 0),), infinite=True)
     omega = np.array([0.31, 0.9, 1.2, 1.6, 2.2, 3.5, 1.1 - 0.01j, -0.7 - 0.02j, -0.7])
@@ -67,7 +67,7 @@ def test_with_both_ends_open_the_lattice_is_endless(ends):
 @pytest.mark.parametrize("end", ["left", "right"])
 def test_nothing_comes_back_over_whole_bands(end):
     """An open end reflects less than 1e-7 of the energy of waves in all bands, up to 1e-3 of a band from its edges."""
-    chain = Chain(CELL, 12, "fixed", sites=(5,), clearances=(1.0,))
+    chain = Chain(CELL, 12, "fixed", sites=sites_at([5], CELL.pair))
     driven = 0 if end == "right" else 11
     lattice = OpenCompliance(chain, ((driven, 0),), open_ends=(end,))
     worst = made_for_one = 0.0
@@ -92,8 +92,8 @@ def test_dashpots_cells_that_differ_and_contacts_to_ground_stay_what_they_are():
     The long lattice has 240 cells and a strong loss, so that nothing comes back from its far end.
     """
     pairs = (Pair(-1, 1), Pair(0, 0, offset=1))
-    short = Chain(rounded_cell((0.05, 0.2)), 5, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
-    long = Chain(rounded_cell((0.05, 0.2)), 240, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
+    short = Chain(rounded_cell((0.05, 0.2)), 5, "fixed", sites=sites_at([1, 3], pairs))
+    long = Chain(rounded_cell((0.05, 0.2)), 240, "fixed", sites=sites_at([1, 3], pairs))
     here = OpenCompliance(short, ((0, 0),), open_ends=("right",))
     omega = np.array([0.6, 1.1 - 0.1j, 1.5, 2.5])
     np.testing.assert_allclose(here.response(omega), ModalCompliance(long, ((0, 0),)).response(omega), rtol=1e-6)

@@ -120,7 +120,7 @@ def impacts(request):
 def test_the_force_is_the_law_at_the_samples(impacts):
     """The force is side k x^n (1 + c w'/w'_minus) within episodes and 0 outside; the log has the largest one."""
     model = Case.of(impacts).model()
-    law = model.contact
+    law = model.chain.sites[0].law
     time = impacts["time"].values
     force = impacts["sites/force"].values
     expected = np.zeros_like(force)
@@ -135,7 +135,7 @@ def test_the_force_is_the_law_at_the_samples(impacts):
         # The comparison is negated for contacts that have not ended, whose separation is NaN.
         inside = (time >= log["onset"][k]) & ~(time > log["separation"][k])
         side = log["side"][k]
-        x = side * motion["displacement"][inside, site] - model.chain.clearances[site]
+        x = side * motion["displacement"][inside, site] - model.chain.sites[site].clearance
         rate = motion["velocity"][inside, site]
         expected[inside, site] = side * law.elastic_force(x) * (1 + law.damping * rate / log["approach"][k])
 
@@ -159,7 +159,7 @@ def test_the_acceleration_is_that_of_the_equation_of_motion(impacts):
     total = -(chain.stiffness_matrix() @ u.T).T - (chain.damping_rows(0, chain.cells) @ v.T).T
     # The drive's force is computed by a formula of this test's own.
     total[:, 0] += [_burst(model.drive, t) for t in impacts["time"].values]
-    for column, site in enumerate(chain.sites):
+    for column, site in enumerate(chain.sites.cells):
         force = impacts["sites/force"].values[:, column]
         total[:, 4 * site + chain.cell.host] += force
         total[:, 4 * site + chain.cell.resonator] -= force

@@ -213,7 +213,7 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
     run, _ = simulated(case.varied(contacts=NO_SITES, drive={"amplitude": 1.0}))
     cell = case.lattice.unit_cell()
     time = network.time[network.during]
-    for site, envelope in zip(case.model().chain.sites, network.linear, strict=True):
+    for site, envelope in zip(case.model().chain.sites.cells, network.linear, strict=True):
         u = run["displacement"].values[:, site]
         # The network's times lie between the samples of the run.
         w = CubicSpline(run["time"].values, u[:, cell.resonator] - u[:, cell.host])(time)

@@ -8,9 +8,9 @@ import pytest
 from tests.one_site import prediction_case
 from vipetsc.figures.registry import draw
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance, bloch
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.lattice.ends import absorber
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import predict
 from vipetsc.studies.rays import BINS, Rays
@@ -31,7 +31,7 @@ def test_elimination_agrees_with_waves_and_with_modes(ends):
     pairs = (Pair(1, 2), Pair(-1, 2))
     omega = np.linspace(400, 3000, 7) - 4j
     points = ((0, 0), (5, 2))
-    equal = Chain(cell, 40, ends, sites=(12, 25), pairs=pairs)
+    equal = Chain(cell, 40, ends, sites=sites_at([12, 25], pairs))
     np.testing.assert_allclose(
         DirectCompliance(equal, points).response(omega), WaveCompliance(equal, points=points).response(omega), rtol=1e-9
     )
@@ -39,7 +39,7 @@ def test_elimination_agrees_with_waves_and_with_modes(ends):
     if ends == "periodic":
         return
     graded = absorber(cell, ends, 15, 1000.0, before=25)
-    varied = Chain(cell, 40, ends, sites=(12, 25), pairs=pairs, variation=graded.variation)
+    varied = Chain(cell, 40, ends, sites=sites_at([12, 25], pairs), variation=graded.variation)
     direct = DirectCompliance(varied, points).response(omega)
     np.testing.assert_allclose(direct, ModalCompliance(varied, points).response(omega), rtol=1e-8, atol=1e-15)
 

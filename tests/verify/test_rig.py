@@ -80,7 +80,7 @@ def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
 def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, grounding):
     """The compliance as a sum over poles is the inverse of K + i omega C - omega^2 M, also with rigid motions."""
     pairs = (Pair(0, 1), Pair(0, 0, offset=1))
-    chain = Chain(rounded_cell(grounding), 5, ends, sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
+    chain = Chain(rounded_cell(grounding), 5, ends, sites=sites_at([1, 3], pairs))
     compliance = ModalCompliance(chain, ((0, 0),))
     loads = compliance.loads
     for omega in (0.3, 1.1 - 0.2j, -0.7, 4.0):
@@ -94,7 +94,7 @@ def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, ground
 def test_without_dashpots_it_is_that_of_bloch_waves():
     """Without dashpots the compliance by poles is that by Bloch waves, and real."""
     cell = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, offset=1), Spring(0, 1, 0.5)), host=0, resonator=1)
-    chain = Chain(cell, 9, "free", sites=(2, 6), clearances=(1.0, 1.0))
+    chain = Chain(cell, 9, "free", sites=sites_at([2, 6], cell.pair))
     omega = np.array([0.0, 0.31, 1.27, 2.9])
     modal = ModalCompliance(chain, ((0, 0),)).response(omega)
     waves = WaveCompliance(chain, points=((0, 0),)).response(omega)

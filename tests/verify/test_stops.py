@@ -26,5 +26,5 @@ def test_disorder_scatters_each_of_a_list():
     drawn = case.contacts.each.restitution
     assert drawn != [0.5, 0.7]
     assert drawn == pytest.approx([0.5, 0.7], rel=0.3)
-    assert [law.restitution for law in case.model().laws] == drawn
+    assert [site.law.restitution for site in case.model().chain.sites] == drawn
     assert Case.from_toml(case.to_toml()).model() == case.model()

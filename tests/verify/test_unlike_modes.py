@@ -13,6 +13,7 @@ from tests.unlike_lattices import independent_lattice, unlike_case
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, Contact
 from vipetsc.lattice.compliance.moments import SeriesCompliance
+from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
@@ -134,16 +135,16 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
 
     The stops are linear, so that motions are proportional to the clearance.
     """
-    sites = (4, 13)
-    chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
-    stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
+    cell = breather_chain().cell
+    chain = Chain(cell, 18, "fixed", sites_at([4, 13], cell.pair, clearances=[CLEARANCE, 2 * CLEARANCE]))
+    stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.sites.clearances]
     control = NnmTable(truncation=1e-7, tolerance=1e-11)
     problem = ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), control)
 
     near, far, opposite = (problem.in_gap(1600.0, np.array(signs)) for signs in ([1, 0], [0, 1], [0, -1]))
 
     fields = [state_of(problem, point, chain.cell.dofs) for point in (near, far)]
-    assert tuple(max(field, key=lambda cell: np.abs(field[cell]).max()) for field in fields) == sites
+    assert tuple(max(field, key=lambda cell: np.abs(field[cell]).max()) for field in fields) == (4, 13)
     assert far.elongations[1] == pytest.approx(2 * near.elongations[0], rel=1e-6)
     # The energy is proportional to the square of the clearance.
     assert far.energy == pytest.approx(4 * near.energy, rel=1e-6)

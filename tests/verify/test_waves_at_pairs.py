@@ -19,7 +19,7 @@ from tests.steady_states import first_harmonic
 from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, Spring, UnitCell, WaveCompliance
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.modes.response.state import Measures
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -35,10 +35,10 @@ def rows_of(chain: Chain) -> np.ndarray:
     """Rows (pair, mass) that give relative displacements from displacements of masses, in a chain that is no ring."""
     d = chain.cell.dofs
     rows = np.zeros((len(chain.sites), chain.cells * d))
-    for row, site, pair in zip(rows, chain.sites, chain.contact_pairs, strict=True):
-        row[(site + pair.offset) * d + pair.resonator] = 1
+    for row, (cell, pair, *_) in zip(rows, chain.sites, strict=True):
+        row[(cell + pair.offset) * d + pair.resonator] = 1
         if pair.host >= 0:
-            row[site * d + pair.host] = -1
+            row[cell * d + pair.host] = -1
     return rows
 
 
@@ -48,7 +48,7 @@ def test_compliances_are_those_of_a_long_damped_lattice(omega):
 
     Waves of these frequencies decay before they reach an end of the long lattice.
     """
-    chain = Chain(CELL, 1000, "free", SITES, (1e-4,) * 4, pairs=PAIRS)
+    chain = Chain(CELL, 1000, "free", sites_at(SITES, PAIRS))
     dynamic = chain.stiffness_matrix().tocsc() - omega**2 * diags(chain.masses(), format="csc")
     rows = rows_of(chain)
     expected = rows @ spsolve(dynamic.astype(complex), rows.T.astype(complex))

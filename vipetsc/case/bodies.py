@@ -13,14 +13,14 @@ def contact_ends(chain: Chain) -> list[tuple[int, int]]:
     return [(1 + host, 1 + resonator) for host, resonator in contacts(chain).mass_pairs()]
 
 
-def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
+def bodies_of(chain: Chain) -> list[int]:
     """Return the body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
 
     Springs, which are all within cells or to the ground, join the masses of a body, and so do contacts that are pressed
-    at rest. ``gaps`` are the clearances in m of the sites on both sides.
+    at rest.
     """
     d = chain.cell.dofs
-    pressed = [ends for ends, gap in zip(contact_ends(chain), gaps, strict=True) if min(gap) < 0]
+    pressed = [ends for ends, site in zip(contact_ends(chain), chain.sites, strict=True) if min(site.gaps) < 0]
     sprung = []
     for cell in range(chain.cells):
         for spring in chain.cell.springs:

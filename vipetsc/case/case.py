@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.case_file import CaseFile, Valid
-from vipetsc.case.contacts import check_joined, check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.contacts import check_joined, check_pairs, check_touching
 from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_waves, driven_wave, packet_frequency
 from vipetsc.case.features import refusals
@@ -161,7 +161,6 @@ class Case(CaseFile):
 
         return Model(
             chain=chain,
-            contact=contact_of(contacts),
             drives=drives,
             end=time.end,
             sample_interval=time.sample_interval,
@@ -171,8 +170,6 @@ class Case(CaseFile):
             scale=scale,
             packet=packet_frequency(drive),
             initial=self.initial,
-            laws=laws_of_sites(contacts, len(chain.sites)),
-            gaps=gaps_of_sites(contacts, list(chain.clearances)),
         )
 
     @property

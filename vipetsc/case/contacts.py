@@ -14,14 +14,14 @@ from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.cell import connected_groups
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.contact import PARAMETERS, RIGID, least_restitution, registered_law
+from vipetsc.lattice.sites import Pair
 
 MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
 JOINS = ("pair", "next_cell")
 NO_APPROACH = "a precompressed contact has no approach velocity: its restitution must be 1"
-Gaps = tuple[tuple[float, float], ...]  # clearances in m of each site on the sides + and -
+Gaps = Sequence[tuple[float, float]] | np.ndarray  # clearances in m of each site on the sides + and -
 
 
 def lists_of(contacts: ContactsTable) -> dict[str, list[Any]]:
@@ -135,7 +135,7 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
     # Sites may have parameters of their own: formulas are checked with those of the first site of each law. They are
     # checked with the stiffness 1 where a case lacks one, which is reported elsewhere.
     first: dict[str, Contact] = {}
-    for law in laws_of_sites(contacts, count) or (contact_of(contacts),):
+    for law in laws_of_sites(contacts, count) or [contact_of(contacts)]:
         if registered_law(law.law):
             first.setdefault(law.law, replace(law, stiffness=law.stiffness or 1.0))
     for name, law in first.items():
@@ -241,24 +241,26 @@ def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
     registered = registered_law(contacts.law)
     if registered:
         given = contacts.parameters or {}
-        return {"parameters": tuple(given[key] for key in registered.parameters)}
+        # One that is missing is reported where the law is checked.
+        return {"parameters": tuple(given.get(key, np.nan) for key in registered.parameters)}
     return {key: getattr(contacts, key) for key, about in PARAMETERS.items() if about.law == contacts.law}
 
 
-def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
-    """Return the law of each site of a resolved case; () if all are equal."""
+def laws_of_sites(contacts: ContactsTable, count: int) -> list[Contact]:
+    """Return the law of each of ``count`` sites of a resolved case."""
     per_site = lists_of(contacts)
-    # Sides and pairs are no part of a law: the gaps and the pairs of the chain hold them.
+    # Sides and pairs are no part of a law: the sites of the chain hold them.
     keys = [key for key in per_site if key not in SIDES + JOINS]
-    if not keys:
-        return ()
+    if not keys or not count:
+        return [contact_of(contacts)] * count if count else []
 
-    # Each site has the common law, with the changes of the lists.
-    laws = []
-    for values in zip(*(per_site[key] for key in keys), strict=True):
-        site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
-        laws.append(contact_of(site))
-    return tuple(laws)
+    # Each site has the common law, with the changes of the lists; sites with the same changes have one law.
+    laws: dict[str, Contact] = {}
+    rows = [*zip(*(per_site[key] for key in keys), strict=True)]
+    for values in rows:
+        if repr(values) not in laws:
+            laws[repr(values)] = contact_of(contacts.model_copy(update=dict(zip(keys, values, strict=True))))
+    return [laws[repr(values)] for values in rows]
 
 
 def describe_stops(gaps: Gaps) -> list[str]:
@@ -282,20 +284,15 @@ def _describe_stop(side: str, gap: float) -> str:
     return f"precompressed by {-1e3 * gap:.4g} mm on side {side}"
 
 
-def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
-    """Return masses (0-based) that each site joins; () if all join the cell's own pair, and no cell has two sites."""
+def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> list[Pair]:
+    """Return the masses (0-based) that each of ``count`` sites joins."""
     pairs = []
     given = values_of_sites(contacts, "pair", count)
     next_cell = values_of_sites(contacts, "next_cell", count)
     for pair, is_in_next_cell in zip(given, next_cell, strict=True):
         host, resonator = pair or (cell.host + 1, cell.resonator + 1)
         pairs.append(Pair(host - 1, resonator - 1, int(bool(is_in_next_cell))))
-
-    # Without pairs, methods for one contact of the cell's own pair in a cell apply to the chain.
-    comes_twice = isinstance(contacts.sites, list) and len(set(contacts.sites)) < len(contacts.sites)
-    if set(pairs) <= {Pair(cell.host, cell.resonator)} and not comes_twice:
-        return ()
-    return tuple(pairs)
+    return pairs
 
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
@@ -304,7 +301,7 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
         return
 
-    pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
+    pairs = pairs_of_sites(contacts, cell, len(cells))
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"
         if max(pair.host, pair.resonator) >= cell.dofs or pair.resonator < 0:
@@ -358,7 +355,7 @@ def _check_loose(cell: UnitCell, pairs: Sequence[Pair]) -> Iterator[Problem]:
         yield Problem("lattice.cell.springs", None, remedy)
 
 
-def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
+def gaps_of_sites(contacts: ContactsTable, gaps: Sequence[float]) -> tuple[tuple[float, float], ...]:
     """Return the clearances in m on the sides + and - of each site, inf without a stop."""
     values = [values_of_sites(contacts, key, len(gaps)) for key in SIDES]
     stops = []

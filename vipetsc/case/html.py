@@ -9,7 +9,7 @@ from vipetsc.case.contacts import describe_stops
 from vipetsc.case.model import Model
 from vipetsc.lattice import UnitCell, wave_bands
 from vipetsc.lattice.cell import GROUND
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 from vipetsc.wording import MOST_SHOWN, counted, shortened
 
 # Fraction of a band's upper edge that counts as zero. A frequency is the root of an eigenvalue, which has a rounding
@@ -54,12 +54,12 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
 
     pair = None
     if chain.sites:
-        pair = chain.contact_pairs[0]
-        laws = model.used_laws[:MOST_SHOWN]
+        pair = chain.sites[0].pair
+        laws = chain.sites.laws[:MOST_SHOWN]
         rows += [
             ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
-            ("sites", shortened([f"cell {site + 1}" for site in chain.sites])),
-            ("clearance", shortened(describe_stops(model.gaps))),
+            ("sites", shortened([f"cell {site + 1}" for site in chain.sites.cells])),
+            ("clearance", shortened(describe_stops(chain.sites.gaps))),
         ]
     if model.initial:
         rows.append(("begins with", model.initial.describe()))

@@ -24,9 +24,9 @@ from vipetsc.case.section import Problem, Section, described
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import wave_warnings
 from vipetsc.lattice import Contact, max_group_velocity, pass_bands, waves_at
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.contact import LAWS, PARAMETERS
 from vipetsc.lattice.packet import packet_speeds
+from vipetsc.lattice.sites import Pair
 
 # Cells times samples of a run, at most: so many take the propagator 100 s, and a point of the law has several runs.
 LARGEST = 1e9
@@ -389,10 +389,11 @@ def site_kinds(model: Model) -> SiteKinds:
     """Return the kinds of the sites of a ``model`` whose clearances are above 0."""
     number: dict[SiteKind, int] = {}
     of = []
-    for law, (plus, minus), pair in zip(model.law_of_sites, model.gaps, model.chain.contact_pairs, strict=True):
+    for site in model.chain.sites:
+        plus, minus = site.gaps
         lesser = min(plus, minus)
         sides = (round(plus / lesser, DIGITS), round(minus / lesser, DIGITS))
-        of.append(number.setdefault(SiteKind(law=law, sides=sides, pair=pair), len(number)))
+        of.append(number.setdefault(SiteKind(law=site.law, sides=sides, pair=site.pair), len(number)))
     return SiteKinds(kinds=tuple(number), of=tuple(of))
 
 

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vipetsc.case.contacts import Gaps
 from vipetsc.case.drive import wave_speed
 from vipetsc.case.initial import InitialTable
-from vipetsc.lattice import Chain, Contact, Drive, Waveform, contacts
+from vipetsc.lattice import Chain, Drive, Waveform, contacts
 
 
 @dataclass(frozen=True)
@@ -16,12 +15,10 @@ class Model:
 
     ``atol`` are the absolute tolerances of displacements (m) and velocities (m/s); ``scale`` is the displacement in m
     of the drives' linear waves or of the ``initial`` state, ``packet`` the frequency in rad/s of the wave that arrives
-    first, infinite for a pulse. ``laws`` has the law of each site, or is () if all have ``contact``; ``gaps`` has the
-    clearances in m of each site on the sides + and -, inf without a stop.
+    first, infinite for a pulse.
     """
 
     chain: Chain
-    contact: Contact
     drives: tuple[Drive, ...]
     end: float
     sample_interval: float
@@ -30,9 +27,7 @@ class Model:
     atol: tuple[float, float]
     scale: float
     packet: float
-    gaps: Gaps
     initial: InitialTable | None = None
-    laws: tuple[Contact, ...] = ()
 
     @property
     def speed(self) -> float:
@@ -41,28 +36,15 @@ class Model:
         return wave_speed(self.chain.cell, self.packet)
 
     @property
-    def used_laws(self) -> tuple[Contact, ...]:
-        """The laws of the sites: one for each, or one for all of them.
-
-        Where each site has its own law, ``contact`` holds at none of them, and its numbers may be impossible.
-        """
-        return self.laws or (self.contact,)
-
-    @property
-    def law_of_sites(self) -> tuple[Contact, ...]:
-        """The law of each site."""
-        return self.laws or (self.contact,) * len(self.chain.sites)
-
-    @property
     def has_rigid_sites(self) -> bool:
         """Whether any site has a stop that does not yield."""
-        return bool(self.chain.sites) and any(law.is_rigid for law in self.used_laws)
+        return any(law.is_rigid for law in self.chain.sites.laws)
 
     @property
     def shared_masses(self) -> np.ndarray:
         """The masses, counted through all cells, on which more than one rigid site acts."""
         elements = contacts(self.chain)
-        rigid = np.array([law.is_rigid for law in self.law_of_sites], bool)
+        rigid = self.chain.sites.are_rigid
         ends = np.concatenate([elements.start[rigid], elements.end[rigid]])
         masses, times = np.unique(ends[ends >= 0], return_counts=True)
         return masses[times > 1]
@@ -70,11 +52,11 @@ class Model:
     @property
     def effective_restitution(self) -> float | list[float]:
         """The effective restitution of each site's law, or of all where they are alike."""
-        if not self.laws:
-            return self.contact.effective_restitution
         # Once for each law, since it takes a root search, and many sites have few laws.
-        values = {law: law.effective_restitution for law in set(self.laws)}
-        return [values[law] for law in self.laws]
+        values = np.array([law.effective_restitution for law in self.chain.sites.laws])
+        if len(values) == 1:
+            return float(values[0])
+        return list(values[self.chain.sites.table["law"]].tolist())
 
     @property
     def drive(self) -> Waveform:

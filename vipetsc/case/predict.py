@@ -61,7 +61,7 @@ class PredictCase(LawCase):
         model = self.model()
         warnings = [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
         # Cells to the nearest site, in a ring along the shorter arc.
-        offsets = [abs(site - model.drive_cell) for site in model.chain.sites]
+        offsets = [abs(site.cell - model.drive_cell) for site in model.chain.sites]
         nearest = min(min(offset, model.chain.cells - offset) for offset in offsets)
         # One revolution of the ring and on to the site, until the end of the burst has passed it.
         passed = (model.chain.cells + nearest) / model.speed + model.drive.duration

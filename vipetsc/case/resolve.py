@@ -11,7 +11,7 @@ from vipetsc.case.case_file import Valid
 from vipetsc.case.contacts import (
     MATERIAL,
     check_per_site,
-    contact_of,
+    gaps_of_sites,
     is_all_rigid,
     laws_of_sites,
     lists_of,
@@ -27,7 +27,7 @@ from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, T
 from vipetsc.case.section import Problem
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.waveforms import DEFAULT, is_sine
-from vipetsc.lattice import Chain, UnitCell, pass_bands
+from vipetsc.lattice import Chain, UnitCell, pass_bands, sites_at
 from vipetsc.lattice.cell import cell_problems, connected_groups
 from vipetsc.lattice.chain import unstable_key
 from vipetsc.lattice.contact import RIGID
@@ -155,16 +155,16 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
 def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     """Return the lattice with its contact sites."""
     cell = lattice.unit_cell()
-    sites = site_cells(lattice, contacts)
-    return Chain(
-        cell,
-        lattice.cells,
-        lattice.ends,
-        sites=tuple(site - 1 for site in sites),
-        clearances=tuple(clearances(lattice, contacts, len(sites))),
-        variation=cell_variation(lattice),
-        pairs=pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites)),
+    cells = site_cells(lattice, contacts)
+    given = clearances(lattice, contacts, len(cells))
+    sites = sites_at(
+        np.array(cells, int) - 1,
+        pairs_of_sites(contacts, cell, len(cells)),
+        laws_of_sites(contacts, len(cells)),
+        clearances=given,
+        gaps=gaps_of_sites(contacts, given),
     )
+    return Chain(cell, lattice.cells, lattice.ends, sites=sites, variation=cell_variation(lattice))
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
@@ -365,10 +365,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
     """Return the frequency in rad/s whose half period the shortest contact at a ``speed`` in m/s is, or None."""
     resolved = resolved_contacts(contacts, lattice)
     chain = build_chain(lattice, resolved)
-    laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
-    # A set, since sites of one kind have one duration, and each takes a quadrature.
-    impacts = {(law, mass) for law, mass in zip(laws, chain.reduced_masses(), strict=True) if not law.is_rigid}
-    return max((np.pi / law.impact_time(speed, mass) for law, mass in impacts), default=None)
+    return max((np.pi / time for time in chain.impact_times(speed)), default=None)
 
 
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:

@@ -192,7 +192,7 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     measured = [cell - 1 for cell in output.window or (at + 1,)]
     if chain.sites:
         name = "site in cell"
-        measured = [*chain.sites]
+        measured = chain.sites.cells.tolist()
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
         # An absorbing end has dashpots besides those of the cell.
         if chain.coefficients(cell, cell + 1).grounding.sum() > sum(chain.cell.grounding):
@@ -228,7 +228,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
         yield f"{sparse}: wavenumber_content, dispersion, partition and entropy are not measured"
 
     first, last = output.window or (1, chain.cells)
-    if output.fields and chain.sites and not any(first <= site + 1 <= last for site in chain.sites):
+    if output.fields and chain.sites and not any(first <= site.cell + 1 <= last for site in chain.sites):
         yield f"output.window = [{first}, {last}] contains none of the contact sites"
 
     highest = max(drive.waveform.highest for drive in model.drives)
@@ -281,11 +281,8 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     if not model.chain.sites or not speed:
         return
 
-    # The briefest contact decides, at the speed of the undisturbed wave. A set, since similar sites have one duration.
-    masses = model.chain.reduced_masses()
-    kinds = {(law, mass) for law, mass in zip(model.law_of_sites, masses, strict=True) if not law.is_rigid}
-    # The impact of a rigid stop takes no time, which nothing has to resolve.
-    time = min((law.impact_time(speed, mass) for law, mass in kinds), default=np.inf)
+    # The briefest contact decides, at the speed of the undisturbed wave.
+    time = min(model.chain.impact_times(speed), default=np.inf)
     step = DEFAULT_STEP / model.drive.frequency
     # Options of PETSc are text in a case. PETSc reads some that are no numbers here, such as "0x10" and "default".
     if is_number(petsc.get("ts_dt", "")):

@@ -4,7 +4,7 @@ import numpy as np
 
 from vipetsc.case.model import Model
 from vipetsc.lattice import ToneBurst, UnitCell, bloch, waves_at
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 
 
 def sends_one_wave(model: Model) -> bool:
@@ -21,12 +21,12 @@ def wave_over_clearance(model: Model) -> np.ndarray:
     """
     chain = model.chain
     drive = model.drive
-    gaps = np.reshape(model.gaps, (-1, 2))
+    gaps = chain.sites.gaps
     waves = waves_at(chain.cell, drive.frequency)
     if not (waves and drive.amplitude):
         return np.zeros(gaps.shape)
 
-    pairs = chain.contact_pairs
+    pairs = chain.sites.pairs
     largest = {pair: max(_relative_amplitude(chain.cell, pair, wave) for wave in waves) for pair in set(pairs)}
     amplitudes = model.scale * np.array([largest[pair] for pair in pairs])
     ratios = np.full(gaps.shape, np.inf)

@@ -31,14 +31,12 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         gap_list = "none"
         if between := gaps(bands):
             gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in between) + " rad/s"
-    # Each of a million sites may have its own law: a list shows only the first ones. Without sites a law has no
-    # stiffness.
-    laws = model.used_laws[: min(len(chain.sites), MOST_SHOWN)]
-    clearances = describe_stops(model.gaps)
-    sites: list[object] = [cell + 1 for cell in chain.sites]
+    # Each of a million sites may have its own law: a list shows only the first ones.
+    laws = chain.sites.laws[:MOST_SHOWN]
+    clearances = describe_stops(chain.sites.gaps)
+    sites: list[object] = (chain.sites.cells + 1).tolist()
     if strip:
-        pairs = zip(chain.sites, chain.contact_pairs, strict=True)
-        sites = [strip.place(cell + 1, pair.resonator + 1) for cell, pair in pairs]
+        sites = [strip.place(site.cell + 1, site.pair.resonator + 1) for site in chain.sites]
 
     return [
         ("case", case.name),

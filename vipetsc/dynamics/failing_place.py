@@ -21,9 +21,9 @@ def failing_place(setup: Setup) -> str:
 
     chain = setup.model.chain
     place = f"cell {fastest + 1}"
-    nearest = chain.topology.nearest_index(chain.sites, fastest)
+    nearest = chain.topology.nearest_index(chain.sites.cells, fastest)
     if nearest is not None:
-        place += f", nearest site {nearest + 1} in cell {chain.sites[nearest] + 1}"
+        place += f", nearest site {nearest + 1} in cell {chain.sites[nearest].cell + 1}"
 
     # Beyond such an elongation the force pushes the masses further apart, and nothing need hold them.
     limits = [chain.spring(fastest, number).without_force for number in range(len(chain.cell.springs))]

@@ -49,15 +49,13 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
 
 def _check_stops(model: Model, motion: np.ndarray) -> None:
     """Raise CaseError for a ``motion`` (site, 2) in which a mass is beyond a stop that does not yield."""
-    for i, law in enumerate(model.law_of_sites):
-        w = float(motion[i, 0])
-        plus, minus = model.gaps[i]
-        beyond = max(w - plus, -w - minus)
-        if law.is_rigid and beyond > LANDED * max(abs(w), model.scale):
-            remedy = (
-                f"site {i + 1} begins {beyond:.3g} m beyond its rigid stop; give a smaller motion or a law that yields"
-            )
-            raise CaseError([Problem("initial", None, remedy)])
+    w = motion[:, 0]
+    beyond = (w[:, None] * [1, -1] - model.chain.sites.gaps).max(axis=1)
+    wrong = np.flatnonzero(model.chain.sites.are_rigid & (beyond > LANDED * np.maximum(np.abs(w), model.scale)))
+    if wrong.size:
+        first = wrong[0]
+        remedy = f"site {first + 1} begins {beyond[first]:.3g} m beyond its rigid stop"
+        raise CaseError([Problem("initial", None, f"{remedy}; give a smaller motion or a law that yields")])
 
 
 def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:

@@ -141,7 +141,7 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
     return Shape(
         cells=layout.owned,
         dofs=layout.dofs,
-        paired=bool(chain.pairs),
+        paired=chain.has_own_pairs,
         owned=layout.size,
         ghosted=layout.size + layout.ghost_rows * len(layout.ghosts),
         exchange=layout.comm.size > 1 or layout.topology.is_ring,

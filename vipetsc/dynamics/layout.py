@@ -45,11 +45,11 @@ class Layout:
         self.damped = dashpots and chain.is_damped
         self.integrates_damping = self.damped and integrates_damping
         self.per_cell = 2 * self.dofs + self.integrates_damping
-        self.ghost_rows = self.dofs * (1 + (self.damped or chain.is_joined))
+        self.ghost_rows = self.dofs * (1 + (self.damped or chain.sites.join_cells))
 
         cuts = cell_cuts(self.cells, comm.size)
         driven = np.array([drive.cell for drive in model.drives], np.int64)
-        ledger_sizes, _ = np.histogram([*driven, *chain.sites], cuts)
+        ledger_sizes, _ = np.histogram(np.append(driven, chain.sites.cells), cuts)
         # Behind a rank's cells one component for each drive and site that it owns.
         sizes = self.per_cell * np.diff(cuts) + ledger_sizes
         self.ranges = np.array([*pairwise(cuts)])

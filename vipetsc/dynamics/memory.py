@@ -47,7 +47,7 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
     chain = model.chain
     owned = -(-chain.cells // ranks)
     first_cells = np.append(np.arange(0, chain.cells, owned), chain.cells)
-    own_sites = int(np.histogram(chain.sites, first_cells)[0].max())
+    own_sites = int(np.histogram(chain.sites.cells, first_cells)[0].max())
     return {
         "lattice.cells": _bytes_of_states(model, engine, ranks),
         "contacts.sites": SITE_BYTES * len(chain.sites) + OWN_SITE_BYTES * own_sites,

@@ -252,7 +252,7 @@ class Recorder(Observer):
         if self.episodes or not sites:
             return ""
 
-        touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
+        touching = np.count_nonzero(self.setup.model.chain.sites.gaps.min(axis=1) <= 0)
         if touching > 1:
             return f"no contact: nothing pressed any of the {touching} sites that touch their stops at rest"
         if touching:
@@ -267,7 +267,7 @@ class Recorder(Observer):
             return [note]
 
         radius = self.setup.case.contact_radius
-        is_hertz = any(law.law == "hertz" for law in self.setup.model.used_laws)
+        is_hertz = any(law.law == "hertz" for law in self.setup.model.chain.sites.laws)
         if radius is None or not is_hertz or self.deepest <= radius:
             return []
         beyond = f"the deepest indentation, {self.deepest:.3g} m, exceeds the contacts' radius of {radius:g} m"
@@ -281,11 +281,11 @@ def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
         "cell": recorded + 1,
         "dof": np.arange(1, chain.cell.dofs + 1),
         "site": np.arange(1, len(chain.sites) + 1),
-        "sites/cell": np.array(chain.sites, np.int64) + 1,
-        "sites/clearance": np.array(chain.clearances, float),
+        "sites/cell": chain.sites.cells + 1,
+        "sites/clearance": chain.sites.clearances,
     }
-    if not has_equal_sides(model.gaps):
-        given["sites/clearance"], given["sites/clearance_minus"] = np.array(model.gaps).T
+    if not has_equal_sides(chain.sites.gaps):
+        given["sites/clearance"], given["sites/clearance_minus"] = chain.sites.gaps.T
     if chain.variation:
         given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}
         given["spring"] = np.arange(1, len(chain.cell.springs) + 1)

@@ -12,6 +12,7 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.law import SHORTEST_FLIGHT, create_contacts, hold
 from vipetsc.dynamics.layout import Layout
 from vipetsc.lattice import Chain, contacts
+from vipetsc.lattice.sites import NO_STOP
 
 END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
 """An end of a site: components of its displacement and velocity, -1 on ground; its owned cell, else -1; its mass."""
@@ -28,20 +29,19 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     numbers = np.asarray(numbers, np.int64)
     chain = model.chain
     exists = numbers >= 0
-    asked = numbers[exists].tolist()
+    asked = chain.sites.table[numbers[exists]]
 
     # A number below 0 has no stops, and the cell's own pair.
     gaps = np.full((len(numbers), 2), np.inf)
+    gaps[exists] = np.column_stack([asked["plus"], asked["minus"]])
     masses = np.full(len(numbers), chain.cell.reduced_mass)
+    masses[exists] = np.array(chain.reduced_masses())[numbers[exists]]
     joins_cells = np.zeros(len(numbers), bool)
-    if asked:
-        gaps[exists] = [model.gaps[i] for i in asked]
-        masses[exists] = chain.reduced_masses(asked)
-        joins_cells[exists] = chain.pair_table[asked, 2] > 0
-    # It takes any law that is used: without stops no law acts.
-    laws = [model.used_laws[0]] * len(numbers)
-    if model.laws:
-        laws = [model.laws[i] for i in np.maximum(numbers, 0).tolist()]
+    joins_cells[exists] = asked["offset"] > 0
+    law_numbers = np.full(len(numbers), -1)
+    law_numbers[exists] = asked["law"]
+    every_law = [*chain.sites.laws, NO_STOP]
+    laws = [every_law[number] for number in law_numbers.tolist()]
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)

@@ -83,7 +83,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
     episodes = Episodes.of(run)
     model = Case.of(run).model()
-    are_pressed = max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run
+    are_pressed = bool((model.chain.sites.gaps.min(axis=1) <= 0).all()) and "displacement" in run
     has_indentation = are_pressed and len(run["cell"]) == model.chain.cells
     has_rows = episodes.are_few and not has_indentation
     every = 1

@@ -228,8 +228,9 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     u = run["displacement"].values
     chain = model.chain
     depth = []
-    for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, model.gaps, strict=True):
-        w = pair.relative(u, cell)
+    for site in chain.sites:
+        plus, minus = site.gaps
+        w = site.pair.relative(u, site.cell)
         depth.append(np.maximum(np.maximum(w - plus, -w - minus), 0.0))
     return np.array(depth)
 

@@ -241,7 +241,7 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if not np.any(run["displacement"].sel(cell=cell)):
         raise NoPicture(f"cell {cell}, the first site, was at rest all the time")
     chain = Case.of(run).model().chain
-    if chain.pairs:
+    if chain.has_own_pairs:
         raise NoPicture("portraits show the cell's contact pair, but the contacts join other masses")
 
     recorded = run.sel(cell=cell)

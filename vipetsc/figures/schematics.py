@@ -20,7 +20,7 @@ from vipetsc.figures.spring_line import ROD, Point, draw_spring
 from vipetsc.figures.style import with_prefix
 from vipetsc.lattice import Spring, UnitCell
 from vipetsc.lattice.cell import GROUND
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 from vipetsc.wording import counted
 
 # Lengths in units of the drawing.
@@ -48,12 +48,15 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         raise style.NoPicture(f"needs a cell of at most {MOST_SPRINGS} springs")
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
-    draw_unit_cell(upper, model.chain.cell, tuple(dict.fromkeys(model.chain.pairs)))
+    pairs: list[Pair] = []
+    if model.chain.has_own_pairs:
+        pairs = [*dict.fromkeys(model.chain.sites.pairs)]
+    draw_unit_cell(upper, model.chain.cell, pairs)
     # The arrow of a wall that moves points at the wall.
     cells = model.chain.cells
     walls = {"left": -0.5 - 0.01 * cells, "right": cells - 0.5 + 0.01 * cells}
     driven = walls.get(Case.of(run).drive.end or "", model.drive_cell)
-    draw_lattice(lower, model.chain, driven, model.gaps)
+    draw_lattice(lower, model.chain, driven)
 
     title = "(a) Unit cell"
     differing = int(model.chain.differs.sum())
@@ -80,7 +83,7 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     rows = lower.subplots(len(sites), 1, squeeze=False).flat
     for i, (axes, count) in enumerate(zip(rows, sites, strict=True)):
         model = case.varied(contacts={"sites": count, "clearance": None}).model()
-        draw_lattice(axes, model.chain, model.drive_cell, model.gaps)
+        draw_lattice(axes, model.chain, model.drive_cell)
         title = f"(c.{i + 1}) {counted(count, 'contact site')}"
         axes.set_title(f"{title}; {LEGEND}" if i == 0 else title)
     return figure
@@ -197,7 +200,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> No
 
     host = layout.centre[cell.host]
     resonator = layout.centre[cell.resonator]
-    inner = Pair(cell.host, cell.resonator)
+    inner = cell.pair
     if layout.nested:
         _draw_host_with_resonator(axes, host, cell, has_stops=not pairs or inner in pairs)
     elif cell.host != cell.resonator and not pairs:

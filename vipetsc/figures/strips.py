@@ -59,7 +59,7 @@ class Strip(NamedTuple):
         model = case.model()
         plane = section.plane_cell()
         first = int(cells[0]) - 1
-        sites = [(i, pair.resonator) for i, pair in zip(model.chain.sites, model.chain.contact_pairs, strict=True)]
+        sites = [(site.cell, site.pair.resonator) for site in model.chain.sites]
         drives = [(drive.cell, drive.mass) for drive in model.drives if drive.waveform.amplitude]
         return cls(
             plane=plane,

@@ -313,7 +313,7 @@ class ContactMotion(NamedTuple):
 
 def _of_contact(run: xr.Dataset, model: Model, quantity: str) -> np.ndarray:
     """Return a ``quantity`` (t, 2) of the host and the resonator of the first contact; 0 for one with the ground."""
-    pair = model.chain.contact_pairs[0]
+    pair = model.chain.sites[0].pair
     cell = int(run["sites/cell"].values[0])
     resonator_cell = int(model.chain.topology.neighbour(cell - 1, pair.offset)) + 1
     resonator = run[quantity].sel(cell=resonator_cell).isel(dof=pair.resonator).values

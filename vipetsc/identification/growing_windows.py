@@ -63,7 +63,7 @@ def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.
     if parameter.quantity not in SIDES:
         return np.nan
     base = plan.base
-    gaps = np.array(base.model().gaps)
+    gaps = base.model().chain.sites.gaps
     sides = SIDES[parameter.quantity]
     if parameter.quantity == "clearance" and not differs_by_side(base.contacts):
         sides = [0, 1]  # one clearance for both

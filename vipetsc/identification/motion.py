@@ -21,7 +21,7 @@ from vipetsc.dynamics.observers import Guard
 from vipetsc.dynamics.plan import RunPlan, choose_engine
 from vipetsc.dynamics.run import Simulation
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice import Chain, Drive, ToneBurst
+from vipetsc.lattice import NO_SITES, Chain, Drive, ToneBurst
 from vipetsc.lattice.drive import COEFFICIENTS, PIECE, Pieces
 
 # Relative tolerance of all motions: differences of runs, over 1e-6 of a coordinate, keep six digits of them. A run
@@ -119,8 +119,7 @@ class SampledModel:
     def _run(self, model: Model, interval: float, count: int, state: State | None) -> "_Run":
         """Follow ``model`` over ``count`` intervals of so many s, from ``state`` on or as the model begins."""
         if not self.touches:
-            chain = replace(model.chain, sites=(), clearances=(), pairs=())
-            model = replace(model, chain=chain, laws=(), gaps=())
+            model = replace(model, chain=replace(model.chain, sites=NO_SITES))
         atol = tuple(RTOL / model.rtol * value for value in model.atol)
         model = replace(model, sample_interval=interval, end=count * interval, rtol=RTOL, atol=(atol[0], atol[1]))
 
@@ -151,15 +150,15 @@ class SampledModel:
         chain = self.model.chain
         reached = np.zeros((len(chain.sites), 2))
         s = BETWEEN[:, None]
-        for site, (cell, pair) in enumerate(zip(chain.sites, chain.contact_pairs, strict=True)):
-            w = pair.relative(run.displacement, cell)
-            rate = interval * pair.relative(run.velocity, cell)
+        for number, site in enumerate(chain.sites):
+            w = site.pair.relative(run.displacement, site.cell)
+            rate = interval * site.pair.relative(run.velocity, site.cell)
 
             # Hermite's cubic through both ends of each interval.
             between = (1 - s) ** 2 * ((1 + 2 * s) * w[:-1] + s * rate[:-1])
             between += s**2 * ((3 - 2 * s) * w[1:] - (1 - s) * rate[1:])
             both = np.concatenate([w, between.ravel()])
-            reached[site] = np.maximum([both.max(), -both.min()], 0.0)
+            reached[number] = np.maximum([both.max(), -both.min()], 0.0)
         return reached
 
 

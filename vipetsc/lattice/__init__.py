@@ -1,8 +1,8 @@
 """The physics of a contact lattice in plain numpy: cells, contacts, drives, Bloch bands, finite chains.
 
 What a lattice is: ``cell``, ``variation`` (cells that differ), ``topology`` (what lies beyond the ends), ``chain``,
-``elements`` (what joins its masses), ``contact`` (with ``registered_law``), ``drive``. Its waves: ``bands`` (at real
-wavenumbers), ``waves`` (at given frequencies), ``damped`` (with dashpots), ``packet``. Its modes: ``modes``,
+``elements`` (what joins its masses), ``sites``, ``contact`` (with ``registered_law``), ``drive``. Its waves: ``bands``
+(at real wavenumbers), ``waves`` (at given frequencies), ``damped`` (with dashpots), ``packet``. Its modes: ``modes``,
 ``inertia``. What its ends send back: ``ends``, ``sent``.
 
 Its ``compliance``, the motion per harmonic force, is a folder with one module for each way to compute it.
@@ -34,5 +34,6 @@ from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
 from vipetsc.lattice.elements import Elements, contacts, nonlinear_springs, spring_laws
 from vipetsc.lattice.modes import Modes, linear_modes
+from vipetsc.lattice.sites import NO_SITES, Pair, Site, Sites, sites_at
 from vipetsc.lattice.topology import Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation

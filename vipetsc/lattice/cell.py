@@ -15,6 +15,8 @@ import scipy
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 
+from vipetsc.lattice.sites import Pair
+
 Reading = Literal["printed", "calibrated"]
 GROUND = -1
 """The ``start`` of a spring to the ground, and the ``other`` mass of its coupling."""
@@ -111,6 +113,11 @@ class UnitCell:
     def dofs(self) -> int:
         """Number of masses in the cell."""
         return len(self.masses)
+
+    @property
+    def pair(self) -> Pair:
+        """The contact pair."""
+        return Pair(self.host, self.resonator)
 
     @property
     def reduced_mass(self) -> float:

@@ -1,9 +1,7 @@
 """A finite lattice: its cells, its ends, its contact sites, its linear response."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -11,6 +9,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 
 from vipetsc.lattice.cell import GROUND, Spring, UnitCell
 from vipetsc.lattice.drive import Waveform
+from vipetsc.lattice.sites import NO_SITES, Sites
 from vipetsc.lattice.topology import NOTHING, WALL, Ends, Topology
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
 
@@ -24,42 +23,20 @@ FEW = 8
 ROUNDING = 1e-10
 
 
-class Pair(NamedTuple):
-    """Masses that a contact joins (0-based; host -1 is ground); ``resonator`` is ``offset`` cells further, 0 or 1."""
-
-    host: int
-    resonator: int
-    offset: int = 0
-
-    def relative(self, field: np.ndarray, cell: int) -> np.ndarray:
-        """Return the motion (...) of the resonator relative to its host in a ``cell`` (0-based).
-
-        ``field`` (..., cell, dof) is the displacement or the velocity of all cells. The resonator may be in the next
-        cell, which of a ring's last cell is the first one; the ground does not move.
-        """
-        w = field[..., (cell + self.offset) % field.shape[-2], self.resonator]
-        if self.host < 0:
-            return np.asarray(w)
-        return np.asarray(w - field[..., cell, self.host])
-
-
 @dataclass(frozen=True)
 class Chain:
-    """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
+    """``cells`` unit cells in a row, with contact ``sites``.
 
-    ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
-    springs; ``periodic`` joins the last cell to the first. ``pairs`` are the masses that contacts join, a pair a site;
-    with () all sites have the cell's pair. ``variation`` holds what differs from ``cell``; bands are those of ``cell``
-    alone. Raises ValueError if an array of ``variation`` has not one row for each cell.
+    ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those springs;
+    ``periodic`` joins the last cell to the first. ``variation`` holds what differs from ``cell``; bands are those of
+    ``cell`` alone. Raises ValueError if an array of ``variation`` has not one row for each cell.
     """
 
     cell: UnitCell
     cells: int
     ends: Ends = "fixed"
-    sites: tuple[int, ...] = ()
-    clearances: tuple[float, ...] = ()
+    sites: Sites = NO_SITES
     variation: Variation | None = None
-    pairs: tuple[Pair, ...] = ()
 
     def __post_init__(self) -> None:
         # NumPy would spread the row of one cell over all of them without a word.
@@ -128,50 +105,42 @@ class Chain:
         return replace(self, cell=cell, variation=Variation(**remaining) if remaining else None)
 
     @property
-    def contact_pairs(self) -> tuple[Pair, ...]:
-        """The pair of each site: those of ``pairs``, or the cell's."""
-        return self.pairs or (Pair(self.cell.host, self.cell.resonator),) * len(self.sites)
-
-    @property
-    def pair_table(self) -> np.ndarray:
-        """Host, resonator and offset (site, 3) of the pair of each site."""
-        # One row for all sites where they have the cell's pair: a lattice may have a million sites.
-        pairs = np.array(self.pairs or [(self.cell.host, self.cell.resonator, 0)], np.int64)
-        return np.broadcast_to(pairs, (len(self.sites), 3))
+    def has_own_pairs(self) -> bool:
+        """Whether a contact joins other masses than its cell's pair, or two contacts are in one cell."""
+        table = self.sites.table
+        own = (table["host"] != self.cell.host) | (table["resonator"] != self.cell.resonator) | (table["offset"] > 0)
+        return bool(own.any()) or len(np.unique(table["cell"])) < len(table)
 
     def resonator_cells(self, topology: Topology | None = None) -> np.ndarray:
         """Return the cell (site,) of each site's resonator; cells follow each other as in ``topology``.
 
         Raises ValueError where it would lie beyond an end.
         """
-        sites = np.array(self.sites, np.int64)
-        cells = sites
-        if self.is_joined:
-            topology = topology or self.topology
-            cells = topology.neighbour(sites, self.pair_table[:, 2])
-            if topology.ends is not None and cells.min() < 0:
-                number = int(cells.argmin())
-                raise ValueError(f"site {number + 1} in cell {sites[number] + 1} has no next cell to touch")
+        topology = topology or self.topology
+        sites = self.sites.table
+        if not len(sites):
+            return np.zeros(0, np.int64)
+        cells = topology.neighbour(sites["cell"], sites["offset"])
+        if topology.ends is not None and cells.min() < 0:
+            number = int(cells.argmin())
+            raise ValueError(f"site {number + 1} in cell {sites['cell'][number] + 1} has no next cell to touch")
         return cells
 
-    @property
-    def is_joined(self) -> bool:
-        """Whether contacts join cells."""
-        return any(pair.offset for pair in self.pairs)
-
-    def reduced_masses(self, numbers: Sequence[int] | None = None) -> list[float]:
-        """Return the mass in kg of the relative motion of the sites with these ``numbers``, from 0, or of all."""
-        if numbers is None:
-            numbers = range(len(self.sites))
+    def reduced_masses(self) -> list[float]:
+        """Return the mass (site,) in kg of the relative motion of each site."""
         # One row for all cells where they are equal, so that a long lattice costs no more than its sites.
         inverse = 1 / self._varied.get("masses", np.array([self.cell.masses]))
         rows = len(inverse)
-        chosen = np.array(numbers, np.int64)
-        sites = np.array(self.sites, np.int64)[chosen]
-        host, resonator, _ = self.pair_table[chosen].T
-        inverse_host = np.where(host >= 0, inverse[sites % rows, host], 0.0)  # ground does not move
-        inverse_resonator = inverse[self.resonator_cells()[chosen] % rows, resonator]
-        return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
+        sites = self.sites.table
+        inverse_host = np.where(sites["host"] >= 0, inverse[sites["cell"] % rows, sites["host"]], 0.0)
+        inverse_resonator = inverse[self.resonator_cells() % rows, sites["resonator"]]
+        return list((1 / (inverse_host + inverse_resonator)).tolist())
+
+    def impact_times(self, speed: float) -> list[float]:
+        """Return the durations in s of impacts at a ``speed`` in m/s, one for each kind of site whose stops yield."""
+        # A set, since sites of one kind have one duration, and each takes a quadrature.
+        kinds = {(site.law, mass) for site, mass in zip(self.sites, self.reduced_masses(), strict=True)}
+        return [law.impact_time(speed, mass) for law, mass in kinds if not law.is_rigid]
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
         """Return whether no cell from ``start`` to ``stop`` differs from the reference cell.

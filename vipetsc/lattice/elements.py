@@ -42,14 +42,13 @@ def contacts(chain: Chain, topology: Topology | None = None) -> Elements:
 
     Raises ValueError for a contact with the next cell where there is none.
     """
-    sites = np.array(chain.sites, np.int64)
-    host, resonator, _ = chain.pair_table.T
+    sites = chain.sites.table
     dofs = chain.cell.dofs
     return Elements(
-        cell=sites,
+        cell=chain.sites.cells,
         number=np.arange(len(sites)),
-        start=np.where(host >= 0, sites * dofs + host, WALL),
-        end=chain.resonator_cells(topology) * dofs + resonator,
+        start=np.where(sites["host"] >= 0, sites["cell"] * dofs + sites["host"], WALL),
+        end=chain.resonator_cells(topology) * dofs + sites["resonator"],
     )
 
 

@@ -22,6 +22,7 @@ from scipy.sparse import csc_matrix, diags
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Drive
+from vipetsc.lattice.sites import NO_SITES
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size has 128 MB
 EPS = float(np.finfo(float).eps)
@@ -101,7 +102,7 @@ def linear_modes(chain: Chain) -> Modes:
     1200 DoFs take a quarter of a second, 4000 a quarter of a minute. Raises ValueError for a lattice of more than
     ``MOST_DOFS`` whose cells differ: its modes are no waves.
     """
-    return _modes(replace(chain.linearised(), sites=(), clearances=()))
+    return _modes(replace(chain.linearised(), sites=NO_SITES))
 
 
 @lru_cache(maxsize=4)

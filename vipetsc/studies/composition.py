@@ -113,7 +113,7 @@ class Network:
         self.model = model
         self.cell = chain.cell
         self.om = drive.frequency
-        self.clearance = lesser_clearances(model.gaps)
+        self.clearance = lesser_clearances(chain.sites.gaps)
 
         half = min(_half_width(drive), WIDEST * drive.frequency)
         self.line = SpectralLine(half=half, length=2 * model.end)
@@ -141,7 +141,7 @@ class Network:
         self.alone = _of_sites(g[:, most])
         self.power = self._powers(self.om)
 
-        self.third = fastest_wave(self.cell, 3 * self.om, chain.contact_pairs[0])
+        self.third = fastest_wave(self.cell, 3 * self.om, chain.sites[0].pair)
         if self.third:
             response, g = self._responses(3 * self.om)
             inside = self._propagates(3 * self.om)
@@ -216,7 +216,7 @@ class Network:
         """
         omega = middle + self.offset - 1j * self.line.decay
         response = self._compliance().response(omega)
-        pairs = self.model.chain.contact_pairs
+        pairs = self.model.chain.sites.pairs
         alone = {pair: self_response(self.cell, omega, pair) for pair in {*pairs}}
         return response, np.array([alone[pair] for pair in pairs])
 
@@ -231,7 +231,7 @@ class Network:
     def _losses(self, driving: np.ndarray) -> WaveLosses | None:
         """Return losses of waves in dashpots; ``driving`` (drive, offset) are the spectra of the drives."""
         compliance = self._compliance()
-        driven = fastest_wave(self.cell, self.om, self.model.chain.contact_pairs[0])
+        driven = fastest_wave(self.cell, self.om, self.model.chain.sites[0].pair)
         if isinstance(compliance, WaveCompliance) or driven is None:
             return None
         return WaveLosses(
@@ -246,7 +246,7 @@ class Network:
 
     def _powers(self, omega: float) -> np.ndarray:
         """Return the power (site, 1) in W/m^2 of the wave at ``omega`` in rad/s over the |w|^2 of each site's pair."""
-        waves = [fastest_wave(self.cell, omega, pair) for pair in self.model.chain.contact_pairs]
+        waves = [fastest_wave(self.cell, omega, pair) for pair in self.model.chain.sites.pairs]
         return np.array([[wave.power_per_area] for wave in waves if wave])
 
     def _propagates(self, middle: float) -> np.ndarray:
@@ -357,7 +357,7 @@ class Network:
         """Return the sum over time of the power in W that sites take from what others ``emitted`` (site, time)."""
         assert self.third
         rate = self.losses.rate(self.third) if self.losses else 0.0
-        cells = np.array(self.model.chain.sites)
+        cells = self.model.chain.sites.cells
         total = 0.0
         for order in (np.argsort(cells), np.argsort(-cells)):  # waves that go up, and those that go down
             passing = np.zeros(len(self.time))

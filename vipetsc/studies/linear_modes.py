@@ -93,7 +93,7 @@ def check_modes(case: Case, count: int, near: float) -> None:
     masses = chain.cells * chain.cell.dofs
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
-    for number, stops in enumerate(model.gaps, start=1):
+    for number, stops in enumerate(chain.sites.gaps, start=1):
         if min(stops) == 0:
             remedy = (
                 f"site {number} touches its stop at rest, which resists on one side only: no motion about it is linear,"
@@ -110,11 +110,11 @@ def check_modes(case: Case, count: int, near: float) -> None:
 def pressed_contacts(model: Model) -> list[float]:
     """Return stiffnesses in N/m of contacts of a ``model`` for small motions: slopes, 0 if not pressed."""
     stiffness = []
-    for law, stops in zip(model.law_of_sites, model.gaps, strict=True):
-        pressed = -min(stops)
+    for site in model.chain.sites:
+        pressed = -min(site.gaps)
         slope = 0.0
         if pressed > 0:
-            slope = float(law.elastic_slope(pressed))
+            slope = float(site.law.elastic_slope(pressed))
         stiffness.append(slope)
     return stiffness
 
@@ -170,7 +170,7 @@ def _place(chain: Chain, cell: int, at_ends: float) -> str:
     """
     if chain.ends != "periodic" and at_ends > 0.5:
         return "edge"
-    sites = np.array(chain.sites, int)
+    sites = chain.sites.cells
     # A contact with the next cell may have its energy on either side.
     near = sites[np.abs(sites - cell) <= 1]
     return f"at site {near[0] + 1}" if near.size else f"in cell {cell + 1}"

@@ -20,13 +20,13 @@ import xarray as xr
 
 from vipetsc import spectra
 from vipetsc.case import Case, case_id
-from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
+from vipetsc.case.contacts import gaps_of_sites
 from vipetsc.case.law import lesser_clearances
 from vipetsc.dynamics import simulate
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 from vipetsc.lattice.topology import Topology
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import MEASURES as REGISTRY
@@ -223,8 +223,8 @@ def of_motion(names: Iterable[str]) -> list[str]:
 
 def other_pairs(case: Case) -> tuple[Pair, ...]:
     """Return the masses that contacts join, if not everywhere those of the cell's pair."""
-    sites = case.contacts.sites if isinstance(case.contacts.sites, list) else []
-    return pairs_of_sites(case.contacts, case.lattice.unit_cell(), len(sites))
+    chain = case.model().chain
+    return tuple(chain.sites.pairs) if chain.has_own_pairs else ()
 
 
 def is_proportional(case: Case) -> bool:

@@ -274,7 +274,7 @@ def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray)
     chain = model.chain
     if not chain.sites or chain.ends == "periodic":
         return np.nan
-    sites = np.array(chain.sites)
+    sites = chain.sites.cells
     farthest = sites[np.argmax(np.abs(sites - model.drive_cell))]
     cells = np.arange(chain.cells)
     beyond = cells > farthest

@@ -201,8 +201,8 @@ def _comparison_values(search: OptimumSearch, cases: Sequence[Case]) -> dict[str
         "compared": [*compared],
         "comparison/number": [*compared.values()],
         "site": np.arange(1, len(search.plan.sites) + 1),
-        "comparison/cell": [np.add(chain.sites, 1) for chain in chains],
-        "comparison/clearance": [chain.clearances for chain in chains],
+        "comparison/cell": [chain.sites.cells + 1 for chain in chains],
+        "comparison/clearance": [chain.sites.clearances for chain in chains],
     }
 
 

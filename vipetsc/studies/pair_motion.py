@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 
 
 class PairMotion(NamedTuple):
@@ -34,7 +34,7 @@ class PairMotion(NamedTuple):
 
         return cls(time=run["time"].values, displacement=relative("displacement"), velocity=relative("velocity"))
 
-    def reached(self, gaps: Sequence[tuple[float, float]]) -> list[float]:
+    def reached(self, gaps: Sequence[tuple[float, float]] | np.ndarray) -> list[float]:
         """Return the largest w (pair) on either side, at or between the samples, over the clearance there.
 
         ``gaps`` (pair) are the clearances on the sides + and -, in any unit.

@@ -111,7 +111,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
         "amplitude": amplitudes,
         "band": np.arange(1, cell.dofs + 1),
         "site": np.arange(1, len(model.chain.sites) + 1),
-        "sites/cell": np.array(model.chain.sites) + 1,
+        "sites/cell": model.chain.sites.cells + 1,
         "sites/kind": np.array(kinds.of) + 1,
     }
     about: dict[str, Any] = {"case": case.to_toml(), "onset_amplitude": onset, "drive_band": driven + 1}

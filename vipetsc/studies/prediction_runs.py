@@ -149,8 +149,8 @@ class PredictionRuns:
         chain = self.model.chain
         linear = self.case.varied(without=("output",), drive={"amplitude": amplitude}, contacts=NO_SITES)
         run, statistics = self._run(linear)
-        motion = PairMotion.between(run, chain.sites, chain.contact_pairs)
-        reached = motion.reached(self.model.gaps)
+        motion = PairMotion.between(run, chain.sites.cells.tolist(), chain.sites.pairs)
+        reached = motion.reached(chain.sites.gaps)
         return {"reached": reached} | self._energies(run, statistics)
 
     def _site(self, z: float, kind: int, largest: float) -> Record:

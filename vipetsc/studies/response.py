@@ -18,8 +18,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.io.records import Record
-from vipetsc.lattice import Band, Chain, OpenCompliance, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice import Band, Chain, OpenCompliance, UnitCell, WaveCompliance, bloch, pass_bands, sites_at, waves_at
+from vipetsc.lattice.sites import Pair
 
 # Changes of energies below are those of predicted energies of bands, whose error is 0.1 decades.
 LOWEST = 0.15  # z of the first bin, to which smaller ones count; half and twice of it change energies by 0.02 decades
@@ -48,9 +48,9 @@ def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
     """
     if cell.is_damped:
         # A segment of two cells, since a contact may join neighbours, with the lattice going on at both ends.
-        chain = Chain(cell, 2, sites=(0,), pairs=(pair,))
+        chain = Chain(cell, 2, sites=sites_at([0], pair))
         return OpenCompliance(chain, open_ends=("left", "right")).at(omega)[:, 0, 0]
-    return WaveCompliance(Chain(cell, 1, sites=(0,), pairs=(pair,)), infinite=True).at(omega)[:, 0, 0]
+    return WaveCompliance(Chain(cell, 1, sites=sites_at([0], pair)), infinite=True).at(omega)[:, 0, 0]
 
 
 class TravellingWave(NamedTuple):

@@ -37,9 +37,9 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.case.law import OneSite
 from vipetsc.lattice import bloch
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.damped import Waves, damped_waves
 from vipetsc.lattice.sent import amplitudes_sent
+from vipetsc.lattice.sites import Pair
 from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.response import DECAY, self_response
 

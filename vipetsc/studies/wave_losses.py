@@ -69,7 +69,7 @@ class WaveLosses:
         driven: TravellingWave,
         third: TravellingWave | None,
     ) -> None:
-        self.sites = model.chain.sites
+        self.sites = model.chain.sites.cells.tolist()
         self.line = line
         self.driving = driving
         self.driven = driven

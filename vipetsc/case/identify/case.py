@@ -177,7 +177,7 @@ def _group_problems(
     ``taken`` are the pairs of a quantity and a member that are sought already. Those of the unknown are added to it.
     """
     quantity = unknown.quantity
-    gaps = base.model().gaps
+    gaps = base.model().chain.sites.gaps
     for group in groups:
         if quantity == "clearance_minus" and all(not isfinite(gaps[member][1]) for member in group):
             remedy = f"site {group[0] + 1} has no stop on the side w < 0; name the other sites, as in of = [[1], [2]]"
@@ -208,9 +208,9 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             continue
 
         # The quantity can be sought in this case.
-        if quantity == "exponent" and any(law.law != "power" for law in base.model().used_laws):
+        if quantity == "exponent" and any(law.law != "power" for law in base.model().chain.sites.laws):
             yield Problem(f"{at}.quantity", quantity, 'only the law "power" has an exponent; set contacts.law')
-        if quantity == "stiffness" and any(law.law not in LAWS for law in base.model().used_laws):
+        if quantity == "stiffness" and any(law.law not in LAWS for law in base.model().chain.sites.laws):
             remedy = "a registered law need not be proportional to its stiffness; only shipped laws can be identified"
             yield Problem(f"{at}.quantity", quantity, remedy)
         if quantity == "amplitude" and all("amplitude" in record.drive for record in options.records):
@@ -302,7 +302,7 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
 
 def _touches(base: Case) -> bool:
     """Return whether a site of the case touches its stop, or is pressed against it, at rest."""
-    return any(min(gaps) <= 0 for gaps in base.model().gaps)
+    return bool((base.model().chain.sites.gaps <= 0).any())
 
 
 def _force_problems(record: RecordTable, drives: Sequence[OneDrive], at: str) -> Iterator[Problem]:

@@ -12,7 +12,7 @@ import tomli_w
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Valid
-from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites, has_equal_sides, lists_of
+from vipetsc.case.contacts import NO_APPROACH, has_equal_sides, lists_of
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.nfrc.ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc.family import FamilyMember, family_of
@@ -92,7 +92,6 @@ class NfrcCase(Case):
         nfrc = sections["nfrc"]
         contacts = sections["contacts"]
         chain = build_chain(sections["lattice"], contacts)
-        gaps = gaps_of_sites(contacts, list(chain.clearances))
         cell = chain.cell
         problems = [*_check_drives(nfrc, sections["drive"]), *_check_lattice(nfrc, contacts, chain)]
         if problems:
@@ -105,7 +104,7 @@ class NfrcCase(Case):
         if nfrc.infinite is None:
             update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
-            is_odd = chain.is_odd and has_equal_sides(gaps)
+            is_odd = chain.is_odd and has_equal_sides(chain.sites.gaps)
             # In half of an even number of its periods the drive does not change its sign, as such a motion would.
             update["symmetric"] = is_odd and nfrc.subharmonic % 2 == 1
         if nfrc.over == "amplitude":
@@ -115,7 +114,7 @@ class NfrcCase(Case):
             nfrc = nfrc.model_copy(update={"band": _fastest_band(nfrc, cell)})
         problems = [
             *_check_waves(nfrc, cell),
-            *check_ground(nfrc, sections["lattice"], chain, gaps),
+            *check_ground(nfrc, sections["lattice"], chain),
             *_check_points_at(nfrc, measures_of(nfrc, sections["lattice"], sections["output"], chain)),
         ]
         return sections | {"nfrc": nfrc}, problems
@@ -268,8 +267,7 @@ class NfrcCase(Case):
 
     def laws(self, restitution: float) -> list[Contact]:
         """Return the law of each site, with the ``restitution`` unless the case gives each site one of its own."""
-        model = self.model()
-        laws = list(model.law_of_sites)
+        laws = [site.law for site in self.model().chain.sites]
         if self.contacts.each and self.contacts.each.restitution:
             return laws
         return [replace(law, restitution=restitution) for law in laws]
@@ -283,8 +281,7 @@ class NfrcCase(Case):
     @property
     def are_contacts_springs(self) -> bool:
         """Whether contacts that are pressed at rest are springs of the linear lattice, as nothing else holds it."""
-        model = self.model()
-        return are_contacts_springs(self.nfrc, self.lattice, model.chain, model.gaps)
+        return are_contacts_springs(self.nfrc, self.lattice, self.model().chain)
 
     @cached_property
     def _members(self) -> list[tuple[FamilyMember, "NfrcCase"]]:
@@ -340,7 +337,7 @@ def needs_modes(chain: Chain) -> bool:
 
     It is if its motions do not consist of Bloch waves, or if contacts join other masses than the cell's pair.
     """
-    return not has_waves(chain) or bool(chain.pairs)
+    return not has_waves(chain) or chain.has_own_pairs
 
 
 def _fastest_band(nfrc: NfrcTable, cell: UnitCell) -> int | None:
@@ -367,12 +364,12 @@ def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
 
 def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:
     """Yield problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
-    gaps = gaps_of_sites(contacts, list(chain.clearances))
+    gaps = chain.sites.gaps
     if nfrc.symmetric and not has_equal_sides(gaps):
         yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; omit it")
     if nfrc.symmetric and not chain.is_odd:
         yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
-    smallest = min((min(gap) for gap in gaps), default=np.inf)
+    smallest = gaps.min(initial=np.inf)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
         yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
     if nfrc.source == "wave" and smallest <= 0:

@@ -1,6 +1,6 @@
 """Supports of the lattice of a steady state: walls, contacts that are pressed at rest, cells beyond its open ends."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from vipetsc.case.bodies import bodies_of, check_apart, contact_ends
@@ -19,16 +19,13 @@ def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
     return lattice.ends == "fixed" and lattice.unit_cell().joins_cells and not is_open
 
 
-def are_contacts_springs(
-    nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
-) -> bool:
+def are_contacts_springs(nfrc: NfrcTable, lattice: LatticeTable, chain: Chain) -> bool:
     """Return whether the contacts that are pressed at rest are springs of the linear lattice.
 
     They are if nothing else holds the masses: contacts with the ground in a lattice without walls, and all contacts in
-    a lattice without springs. A mean force would push masses that no spring holds away without bound. ``gaps`` are the
-    clearances in m of the sites of ``chain`` on both sides.
+    a lattice without springs. A mean force would push masses that no spring holds away without bound.
     """
-    pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=True) if min(gap) < 0]
+    pressed = [site.pair for site in chain.sites if min(site.gaps) < 0]
     if not lattice.unit_cell().joins_cells:
         return bool(pressed)
     return any(pair.host < 0 for pair in pressed) and not has_walls(nfrc, lattice)
@@ -49,27 +46,22 @@ def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
         yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
 
 
-def check_ground(
-    nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
-) -> Iterator[Problem]:
-    """Yield problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds.
-
-    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides.
-    """
+def check_ground(nfrc: NfrcTable, lattice: LatticeTable, chain: Chain) -> Iterator[Problem]:
+    """Yield problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds."""
     if nfrc.symmetric:
         return
     # Cells that no springs join must be held together by contacts that are pressed. Springs hold the masses of other
     # lattices together, which only contacts to ground can push away.
     if not (chain.cell.joins_cells or nfrc.infinite):
-        yield from check_apart(bodies_of(chain, gaps), contact_ends(chain))
+        yield from check_apart(bodies_of(chain), contact_ends(chain))
         return
-    to_ground = any(pair.host < 0 for pair in chain.contact_pairs)
+    to_ground = bool((chain.sites.table["host"] < 0).any())
     if not to_ground or has_walls(nfrc, lattice) or chain.cell.is_grounded:
         return
     if nfrc.infinite:
         reason = "a mean force of the ground moves an infinite lattice without bound, since no wall holds it"
         yield Problem("contacts.pair", None, f"{reason}; give equal stops on both sides, or nfrc.infinite = false")
-    elif not are_contacts_springs(nfrc, lattice, chain, gaps):
+    elif not are_contacts_springs(nfrc, lattice, chain):
         reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
         remedy = 'use ends = "fixed", a precompression, or equal stops on both sides'
         yield Problem("contacts.pair", None, f"{reason} holds; {remedy}")

@@ -16,7 +16,6 @@ from vipetsc.case.contacts import (
     MATERIAL,
     Gaps,
     check_per_site,
-    contact_of,
     gaps_of_sites,
     has_equal_sides,
     laws_of_sites,
@@ -225,7 +224,7 @@ class NnmCase(CaseFile):
         """Return the law of each contact, with its dissipation; the stiffness is 0 where none is given."""
         count = len(self._clearances())
         contacts = with_stiffness(self.contacts, count)
-        return list(laws_of_sites(contacts, count) or (contact_of(contacts),) * count)
+        return laws_of_sites(contacts, count)
 
     def elastic_laws(self) -> list[Contact]:
         """Return the law of each contact without dissipation."""

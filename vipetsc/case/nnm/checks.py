@@ -136,7 +136,7 @@ def check_lattice(
     # Symmetric motions have no mean forces, and springs that join cells make one body of a lattice.
     if not (cell.joins_cells or is_symmetric):
         chain = build_chain(lattice, contacts)
-        yield from check_apart(bodies_of(chain, gaps), contact_ends(chain))
+        yield from check_apart(bodies_of(chain), contact_ends(chain))
 
 
 def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> Iterator[Problem]:
@@ -180,7 +180,7 @@ def rigid_motions(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
     if cell.joins_cells:
         return int(not is_held(lattice, contacts, cell, gaps))
     # One of the bodies is the ground with what is pressed against it.
-    return len(set(bodies_of(build_chain(lattice, contacts), gaps))) - 1
+    return len(set(bodies_of(build_chain(lattice, contacts)))) - 1
 
 
 def rigid_motions_of_pair(cell: UnitCell) -> int:
@@ -199,7 +199,6 @@ def rigid_motions_of_pair(cell: UnitCell) -> int:
 
 def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
     """Return the clearances on both sides of the contacts with the ground; ``gaps`` are those of all sites."""
-    # There are no pairs if all sites join the cell's own pair, which the ground is no part of.
     pairs = pairs_of_sites(contacts, cell, len(gaps))
     return [gaps[number] for number, pair in enumerate(pairs) if pair.host < 0]
 

@@ -150,7 +150,7 @@ class OptimiseCase(StudyCase):
     @property
     def sites(self) -> list[int]:
         """Cells (1-based) of the sites of the case to begin with."""
-        return [site + 1 for site in self.base.model().chain.sites]
+        return (self.base.model().chain.sites.cells + 1).tolist()
 
     @cached_property
     def space(self) -> SearchSpace:
@@ -250,6 +250,6 @@ def _matched_problems(table: Table) -> Iterator[Problem]:
             yield Problem("optimise.start", "matched", remedy)
         return
     # One law is computed, for the cell's own pair, by whose linear motion all clearances are set.
-    if len(law.kinds.kinds) > 1 or law.model().chain.pairs:
+    if len(law.kinds.kinds) > 1 or law.model().chain.has_own_pairs:
         remedy = "clearances are matched by the scattering law of one site, and these sites differ; begin with the case"
         yield Problem("optimise.start", "matched", remedy)

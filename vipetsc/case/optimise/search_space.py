@@ -87,7 +87,7 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
     rows = _named_rows(bounds, len(base.model().chain.sites))
     given = bounds.keys_of_case()
     table = _with_entries(table, base, [*(path for row in rows for path in row.paths), *given])
-    gaps = base.model().chain.clearances
+    gaps = base.model().chain.sites.clearances.tolist()
     # Without sites there are no clearances, which ``variable_problems`` reports.
     if bounds.profile and gaps:
         # The clearances of a profile follow from the first and the last one, whatever those of the case are.
@@ -158,9 +158,9 @@ def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
     contacts = dict(table.get("contacts", {}))
     for path in paths:
         if path.startswith("contacts.clearance["):
-            contacts["clearance"] = list(chain.clearances)
+            contacts["clearance"] = chain.sites.clearances.tolist()
         if path.startswith("contacts.sites["):
-            contacts["sites"] = [site + 1 for site in chain.sites]
+            contacts["sites"] = (chain.sites.cells + 1).tolist()
         of_each_site = re.match(r"contacts\.each\.(\w+)", path)
         if of_each_site and hasattr(base.contacts, of_each_site[1]):
             values = values_of_sites(base.contacts, of_each_site[1], len(chain.sites))

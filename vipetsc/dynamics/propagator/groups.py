@@ -50,7 +50,7 @@ def spans_cells(chain: Chain) -> bool:
     # Springs to a wall act on one mass.
     joins = (springs.start >= 0) & (springs.end >= 0)
     apart = springs.start // chain.cell.dofs != springs.end // chain.cell.dofs
-    return chain.is_joined or bool(np.any(joins & apart))
+    return chain.sites.join_cells or bool(np.any(joins & apart))
 
 
 @lru_cache(maxsize=2)  # each table of an engine asks for those of its model
@@ -80,7 +80,7 @@ def contact_dofs(model: Model) -> np.ndarray:
     driven["cell"] = driven["last"] = [drive.cell for drive in drives]
     driven["form"][np.arange(len(drives)), 0, [drive.mass for drive in drives]] = 1.0
 
-    dofs["clearance"][:first_spring] = np.reshape(model.gaps, (-1, 2)).min(axis=1)
+    dofs["clearance"][:first_spring] = lattice.sites.gaps.min(axis=1)
     driven["clearance"] = np.inf
     if len(springs.cell):
         _fill_springs(dofs[first_spring:first_drive], lattice, springs)

@@ -155,7 +155,7 @@ class StepSeries:
     @property
     def width(self) -> int:
         """How many cells the rows of a DoF span: its own, the reach on both sides, one more if forces join cells."""
-        return 2 * self.reach + 1 + (self.spans_cells or self.chain.is_joined)
+        return 2 * self.reach + 1 + (self.spans_cells or self.chain.sites.join_cells)
 
     @cached_property
     def truncation(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.dynamics.propagator.groups import group_dofs, spans_cells
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.lattice import Chain, ToneBurst, nonlinear_springs
+from vipetsc.lattice import NO_SITES, Chain, ToneBurst, nonlinear_springs
 from vipetsc.wording import counted
 
 # The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
@@ -85,7 +85,7 @@ def _fastest_burst(model: Model) -> float:
 def _series(model: Model, parts: int) -> StepSeries:
     """Return the series over a step of a sample interval over ``parts``, in which springs are linear."""
     # Free motion knows no contacts: members of a sweep that differ in these have one series, and compute it once.
-    chain = replace(model.chain.linearised(), sites=(), clearances=(), pairs=())
+    chain = replace(model.chain.linearised(), sites=NO_SITES)
     return _kept_series(
         chain,
         interval=model.sample_interval / parts,
@@ -131,7 +131,7 @@ def refusal(model: Model) -> str | None:
     if counts[largest] <= MOST_SITES:
         return None
     numbers = groups.numbers[groups.first[largest] :][: counts[largest]]
-    cells = sorted(model.chain.sites[i] + 1 for i in numbers)
+    cells = sorted(model.chain.sites.cells[numbers] + 1)
     return (
         f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
         f" another (at most {MOST_SITES} may)"

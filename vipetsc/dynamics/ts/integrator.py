@@ -97,7 +97,7 @@ class Integrator(Engine):
         # Whether the next step is taken without a search, and the steps and trials since the last that landed nowhere.
         self._is_blind = False
         self._trials = 0
-        self._is_rough = any(law.onset_exponent != 1 for law in model.used_laws)
+        self._is_rough = any(law.onset_exponent != 1 for law in model.chain.sites.laws)
 
         self.time = 0.0
         self.state = layout.create_vector()
@@ -106,7 +106,7 @@ class Integrator(Engine):
             self._components = local.array
         # Only contacts of other pairs of masses, and rigid ones, are observed with rates of the whole state.
         self.rates = self.state
-        self._observes_rates = bool(model.chain.pairs) or model.has_rigid_sites
+        self._observes_rates = model.chain.has_own_pairs or model.has_rigid_sites
         if self._observes_rates:
             self.rates = layout.create_vector()
         # A state a little before or after one at which reactions are asked for, and its rates.
@@ -125,7 +125,7 @@ class Integrator(Engine):
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
         self._has_pieces = any(isinstance(drive.waveform, Pieces) for drive in model.drives)
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
-        self._onset_fraction = onset_fraction(model.used_laws, model.rtol)
+        self._onset_fraction = onset_fraction(model.chain.sites.laws, model.rtol)
         self.observe(self.tracker.start)
 
     def observe(self, motion: np.ndarray, time: float | None = None) -> None:

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands, waves_at
-from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.compliance.base import ChainCompliance, ComplianceError
 from vipetsc.lattice.elements import contacts
+from vipetsc.lattice.sites import Pair
 from vipetsc.lattice.topology import NOTHING, WALL, Topology
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
@@ -156,20 +156,20 @@ class WaveCompliance(ChainCompliance):
         state = waves.state[0, :, channel]
         shape = cell_between(cell, waves, state, factor * state)
 
-        pairs = self.chain.contact_pairs
+        pairs = self.chain.sites.pairs
         relative = _relative_motion(pairs[0], shape, factor)
         if abs(relative) < AT_REST * np.abs(shape).max():
             raise ComplianceError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
         # A pair like the first one moves as it does, but for the phase.
         ratios = [1.0 if pair == pairs[0] else _relative_motion(pair, shape, factor) / relative for pair in pairs]
 
-        origin = self.chain.sites[0]
+        origin = self.chain.sites[0].cell
         return IncidentWave(
             frequency=omega,
             band=band,
             direction=direction,
             wavenumber=wavenumbers[0],
-            relative=factor ** (np.array(self.chain.sites) - origin) * ratios,
+            relative=factor ** (self.chain.sites.cells - origin) * ratios,
             flux=abs(energy_flux(omega, state)) / abs(relative) ** 2,
             shape=shape / relative,
             factor=factor,

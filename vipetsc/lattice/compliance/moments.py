@@ -49,7 +49,7 @@ class SeriesCompliance(WaveCompliance):
             first, piece = self._piece(group)
             rows = np.zeros((piece.cells * d, len(group)))
             for j, number in enumerate(group):
-                start = (chain.sites[number] - first) * d
+                start = (chain.sites.cells[number] - first) * d
                 rows[start + chain.cell.resonator, j] = 1.0
                 rows[start + chain.cell.host, j] = -1.0
 
@@ -65,8 +65,8 @@ class SeriesCompliance(WaveCompliance):
     def _piece(self, group: np.ndarray) -> tuple[int, Chain]:
         """Return first cell, and the chain, of what the series of a ``group`` of sites reaches: a cell each term."""
         chain = self.chain
-        first = chain.sites[group[0]] - TERMS
-        last = chain.sites[group[-1]] + TERMS
+        first = int(chain.sites.cells[group[0]]) - TERMS
+        last = int(chain.sites.cells[group[-1]]) + TERMS
         if not chain.topology.is_ring:
             first = max(first, 0)
             last = min(last, chain.cells - 1)
@@ -77,7 +77,7 @@ class SeriesCompliance(WaveCompliance):
 
     def _groups(self) -> list[np.ndarray]:
         """Return the sites' numbers in the chain's list, together where their pieces overlap; a ring's all together."""
-        sites = np.array(self.chain.sites)
+        sites = self.chain.sites.cells
         order = np.argsort(sites, kind="stable")
         if self.chain.topology.is_ring:
             return [order]

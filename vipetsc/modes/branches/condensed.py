@@ -264,7 +264,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
         u = compliance.field(omega, forces, near).real
         size = np.abs(u).max(axis=1)
         # The cells at the full distance: while one of them moves, cells beyond may move, too.
-        rim = np.min(np.abs(np.subtract.outer(near, chain.sites)), axis=1) == reach
+        rim = np.min(np.abs(np.subtract.outer(near, chain.sites.cells)), axis=1) == reach
         if reach >= LAST_REACH or not rim.any() or size[rim].max() <= NEGLIGIBLE * size.max():
             return dict(zip(near.tolist(), u, strict=True))
         reach *= 2
@@ -272,7 +272,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
 
 def _cells_near(chain: Chain, reach: int) -> np.ndarray:
     """Return numbers of the cells within ``reach`` cells of a site."""
-    near = np.unique(np.add.outer(chain.sites, np.arange(-reach, reach + 1)))
+    near = np.unique(np.add.outer(chain.sites.cells, np.arange(-reach, reach + 1)))
     # On a ring the cells on both sides of a site may meet, and are then counted once.
     if chain.ends == "periodic":
         return np.unique(near % chain.cells)

@@ -310,10 +310,10 @@ def _axes(case: NfrcCase) -> Variables:
     last_harmonic = 1 if case.is_linear else case.nfrc.harmonics
     orders = np.arange(last_harmonic + 1)
     axes = {
-        "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
+        "site": variable("site", chain.sites.cells + 1, "1", "cell of the site, counted from 1"),
         "order": variable("order", orders, "1", "harmonic of the motion"),
         "way": variable("way", np.array(FRACTIONS), "1", "destination of the energy"),
-        "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
+        "clearance": variable("site", chain.sites.clearances, "m", "clearance"),
     }
 
     if not chain.is_linear:

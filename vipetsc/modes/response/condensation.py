@@ -102,7 +102,7 @@ def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
     Where a pressed contact is a spring of the linear lattice, its ``Stops.spring`` is the slope of its law at rest. It
     is 0 of a contact that is not pressed.
     """
-    gaps = case.model().gaps
+    gaps = case.model().chain.sites.gaps.tolist()
     stops = [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
     if not case.are_contacts_springs:
         return stops

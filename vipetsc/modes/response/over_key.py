@@ -22,7 +22,7 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase, NfrcTable
 from vipetsc.case.section import CaseError
-from vipetsc.lattice import Chain
+from vipetsc.lattice import Chain, sites_at
 from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.problem import FlowError, SpecialKind
@@ -206,6 +206,7 @@ class KeyedCase:
 def _linear_lattice(case: NfrcCase) -> tuple[Chain, tuple[float, ...]]:
     """Return what makes up the linear lattice of a ``case``: its chain, and springs in N/m in the place of contacts.
 
-    Clearances, which do not belong to it, are left out, so that two can be compared.
+    Stops, which do not belong to it, are left out, so that two can be compared.
     """
-    return replace(case.model().chain, clearances=()), contact_springs(case)
+    chain = case.model().chain
+    return replace(chain, sites=sites_at(chain.sites.cells, chain.sites.pairs)), contact_springs(case)

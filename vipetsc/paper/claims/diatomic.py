@@ -41,7 +41,7 @@ class AmplitudeTriple:
 
         model = self.low.case.model()
         drive = model.drive
-        sites = np.asarray(model.chain.sites)
+        sites = model.chain.sites.cells
         waves = [wave for wave in waves_at(model.chain.cell, drive.frequency) if wave[0] == OPTICAL]
         if not waves or not sites.size:
             raise MissingEvidence(f"{STEP}: the drive excites no wave of band {OPTICAL}, or the lattice has no sites")
