@@ -55,3 +55,30 @@ def test_a_sine_that_does_not_end_is_beyond_a_clearance_all_the_time():
     stop = {"pair": [0, 1], "side": "both"}
     assert expected_episodes(chain_with_a_stop(stop, sine, over=1.01)) == pytest.approx(2 * 0.2 * 1000.0 / (2 * np.pi))
     assert expected_episodes(chain_with_a_stop(stop, sine, over=0.99)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("lattice", "time", "engine"),
+    [
+        ({"strip": {"mass": 0.01, "stiffness": 1e4, "rows": 40}}, {}, "ts"),
+        ({"strip": {"mass": 0.01, "stiffness": 1e4, "rows": 40}}, {"end": 10.0}, "propagator"),
+        ({"strip": {"mass": 0.01, "stiffness": 1e4, "rows": 40}}, {"engine": "propagator"}, "propagator"),
+        ({"strip": {"mass": 0.01, "stiffness": 1e4, "rows": 4}}, {}, "propagator"),
+        ({"preset": "four-band"}, {}, "propagator"),
+        ({"preset": "four-band", "cells": 10_000}, {}, "propagator"),
+    ],
+)
+def test_a_case_that_names_no_engine_has_the_one_that_costs_less(lattice, time, engine):
+    """Set-up of the propagator grows with the square of a strip's width, which a long run repays and a short does not.
+
+    A short run of a narrow lattice keeps the propagator: what there is to save is not noticed.
+    """
+    case = Case.from_table(
+        {
+            "lattice": {"cells": 40} | lattice,
+            "contacts": {"stiffness": 1e6, "sites": []},
+            "drive": {"amplitude": 1.0, "cycles": 3, "frequency": 500.0},
+            "time": {"end": 0.02, "sample_interval": 1e-4} | time,
+        }
+    )
+    assert choose_engine(case, case.model()).name == engine

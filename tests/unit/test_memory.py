@@ -8,7 +8,6 @@ import pytest
 from tests.conftest import small_case
 from vipetsc.case import CaseError
 from vipetsc.dynamics import memory, simulate
-from vipetsc.dynamics.cost import estimate
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import memory_needed

@@ -5,15 +5,11 @@ engines take longer or shorter by about one factor, so that their ratio remains.
 wave on its first way along the lattice; if waves return to the sites, there are up to several times as many.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.case.wave_at_sites import wave_over_clearance
-from vipetsc.dynamics.plan import PROPAGATOR, RunPlan
-from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.step_choice import RESOLVED, refusal, spring_cost, step_seconds, step_series
+from vipetsc.dynamics.propagator.step_choice import RESOLVED, spring_cost, step_seconds, step_series
 from vipetsc.lattice import pass_bands
 
 # Further steps of ts that an episode costs.
@@ -30,41 +26,9 @@ WIDTH = 4.2e-4
 # Times in s of cells with separate rows: for each number in these rows in a step, and to make one of these numbers.
 OWN_NUMBER = 4e-10
 MAKE_NUMBER = 7e-7
-# Masses on a rank below which messages cost what further ranks save. As was measured, two ranks are a little slower
-# than one at 1200 masses with ts, and as fast at 300 cells of four masses with the propagator.
-FEW_MASSES = 750
-# An engine so many times as fast is recommended.
-MUCH_FASTER = 1.5
 
 
-class Cost(NamedTuple):
-    """CPU time in ``seconds`` that a run takes on each rank; ``faster`` says what would take less, if anything."""
-
-    seconds: float
-    faster: str
-
-
-def estimate(plan: RunPlan, ranks: int = 1) -> Cost:
-    """Return cost of the run that a ``plan`` says, on so many ranks; every site is assumed to meet the drive's wave."""
-    model = plan.model
-    seconds = _runge_kutta_seconds(model)
-    faster = []
-    if not plan.case.petsc and refusal(model) is None and (series := step_series(model)):
-        by_propagator = _propagator_seconds(model, series)
-        if plan.engine.name == PROPAGATOR:
-            seconds = by_propagator
-        elif seconds >= MUCH_FASTER * by_propagator:
-            ratio = seconds / by_propagator
-            faster.append(f'time.engine = "propagator" would be about {ratio:.0f} times faster')
-
-    if ranks > 1 and model.chain.cells * model.chain.cell.dofs < FEW_MASSES * ranks:
-        faster.append(f"one rank would be as fast: in so short a lattice messages cost what {ranks} ranks save")
-    else:
-        seconds /= ranks
-    return Cost(seconds, "; ".join(faster))
-
-
-def _runge_kutta_seconds(model: Model) -> float:
+def runge_kutta_seconds(model: Model) -> float:
     """Return CPU time in s of ``ts`` for ``model`` on one rank."""
     step = step_seconds(model.chain.cells * model.chain.cell.dofs)
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
@@ -72,8 +36,10 @@ def _runge_kutta_seconds(model: Model) -> float:
     return float((steps + EPISODE_STEPS * expected_episodes(model)) * step)
 
 
-def _propagator_seconds(model: Model, series: StepSeries) -> float:
-    """Return CPU time in s of the propagator, with steps of ``series``, for ``model`` on one rank."""
+def propagator_seconds(model: Model) -> float:
+    """Return CPU time in s of the propagator for ``model``, which it must suit, on one rank."""
+    series = step_series(model)
+    assert series is not None
     steps = model.samples * round(model.sample_interval / series.interval)
     own_cells, own_tables = series.own_rows()
     numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1)

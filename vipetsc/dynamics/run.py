@@ -334,7 +334,8 @@ class Run:
         if is_stopped:
             sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
-        statistics["effective_restitution"] = self.setup.model.effective_restitution
+        if self.setup.model.chain.sites:
+            statistics["effective_restitution"] = self.setup.model.effective_restitution
 
         warnings = [*noticed]
         for observer in self.observers:

@@ -127,7 +127,7 @@ class SampledModel:
         points = [PointTable(name=f"mass{mass}", cell=mass // dofs + 1, mass=mass % dofs + 1) for mass in self.watched]
         # The propagator where it applies, whatever engine the case has for its own run: steps of ts change with the
         # parameters, and so do its errors.
-        time = self.case.time.model_copy(update={"engine": "auto"})
+        time = self.case.time.model_copy(update={"engine": "propagator"})
         case = self.case.model_copy(update={"output": OutputTable(points=points), "time": time})
         memory = RunMemory(MPI.COMM_SELF)
         plan = RunPlan(case, model, choose_engine(case, model))

@@ -79,8 +79,7 @@ def _sweep_of(options: argparse.Namespace) -> Sweep:
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
     """Simulate the case, and measure its fields and the motion of its named points, as far as they are stored."""
     from vipetsc.dynamics import simulate
-    from vipetsc.dynamics.cost import estimate
-    from vipetsc.dynamics.plan import RunPlan
+    from vipetsc.dynamics.plan import RunPlan, estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
 
     result = simulate(case, work.folder, work.comm, extend=work.options.extend, **work.keywords)
@@ -131,9 +130,8 @@ def measure_unless_measured(case: Case, work: Work) -> None:
 
 def run_rows(case: Case, ranks: int) -> Rows:
     """Return the rows of ``validate`` on a run: lattice, drive, times, samples, files, memory and time on ``ranks``."""
-    from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_size, memory_available, memory_needed
-    from vipetsc.dynamics.plan import RunPlan
+    from vipetsc.dynamics.plan import RunPlan, estimate
     from vipetsc.dynamics.recorded_sizes import recorded_cells
 
     plan = RunPlan.of(case)

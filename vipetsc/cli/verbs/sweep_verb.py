@@ -39,8 +39,7 @@ def failure_of(result: "SweepResult") -> list[str]:
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     """Return rows of ``validate`` with the number of members, how many of those tried are not valid, and their time."""
-    from vipetsc.dynamics.cost import estimate
-    from vipetsc.dynamics.plan import RunPlan
+    from vipetsc.dynamics.plan import RunPlan, estimate
 
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
