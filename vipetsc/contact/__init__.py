@@ -18,12 +18,13 @@ For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx
 x = 0, the right side integrates to zero, hence the rebound e = -w'_plus/w'_minus solves
 e + log(1 - c e)/c = log(1 + c)/c - 1. Its expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic
 impact. The exact damping is the c that solves it for e = r. A fast separation makes g < 0, a pull; ``adhesion =
-"clip"`` then sets the force to zero. A floor of |w'_minus| bounds g at a grazing onset.
+"clip"`` then takes g = 0: the contact dissipates the elastic energy that it has left. The error control of a step
+resolves the kink there. A floor of |w'_minus| bounds g at a grazing onset.
 
-**Modes.** A site is free, closed (in contact), clipped, permanent or at rest in contact. Within a time step the modes
+**Modes.** A site is free, closed (in contact), permanent or at rest in contact. Within a time step the modes
 are frozen, and the law of a closed site is continued as an odd function through x = 0: the force is smooth, so that no
 kink spoils the order of the method. Every change of mode is a switching function that crosses zero upwards:
-sigma w - D (onset), D - sigma w (separation), -g and g (clipping begins and ends). A contact without loss that is
+sigma w - D (onset), D - sigma w (separation). A contact without loss that is
 pressed at rest, or in which the masses of two cells touch, is permanent: its force is that of max(x, 0) at all times,
 kink included, and its mode never changes.
 

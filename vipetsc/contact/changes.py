@@ -1,11 +1,10 @@
 """Compiled search of a step for the first change of a site's mode; extremes within the step, shortest contact times.
 
 A site's motion is (w, w', w''), w = u_resonator - u_host, in rows of arrays (sites, 3). Every change is an upcrossing
-of one of two switching functions of the site's mode, each affine in w or in w':
+of one of two switching functions of the site's mode, each affine in w:
 
 - free: w - D and -w - D, an onset on either side;
-- closed: D - side w, the separation, and with clipping -g (the force would turn into a pull);
-- clipped: D - side w, and g;
+- closed: D - side w, the separation;
 - resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing;
 - permanent: side w - D and D - side w, where the masses meet and part. The mode stays: only a search for kinks, by an
   engine whose steps end on them, asks for these.
@@ -20,7 +19,6 @@ import numpy as np
 
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import (
-    CLIPPED,
     CLOSED,
     FREE,
     PERMANENT,
@@ -35,9 +33,6 @@ from vipetsc.contact.law import (
 )
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
-# A site has landed on its clearance when |side w - D| is within its ``tolerance`` (``contact.law``), and on g = 0 when
-# |g| is within this.
-LANDED_G = 1e-9
 # A site at rest in contact has opened or closed when it is so many tolerances away from D. A return to D from there is
 # a motion of its own, on which the site may land again.
 MOVED = 100.0
@@ -56,13 +51,12 @@ _SECTIONS = 24
 
 
 class AffineForm(NamedTuple):
-    """A switching function ``factor`` d^k w/dt^k + ``offset`` with k = ``order``, 0 or 1.
+    """A switching function ``factor`` w + ``offset``.
 
     ``tolerance`` is that of a landing on its zero, ``mode`` the mode of the site from there on. The offset is -inf
     where the site's mode has no such function, so that it never crosses zero.
     """
 
-    order: int
     factor: float
     offset: float
     tolerance: float
@@ -110,7 +104,7 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
         # Function 0 is the onset on the side 1, function 1 that on the side -1.
         side = 1 - 2 * function
         gap = gap_of(site, side)
-        return AffineForm(order=0, factor=float(side), offset=-gap, tolerance=tolerance, mode=side * CLOSED)
+        return AffineForm(factor=float(side), offset=-gap, tolerance=tolerance, mode=side * CLOSED)
 
     side = side_of(site.mode)
     gap = gap_of(site, side)
@@ -118,26 +112,19 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
         # Its force has a kink at D, where the masses meet (function 0) or part (function 1).
         rises = 1 - 2 * function
         near = MOVED * site.tolerance
-        return AffineForm(order=0, factor=float(rises * side), offset=-rises * gap, tolerance=near, mode=site.mode)
+        return AffineForm(factor=float(rises * side), offset=-rises * gap, tolerance=near, mode=site.mode)
 
     if abs(site.mode) == RESTING:
         # Not on D itself, where the motion has as many roots as before the site came to rest.
         moved = MOVED * site.tolerance
         if function == 0:
-            return AffineForm(order=0, factor=float(-side), offset=gap - moved, tolerance=tolerance, mode=FREE)
-        return AffineForm(order=0, factor=float(side), offset=-gap - moved, tolerance=tolerance, mode=side * CLOSED)
+            return AffineForm(factor=float(-side), offset=gap - moved, tolerance=tolerance, mode=FREE)
+        return AffineForm(factor=float(side), offset=-gap - moved, tolerance=tolerance, mode=side * CLOSED)
 
-    # Closed or clipped: function 0 is the separation.
+    # Closed: function 0 is the separation, and there is no other.
     if function == 0:
-        return AffineForm(order=0, factor=float(-side), offset=gap, tolerance=tolerance, mode=FREE)
-    if not site.clip:
-        return AffineForm(order=1, factor=0.0, offset=-np.inf, tolerance=0.0, mode=site.mode)
-
-    # g = 1 + c w'/w'_minus falls through zero where clipping begins, and rises through it where it ends.
-    slope = site.damping / site.approach
-    if abs(site.mode) == CLIPPED:
-        return AffineForm(order=1, factor=slope, offset=1.0, tolerance=LANDED_G, mode=side * CLOSED)
-    return AffineForm(order=1, factor=-slope, offset=-1.0, tolerance=LANDED_G, mode=side * CLIPPED)
+        return AffineForm(factor=float(-side), offset=gap, tolerance=tolerance, mode=FREE)
+    return AffineForm(factor=0.0, offset=-np.inf, tolerance=0.0, mode=site.mode)
 
 
 @kernel
@@ -160,8 +147,8 @@ def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -
         least = _least_pull(contacts[i])
         return Switching(value=-motion[0] - least, rate=-motion[1], tolerance=0.5 * least, mode=FREE)
     form = _affine_form(contacts, i, function)
-    value = form.factor * motion[form.order] + form.offset
-    rate = form.factor * motion[form.order + 1]
+    value = form.factor * motion[0] + form.offset
+    rate = form.factor * motion[1]
     return Switching(value=value, rate=rate, tolerance=form.tolerance, mode=form.mode)
 
 
@@ -288,17 +275,14 @@ def first_change(
             form = _affine_form(contacts, i, function)
             if form.offset == -np.inf:
                 continue
-            # The coefficients of w' are 5 (b_k+1 - b_k)/h; an offset adds to every coefficient.
-            for k in range(6 - form.order):
-                if form.order == 0:
-                    c[k] = form.factor * b[k] + form.offset
-                else:
-                    c[k] = form.factor * 5.0 * (b[k + 1] - b[k]) / h + form.offset
+            # An offset adds to every coefficient.
+            for k in range(6):
+                c[k] = form.factor * b[k] + form.offset
             near = form.tolerance
             if contacts[i].rigid:
                 # A blow on another site may have left it a little beyond its stop: it lands where it comes back there.
                 near = max(near, c[0])
-            position = first_upcrossing_after_start(c[: 6 - form.order], near)
+            position = first_upcrossing_after_start(c, near)
             # Strictly less: of changes at one time that of the first site is landed on, and the others land with it.
             if position < first.position:
                 first = ModeChange(position=position, site=i, function=function)
@@ -390,6 +374,6 @@ def shortest_impact(contacts: np.ndarray) -> float:
     """Return least ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf for none."""
     shortest = np.inf
     for i in range(contacts.size):
-        if abs(contacts[i].mode) in (CLOSED, CLIPPED):
+        if abs(contacts[i].mode) == CLOSED:
             shortest = min(shortest, impact_time(contacts[i], abs(contacts[i].approach)))
     return shortest

@@ -32,10 +32,9 @@ ROUNDINGS = 1000 * float(np.finfo(float).eps)
 # PERMANENT and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
 FREE = 0
 CLOSED = 1
-CLIPPED = 2
-PERMANENT = 3
-RESTING = 4
-STUCK = 5
+PERMANENT = 2
+RESTING = 3
+STUCK = 4
 # A rigid site sticks where its next flight would take less than this fraction of the shortest period of the motion.
 SHORTEST_FLIGHT = 1e-6
 
@@ -285,8 +284,7 @@ def impact_time(site: Any, speed: float) -> float:
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
     """Return force on the host in N and dissipated power in W of site ``i``, at ``w`` in m and ``rate`` w' in m/s.
 
-    ``contacts`` (site,) are of dtype ``SITE``. The power of a clipped contact is given as 0: what it dissipates is the
-    change of its ``clipped_energy``.
+    ``contacts`` (site,) are of dtype ``SITE``.
     """
     site = contacts[i]
     if site.mode == FREE:
@@ -300,20 +298,8 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
         # The mode stays while the masses part and meet: the force itself has the kink at x = 0.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
 
-    if abs(site.mode) == CLIPPED:
-        return 0.0, 0.0
     elastic = elastic_force(site.elastic, x)
     g = 1.0 + site.damping * rate / site.approach
+    if site.clip:
+        g = max(g, 0.0)
     return side * elastic * g, side * elastic * (g - 1.0) * rate
-
-
-@kernel
-def clipped_energy(site: Any, w: float) -> float:
-    """Return the elastic energy in J at w in m of a ``SITE`` whose mode is ``CLIPPED``; 0 in any other mode.
-
-    No force gives this energy back to the masses: the contact dissipates all of it up to its separation.
-    """
-    if abs(site.mode) != CLIPPED:
-        return 0.0
-    side = side_of(site.mode)
-    return elastic_energy(site.elastic, side * w - gap_of(site, side))

@@ -15,15 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import LANDED_G, MOVED, Extremes, extremes, shortest_beginning, shortest_impact, switching
+from vipetsc.contact.changes import MOVED, Extremes, extremes, shortest_beginning, shortest_impact, switching
 from vipetsc.contact.law import (
-    CLIPPED,
     CLOSED,
     FREE,
     PERMANENT,
     RESTING,
     STUCK,
-    clipped_energy,
     contact_force,
     elastic_energy,
     elastic_force,
@@ -33,7 +31,7 @@ from vipetsc.contact.law import (
 )
 
 # What is counted of each site: landings on the clearance without an onset, onsets below the floor of the approach
-# velocity, contacts that were clipped, and contacts that pulled.
+# velocity, contacts that separated while clipped, and contacts that pulled.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
 # Blows of all sites at one instant beyond which the run fails. A row of n stuck masses comes to rest after some 3 n^3:
 # 1.5 million for 80 masses, which take 0.05 s.
@@ -106,13 +104,12 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
 
-    # A landing ends within a tolerance of w = D or g = 0. There the law, continued beyond its limit, has a small force
-    # that pulls, which is the error of the landing. Only a larger one counts: at x = -tolerance the pull is at most
-    # f(tolerance) (1 + c), since g is at most 1 + c; at g = -tolerance it is at most f(depth) times that.
+    # A landing ends within a tolerance of w = D. There the law, continued beyond its limit, has a small force that
+    # pulls, which is the error of the landing. Only a larger one counts: at x = -tolerance the pull is at most
+    # f(tolerance) (1 + c), since g is at most 1 + c.
     pull = -reached.smallest_force
     before_onset = (1.0 + site.damping) * elastic_force(site.elastic, site.tolerance)
-    beyond_clipping = LANDED_G * elastic_force(site.elastic, episode.indentation)
-    if pull > 0.0 and not track.pulls and pull > before_onset + beyond_clipping:
+    if pull > 0.0 and not track.pulls and pull > before_onset:
         track.pulls = True
         track.counts.pulled += 1
 
@@ -175,11 +172,7 @@ def switch_sites(
 
     ``impulses`` (sites,) in N s get what strikes the hosts of rigid sites at this instant, and their resonators the
     other way; the rows of ``motion`` of rigid sites are overwritten by what follows.
-    ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) in J are what the ledger has of each site: the energy
-    that it has dissipated so far, and of a clipped site the ``clipped_energy`` in addition. While a site is clipped
-    this sum is constant, since all of that energy is dissipated; this function changes it at both ends of the phase.
-    The loss of the phase is not integrated: by Hertz's law its power vanishes at the separation as the power 3/2 of the
-    time, which would take short steps where the motion, free of force, needs none.
+    ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) in J are what each site has dissipated so far.
     """
     switched = 0
     any_rigid = False
@@ -477,19 +470,16 @@ def _set_mode(
     had_episode = in_episode(site.mode)
     rested = abs(site.mode) == RESTING
 
-    # What the site has dissipated; the energy of a clipped phase depends on the mode, before and after.
-    energy = energies[i] - clipped_energy(site, motion[0])
+    energy = energies[i]
     site.mode = mode
-    energies[i] = energy + clipped_energy(site, motion[0])
-
     if not had_episode and in_episode(mode):
         _begin_episode(site, track, motion[0], motion[1], t, rested)
         # The loss of an episode is the difference of ``energy`` between its end and its beginning.
         track.episode.loss = -energy
     elif had_episode and not in_episode(mode):
+        # A force that has been cut off at zero is zero up to the separation, unless others turn the masses round.
+        track.counts.clipped += site.clip and site.damping * motion[1] / site.approach < -1.0
         _end_episode(site, track, tracks, energy, t)
-    elif abs(mode) == CLIPPED:
-        track.counts.clipped += 1
 
 
 class ImpactTracker:
@@ -546,9 +536,6 @@ class ImpactTracker:
         speed = np.array([_approach_speed(*motion) for motion in motions])
         sites["approach"][closed] = side * np.maximum(speed, law["floor"])
         sites["mode"][closed] = side * CLOSED
-        # Where g < 0 the law would pull.
-        clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][closed] < 0)
-        sites["mode"][closed[clipped]] = side[clipped] * CLIPPED
 
         episodes = tracked["episode"]
         episodes["site"][closed] = tracked["number"][closed]
@@ -556,13 +543,6 @@ class ImpactTracker:
         episodes["approach_velocity"][closed] = side * speed
         episodes["separation"][closed] = np.nan
         return closed
-
-    def clipped_energies(self, motion: np.ndarray) -> np.ndarray:
-        """Return the ``clipped_energy`` (sites,) in J of all sites at their ``motion`` (sites, 3)."""
-        energies = np.zeros(len(self.contacts))
-        for i in np.flatnonzero(np.abs(self.contacts["mode"]) == CLIPPED):
-            energies[i] = clipped_energy(self.contacts[i], motion[i, 0])
-        return energies
 
     @property
     def counts(self) -> np.ndarray:

@@ -153,15 +153,6 @@ def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
 
 
 @kernel
-def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
-    """Add an ``energy`` in J to what contacts have dissipated.
-
-    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
-    """
-    _add_one(sums, _DISSIPATED, energy, unit)
-
-
-@kernel
 def add_damping(sums: np.ndarray, energy: float, unit: float) -> None:
     """Add an ``energy`` in J to what dashpots have dissipated.
 

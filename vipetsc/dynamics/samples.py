@@ -8,9 +8,9 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
+from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import dashpot_power, select_piece, wall_energy
-from vipetsc.dynamics.energies import LARGEST, Energies, add_damping, add_energy, add_loss, add_powers, measure
+from vipetsc.dynamics.energies import LARGEST, Energies, add_damping, add_energy, add_powers, measure
 from vipetsc.dynamics.equation import acceleration
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
@@ -85,7 +85,6 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
             add_damping(samples.sums[k], lost, samples.unit)
     for i in range(samples.losses.shape[1]):
         samples.losses[k, i] = y[shape.dissipated + i]
-    _take_clipped(y, k, samples, contacts, rows)
 
     # By the number in the run, not in the block: blocks may begin anywhere, and a resumed run records the same samples.
     if number % samples.stride == 0:
@@ -95,22 +94,6 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
     if samples.watched.shape[0] > 0:
         _record_points(y, k, samples, contacts, rows)
     return _is_finite(samples, k)
-
-
-@kernel
-def _take_clipped(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
-    """Subtract from the losses of sample ``k`` the elastic energy that clipped sites still have.
-
-    They lose it up to their separation. ``contacts`` and their ``rows`` are as in ``take_sample``.
-    """
-    lattice = samples.lattice
-    for i in range(lattice.site_dofs.size):
-        column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
-        if column >= 0 and abs(contacts[rows[i]].mode) == CLIPPED:
-            w, _ = relative_motion(y, lattice.site_dofs, i)
-            energy = clipped_energy(contacts[rows[i]], w)
-            samples.losses[k, column] -= energy
-            add_loss(samples.sums[k], -energy, samples.unit)
 
 
 @kernel

@@ -27,9 +27,10 @@ one on (``may_rest``). ``vipetsc.contact`` says what force a site at rest has an
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel
-from vipetsc.contact.changes import ModeChange, extremes, first_change, stays_landed, switching
+from vipetsc.contact.changes import Extremes, ModeChange, extremes, first_change, stays_landed, switching
 from vipetsc.contact.law import CLOSED, PERMANENT, STUCK, begins_linearly, contact_force, gap_of, side_of
 from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
+from vipetsc.contact.tracker import Tracks, in_episode, update_episode
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
     accumulate_moments,
@@ -305,20 +306,18 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
 
 
 @kernel
-def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float, kind: int) -> None:
-    """Update the history of the contact of site ``i`` by a substep of so many ``seconds`` and a ``kind`` of nodes.
-
-    It has the largest indentation in m, the largest and smallest force on the host in N, positive where the contact
-    pushes, and their integral; the smallest one shows whether it has pulled.
-    """
+def _update_episode(cluster: Cluster, tracks: Tracks, trial: Trial, i: int, seconds: float, kind: int) -> None:
+    """Update the open episode of site ``i`` by a substep of so many ``seconds`` and a ``kind`` of nodes."""
+    if not in_episode(cluster.contacts[i].mode):
+        return
     start = cluster.site_motion[i]
     end = trial.site_motion[i]
-    history = cluster.history[i]
+    episode = tracks.sites[i].episode
     side = side_of(cluster.contacts[i].mode)
     if abs(cluster.contacts[i].mode) == STUCK:
-        history.force = max(history.force, max(start[0], end[0]))
+        episode.force = max(episode.force, max(start[0], end[0]))
         for node in range(NODES):
-            history.impulse -= seconds * cluster.nodes.weight[kind, node] * side * trial.force[i, node]
+            episode.impulse -= seconds * cluster.nodes.weight[kind, node] * side * trial.force[i, node]
         return
     depth = max(side * start[0], side * end[0]) - gap_of(cluster.contacts[i], side)
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
@@ -331,30 +330,28 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float, kin
         inside = -side * (trial.force[i, node] - cluster.contacts[i].preload)
         smallest = min(smallest, inside)
         largest = max(largest, inside)
-        history.impulse += seconds * cluster.nodes.weight[kind, node] * inside
+        episode.impulse += seconds * cluster.nodes.weight[kind, node] * inside
     # The costly search within the substep only where a turn lies inside.
     if largest > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         depth, force, smallest, _ = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
-    history.indentation = max(history.indentation, depth)
-    history.force = max(history.force, force)
-    history.smallest_force = min(history.smallest_force, smallest)
+    update_episode(cluster.contacts, tracks, i, Extremes(depth, force, smallest, 0.0))
 
 
 @inlined
-def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
+def _take(cluster: Cluster, tracks: Tracks, trial: Trial, substep: Substep) -> None:
+    """Take the substep of ``trial`` with its moments, energies and episodes; the cluster then stands at its end."""
     state = cluster.state[0]
     accumulate_moments(cluster, trial, substep)
     for i in trial.closed:
-        _update_extremes(cluster, trial, i, cluster.interval * substep.length, substep.kind)
+        _update_episode(cluster, tracks, trial, i, cluster.interval * substep.length, substep.kind)
     state.position += substep.length
     copy(trial.taylor, cluster.taylor)
     copy(trial.site_motion, cluster.site_motion)
 
 
 @kernel
-def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
-    """Advance a cluster to the first change of modes or to the step's end.
+def advance_cluster(cluster: Cluster, tracks: Tracks, may_rest: bool) -> tuple[int, int]:
+    """Advance a cluster, with the ``tracks`` of its sites, to the first change of modes or to the step's end.
 
     Returns how it ended, and a site or -1. ``DONE``: at the step's end. ``CHANGED``: the cluster stands on a change of
     modes, and the caller switches the sites whose switching functions say so; the site is one that changes again before
@@ -412,7 +409,7 @@ def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
             # Judged only now: a force continued beyond its end is no smooth function.
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
-            _take(cluster, trial, substep)
+            _take(cluster, tracks, trial, substep)
         # A substep that was rejected is repeated without a search, too.
         blind = leads_nowhere
         if landed:

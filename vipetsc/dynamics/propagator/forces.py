@@ -17,18 +17,8 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import STUCK, clipped_energy, impact_time
-from vipetsc.contact.tracker import (
-    LIMITS,
-    ImpactTracker,
-    Tracks,
-    in_episode,
-    rest_site,
-    switch_sites,
-    update_episode,
-    with_room,
-)
+from vipetsc.contact.law import impact_time
+from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, in_episode, rest_site, switch_sites, with_room
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, RESTS, advance_cluster
@@ -58,33 +48,16 @@ FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY),
 
 
 @kernel
-def _update_open_episodes(contacts: np.ndarray, histories: np.ndarray, tracks: Tracks) -> None:
-    """Bring the open episodes of ``contacts`` (site,) up to date with their ``histories`` of dtype ``HISTORY``."""
-    for i in range(contacts.size):
-        if in_episode(contacts[i].mode):
-            history = histories[i]
-            if contacts[i].rigid:
-                tracks.sites[i].episode.force = history.force
-                tracks.sites[i].episode.impulse = history.impulse
-                continue
-            reached = Extremes(history.indentation, history.force, history.smallest_force, history.impulse)
-            update_episode(contacts, tracks, i, reached)
-            tracks.sites[i].episode.impulse = history.impulse
-
-
-@kernel
 def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     """Switch the sites of a cluster that have landed, ``now`` in s; sets the length of the next substep."""
     contacts = cluster.contacts
     state = cluster.state[0]
-    # Before the switch: an episode that ends takes its extremes along.
-    _update_open_episodes(contacts, cluster.history, tracks)
     had_contact = cluster.trial.sums.had_contact
     for i in range(contacts.size):
         had_contact[i] = in_episode(contacts[i].mode)
     impulses = cluster.trial.sums.impulses
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, impulses, now)
-    _apply_impulses(cluster, tracks, impulses)
+    _apply_impulses(cluster, impulses)
 
     all_free = True
     for i in range(contacts.size):
@@ -97,7 +70,7 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
 
 
 @kernel
-def _apply_impulses(cluster: Cluster, tracks: Tracks, impulses: np.ndarray) -> None:
+def _apply_impulses(cluster: Cluster, impulses: np.ndarray) -> None:
     """Add what has struck rigid sites, ``impulses`` (site,) on their hosts in N s, to the motion from here on.
 
     They add to the series of the free motion as to the moments: a force F in the time dt does so as the impulse F dt.
@@ -120,10 +93,6 @@ def _apply_impulses(cluster: Cluster, tracks: Tracks, impulses: np.ndarray) -> N
         if contacts[i].rigid and impulses[i] != 0.0:
             # To the last bit, so that what has been turned does not approach by its rounding.
             cluster.taylor[i, 1] = cluster.site_motion[i, 1] * cluster.interval
-        if abs(contacts[i].mode) == STUCK:
-            episode = tracks.sites[i].episode
-            cluster.history[i].force = episode.force
-            cluster.history[i].impulse = episode.impulse
 
 
 @kernel
@@ -132,13 +101,8 @@ def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
     if cluster.contacts[i].rigid:
         return  # what is stuck has no first moment that is brief
     duration = impact_time(cluster.contacts[i], abs(cluster.contacts[i].approach))
-    history = cluster.history[i]
-    history.onset = now
-    history.duration = duration
-    history.indentation = 0.0
-    history.force = 0.0
-    history.smallest_force = 0.0
-    history.impulse = 0.0
+    cluster.history[i].onset = now
+    cluster.history[i].duration = duration
     state = cluster.state[0]
     state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
 
@@ -158,7 +122,7 @@ def follow_contacts(cluster: Cluster, tracks: Tracks, begin: float) -> tuple[boo
     # compile the call twice for a variable that begins as False, once for the constant.
     landings_nowhere = 0
     for _ in range(MOST_CHANGES):
-        outcome, site = advance_cluster(cluster, landings_nowhere > 0)
+        outcome, site = advance_cluster(cluster, tracks, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
 
@@ -167,10 +131,9 @@ def follow_contacts(cluster: Cluster, tracks: Tracks, begin: float) -> tuple[boo
         if outcome == CHANGED:
             _switch(cluster, tracks, now)
         else:
-            _update_open_episodes(cluster.contacts, cluster.history, tracks)
             impulses = cluster.trial.sums.impulses
             rest_site(cluster.contacts, tracks, site, cluster.site_motion, cluster.energy, impulses, now)
-            _apply_impulses(cluster, tracks, impulses)
+            _apply_impulses(cluster, impulses)
         landings_nowhere += outcome == CHANGED and site >= 0
     return False, tracks
 
@@ -225,8 +188,6 @@ class Forces:
         clusters = self.clusters
         clusters.energy[self._numbers == -1] = energy
         for i in self.tracker.begin(motion).tolist():
-            w = motion[self._numbers[i], 0]
-            clusters.energy[i] = clipped_energy(clusters.contacts[i], w)
             # As if the contact were old: its force is smooth.
             duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
             clusters.history["onset"][i] = -duration
@@ -264,10 +225,7 @@ class Forces:
 
     def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Return episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
-        if unfinished:
-            _update_open_episodes(self.clusters.contacts, self.clusters.history, self.tracker.tracks)
-        losses = self.clusters.energy - self.tracker.clipped_energies(self.clusters.site_motion)
-        episodes = self.tracker.take_episodes(losses, unfinished)
+        episodes = self.tracker.take_episodes(self.clusters.energy, unfinished)
         return episodes[self._logs_number[episodes["site"]]]
 
     def statistics(self) -> dict[str, Any]:

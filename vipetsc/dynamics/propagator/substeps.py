@@ -28,10 +28,8 @@ of substeps that end beside a change or with a kink inside, and of those taken a
 SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
 """A nonlinear spring: what its force has beyond the linear part; the size in m of elongations."""
 
-HISTORY = np.dtype(
-    [(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force", "impulse")]
-)
-"""A site's contact: its onset and expected duration in s, its extremes so far in m and N, its impulse so far in N s."""
+HISTORY = np.dtype([("onset", float), ("duration", float)])
+"""A site's contact: its onset and expected duration in s."""
 
 
 class Substep(NamedTuple):

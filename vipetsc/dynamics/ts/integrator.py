@@ -172,7 +172,6 @@ class Integrator(Engine):
         self.layout.place(cells, energy, self.state.array)
         self.tracker.begin(motion)
         self._restart(True)
-        self._put_losses(self.tracker.clipped_energies(self.tracker.start))
 
     def fill(self, samples: Samples) -> FillResult:
         """Go on through ``samples`` and take them; a sample at which it stops is not taken."""
@@ -440,8 +439,7 @@ class Integrator(Engine):
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """Return episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
-        losses = self.layout.losses(self.state.array_r) - self.tracker.clipped_energies(self.tracker.start)
-        episodes = self.tracker.take_episodes(losses, unfinished)
+        episodes = self.tracker.take_episodes(self.layout.losses(self.state.array_r), unfinished)
         return episodes[np.isin(episodes["site"], self.layout.sites)]
 
     def statistics(self) -> dict[str, Any]:
