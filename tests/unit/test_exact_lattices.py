@@ -12,7 +12,12 @@ import pytest
 from tests.exact_lattices import exponential, unlike_lattice
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.clusters import apply_impulses, create_dof_tables, create_responses, expand_free_motion
+from vipetsc.dynamics.propagator.dof_tables import (
+    apply_impulses,
+    create_dof_tables,
+    create_responses,
+    expand_free_motion,
+)
 from vipetsc.dynamics.propagator.groups import group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange

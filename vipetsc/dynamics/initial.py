@@ -33,11 +33,11 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
         y = local.array
         site_dofs = setup.engine.lattice.site_dofs
         sums = meter.sums(y)
-        relative = np.array([relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))])
+        relative = np.array([relative_motion(y, site_dofs, i) for i in range(len(layout.acting_sites))])
 
     # A site between two ranks comes from both, with the same bits.
     motion = np.zeros((len(setup.model.chain.sites), 2))
-    of_rank = np.array(layout.contacts, np.int64), relative.reshape(-1, 2)
+    of_rank = np.array(layout.acting_sites, np.int64), relative.reshape(-1, 2)
     for numbers, rows in layout.comm.allgather(of_rank):
         motion[numbers] = rows
     _check_stops(setup.model, motion)

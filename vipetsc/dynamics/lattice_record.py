@@ -98,7 +98,7 @@ def create_record(model: Model, layout: Layout) -> Record:
         couplings=couplings,
         spring_ends=np.lexsort((-couplings["sign"], couplings["spring"])),
         site_dofs=create_site_dofs(model, layout),
-        contacts=site_records(model, layout.contacts),
+        contacts=site_records(model, layout.acting_sites),
         drives=drives,
         spring_laws=laws,
         inverse_masses=inverse_masses,

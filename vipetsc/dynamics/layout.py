@@ -30,7 +30,7 @@ class Layout:
     Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
-    numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``per_cell`` components,
+    numbers of the owned sites, ``acting_sites`` of all that act on its masses. A cell has ``per_cell`` components,
     as a ghost ``ghost_rows``. With ``dashpots`` a damped lattice is ``damped``: its ghosts have velocities, and
     ``create_record`` has its dashpots. Where ``integrates_damping`` is true, too, each cell of it has one more
     component, the energy that its dashpots have dissipated.
@@ -58,11 +58,11 @@ class Layout:
         self.start, self.stop = self.ranges[comm.rank].tolist()
         self.owned = self.stop - self.start
         self.size = int(sizes[comm.rank])
-        self.sites, self.contacts = _sites_within(chain, self.start, self.stop)
+        self.sites, self.acting_sites = _sites_within(chain, self.start, self.stop)
         self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
         self.dissipated = self.per_cell * self.owned + len(self.drives)
         # Asked for at every change of a contact.
-        self._is_own = np.isin(self.contacts, self.sites)
+        self._is_own = np.isin(self.acting_sites, self.sites)
 
     def neighbours(self) -> tuple[int, int]:
         """Return the cells next to this rank's on the left and right, ``WALL`` or ``NOTHING``, as on an empty rank."""
@@ -127,7 +127,7 @@ class Layout:
 
         ``y`` (component,) is the rank's part of the state.
         """
-        losses = np.zeros(len(self.contacts))
+        losses = np.zeros(len(self.acting_sites))
         losses[self._is_own] = y[self.dissipated : self.size]
         return losses
 

@@ -16,8 +16,8 @@ class PointMotion:
     """The motion of ``points`` of a ``chain``.
 
     ``watched`` (own point, 2) are cell and mass of those in this rank's cells, which are counted from its first one on.
-    ``pushes`` (push, 3) say which contacts act on them: the own point, the contact's place among ``Layout.contacts``,
-    and 1 where the point is its host, -1 where it is its resonator.
+    ``pushes`` (push, 3) say which contacts act on them: the own point, its place among ``Layout.acting_sites``, and
+    1 where the point is its host, -1 where it is its resonator.
     """
 
     def __init__(self, points: list[PointTable], chain: Chain, layout: Layout) -> None:
@@ -29,7 +29,7 @@ class PointMotion:
         self._comm = layout.comm
 
         acting = contacts(chain)
-        own_contacts = np.array(layout.contacts, np.int64)
+        own_contacts = np.array(layout.acting_sites, np.int64)
         pushes = []
         for point, place in enumerate((cells * layout.dofs + masses)[is_own].tolist()):
             for sign, ends in ((1, acting.start), (-1, acting.end)):

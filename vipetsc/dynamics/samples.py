@@ -57,7 +57,7 @@ class Samples(NamedTuple):
 def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
     """Store the rank's part ``y`` (component,) of the state, ghosts up to date, as sample ``k``; whether it is finite.
 
-    ``contacts`` of dtype ``SITE`` have the modes of the sites; ``rows`` (site,) are those of ``Layout.contacts``.
+    ``contacts`` of dtype ``SITE`` have the modes of the sites; ``rows`` (site,) are those of ``Layout.acting_sites``.
     """
     shape = samples.lattice.shape
     drives = samples.lattice.drives

@@ -93,9 +93,9 @@ def _describe_rigid_sites(sites: np.ndarray, numbers: np.ndarray, model: Model) 
 
 
 def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:
-    """Return records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``."""
+    """Return records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.acting_sites``."""
     elements = contacts(model.chain)
-    chosen = np.array(layout.contacts, np.int64)
+    chosen = np.array(layout.acting_sites, np.int64)
     site_dofs = np.zeros(len(chosen), SITE_DOFS)
     for name, masses in (("host", elements.start[chosen]), ("resonator", elements.end[chosen])):
         ends = site_dofs[name]
@@ -105,7 +105,7 @@ def create_site_dofs(model: Model, layout: Layout) -> np.ndarray:
         ends["cell"] = np.where(is_own, cells - layout.start, -1)
         ends["mass"] = np.where(masses >= 0, mass, -1)
 
-    owned = np.isin(layout.contacts, layout.sites)
+    owned = np.isin(layout.acting_sites, layout.sites)
     site_dofs["ledger"] = np.where(owned, layout.dissipated + np.cumsum(owned) - 1, -1)
     return site_dofs
 

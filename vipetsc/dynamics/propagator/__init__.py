@@ -18,9 +18,9 @@ which the rows of P sum to less than the tolerance. Both bounds and the entries 
 ``truncation``. Since theta <= 3.2, no term exceeds the result by much, and the series is as good as rounding allows
 (Moler and Van Loan 2003). Cells at least r from an end have one stencil in common; the others have rows of their own.
 
-**2. Free motion of the contact DoFs** (``series``, ``clusters``). A DoF x = c u is a driven mass's displacement or the
-relative displacement w of a site, of two masses in one cell or in neighbouring ones, or of a mass to ground: c has an
-entry for each end, so that a force on w acts at both. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k
+**2. Free motion of the contact DoFs** (``series``, ``dof_tables``). A DoF x = c u is a driven mass's displacement or
+the relative displacement w of a site, of two masses in one cell or in neighbouring ones, or of a mass to ground: c has
+an entry for each end, so that a force on w acts at both. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k
 beforehand: a site with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola:
 on the side sigma one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and
 such steps converge to the first one.
@@ -46,7 +46,7 @@ substeps end there, too.
 At a rigid stop an impulse J adds G_il(s - s_J) J to x_i, as a force in a time dt adds G_il F dt. A site that sticks has
 w'' = 0, by which its reaction follows: R/mu = -a'' - integral of G'' R, an equation of the second kind.
 
-**5. What forces leave in the lattice** (``clusters``). K and M are symmetric, and so is (-A)^m M^-1: the motion
+**5. What forces leave in the lattice** (``dof_tables``). K and M are symmetric, and so is (-A)^m M^-1: the motion
 after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
 the moments mu_k = integral of F (1 - s)^k dt over the step,
 
@@ -54,7 +54,7 @@ the moments mu_k = integral of F (1 - s)^k dt over the step,
 
 in the cells within r. Nothing else of the forces' history is needed.
 
-**6. Clusters and ranks** (``clusters``, ``stencil``). DoFs within r cells of one another, counted from any cell that
+**6. Clusters and ranks** (``dof_tables``, ``stencil``). DoFs within r cells of one another, counted from any cell that
 they have a mass in, must be solved for together: they are a group, and on a rank that feels it a cluster. Every rank
 that owns a cell within r of a cluster advances it, from the same numbers to the same bits, so that ranks communicate
 only by one exchange of ``HaloRegions`` per step. ``engine`` weighs a step's cost against the size of its
@@ -92,9 +92,9 @@ masses: ``step_choice`` compares the two.
 
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
 of them count, and how far. ``groups``: contact DoFs and their groups. ``step_choice``: the length of a step.
-``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
+``taylor``: values of the series. ``stencil``: P on a rank's cells. ``dof_tables``: tables of contact DoFs. ``nodes``:
 tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
-``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
+``advance``: substeps up to a change of modes. ``clusters``: changes up to the step's end. ``engine``: steps up to the
 sample.
 
 References

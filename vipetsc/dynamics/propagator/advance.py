@@ -3,7 +3,7 @@
 A step (sec. 4 of the derivation in the package's docstring) is a chain of substeps: collocate one of a length that
 seems right (sec. 3), search it for the first time at which a site changes its mode, and if there is one, repeat the
 substep so that it ends there, since the force law inside a substep must be smooth. Then judge its error, take it or try
-a shorter one. ``advance_cluster`` returns at each change, where its caller ``forces.follow_contacts`` switches the
+a shorter one. ``advance_cluster`` returns at each change, where its caller ``clusters.follow_contacts`` switches the
 site, and at the end of the step. While no site is closed, no drive is on and there is no nonlinear spring, the motion
 is a polynomial and the cluster goes to its first onset at once (sec. 2). Contacts that touch or are pressed at rest,
 of mode ``PERMANENT``, change no mode; substeps end where they open or close, too, on a *kink* of

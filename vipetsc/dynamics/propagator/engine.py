@@ -21,8 +21,8 @@ from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
-from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
-from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
+from vipetsc.dynamics.propagator.clusters import Clusters, follow_contacts
+from vipetsc.dynamics.propagator.dof_tables import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.substeps import Cluster
@@ -54,11 +54,11 @@ class States(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What a rank can go back to: the ``steps`` done, its ``state`` (component,), the checkpoint of its ``forces``."""
+    """What a rank can go back to: the ``steps`` done, its ``state`` (component,), a checkpoint of its ``clusters``."""
 
     steps: int
     state: np.ndarray
-    forces: dict[str, np.ndarray]
+    clusters: dict[str, np.ndarray]
 
 
 @kernel
@@ -175,7 +175,7 @@ class Propagator(Engine):
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
-        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
+        self._clusters = on_every_rank(layout.comm, lambda: Clusters(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
         for cell in layout.ghosts:
             self._regions.add(cell, 1)
@@ -205,7 +205,7 @@ class Propagator(Engine):
 
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self._layout.place(cells, energy, self._components[0])
-        self._forces.begin(motion, energy)
+        self._clusters.begin(motion, energy)
 
     def fill(self, samples: Samples) -> FillResult:
         """Fill ``samples`` as ``Engine`` says; without room, go to the sample before the first. All ranks must call it.
@@ -218,7 +218,7 @@ class Propagator(Engine):
         # The log has no episode then: it has just been taken, or nothing has happened yet.
         if comm.size > 1 and self._saved is None:
             state = self._components[self.steps % 2].copy()
-            self._saved = Saved(steps=self.steps, state=state, forces=self._forces.checkpoint())
+            self._saved = Saved(steps=self.steps, state=state, clusters=self._clusters.checkpoint())
         self._go_to((samples.number + len(samples.work) - 1) * parts, samples)
 
         # The earliest failure of a rank, and any rank's request, count on all.
@@ -239,37 +239,37 @@ class Propagator(Engine):
 
     def _go_to(self, last: int, samples: Samples) -> None:
         """Go on to the step ``last`` and take the ``samples`` on the way; all ranks must call it."""
-        forces = self._forces
+        clusters = self._clusters
         progress = self._record.progress[0]
         progress["last"] = last
         progress["failed"] = NEVER
         progress["cluster"] = -1
-        tracks = forces.tracker.tracks
+        tracks = clusters.tracker.tracks
         with PROPAGATOR:
             error, log = take_steps(
                 self._record,
                 self._stencil,
                 self._halo,
-                forces.dofs,
-                forces.clusters,
-                forces.each,
+                clusters.dofs,
+                clusters.record,
+                clusters.each,
                 tracks,
                 Record(samples),
             )
         if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")
-        forces.tracker.tracks = tracks._replace(log=log)
+        clusters.tracker.tracks = tracks._replace(log=log)
 
     def _first_reason(self) -> str:
         """Return the reason of the first failure; all ranks must call it."""
         progress = self._record.progress[0]
         cluster = int(progress["cluster"])
         reason = "the state is not finite"
-        acting = self._forces.describe(cluster)
+        acting = self._clusters.describe(cluster)
         if acting:
             reason = f"{acting} at {progress['time']:.9g} s"
         # Of several clusters in one step the first of the lattice counts, as on one rank, which follows them in order.
-        place = int(progress["failed"]), self._forces.first_cell(cluster)
+        place = int(progress["failed"]), self._clusters.first_cell(cluster)
         _, reason = min(self._layout.comm.allgather((place, reason)))
         return reason
 
@@ -280,7 +280,7 @@ class Propagator(Engine):
         """
         self._components[saved.steps % 2] = saved.state
         self._record.progress["steps"] = saved.steps
-        self._forces.restore(self._layout.comm.allgather(saved.forces))
+        self._clusters.restore(self._layout.comm.allgather(saved.clusters))
         steps, in_contact = divmod(failed, 2)
         self._go_to(steps, samples)
         if in_contact:
@@ -295,7 +295,7 @@ class Propagator(Engine):
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         # Steps that are repeated from before would log these episodes once more.
         self._saved = None
-        return self._forces.take_episodes(unfinished)
+        return self._clusters.take_episodes(unfinished)
 
     def statistics(self) -> dict[str, Any]:
         """Return linear steps and what the clusters did, the step and its band."""
@@ -308,14 +308,14 @@ class Propagator(Engine):
             "nonzeros": int(np.count_nonzero(series.interior())),
             "truncation": series.truncation,
         }
-        return {"steps": self.steps} | self._forces.statistics() | band
+        return {"steps": self.steps} | self._clusters.statistics() | band
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         state = self._layout.checkpoint(self._components[self.steps % 2])
-        return state | {"steps": np.array(self.steps)} | self._forces.checkpoint()
+        return state | {"steps": np.array(self.steps)} | self._clusters.checkpoint()
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        self._forces.restore(checkpoints)
+        self._clusters.restore(checkpoints)
         steps = int(checkpoints[0]["steps"])
         self._saved = None
         self._layout.restore(checkpoints, self._components[steps % 2])

@@ -86,10 +86,10 @@ class Integrator(Engine):
         self.comm = layout.comm
         self.layout = layout
         self.lattice = create_record(model, layout)
-        self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
+        self.tracker = ImpactTracker(self.lattice.contacts, layout.acting_sites)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "missed", "switches"), 0)
-        self._logged = np.isin(layout.contacts, layout.sites)  # other ranks log the others
-        self._rows = np.arange(len(layout.contacts))
+        self._logged = np.isin(layout.acting_sites, layout.sites)  # other ranks log the others
+        self._rows = np.arange(len(layout.acting_sites))
         self._stop = stop or StopRequest()
         self._any_open = False
         # Whether the next step begins at an onset, after which a force is not smooth in time.

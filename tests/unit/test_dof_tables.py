@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.conftest import small_case
 from tests.unit.propagator_parts import chain_parts
-from vipetsc.dynamics.propagator.clusters import create_dof_tables, create_responses, expand_free_motion
+from vipetsc.dynamics.propagator.dof_tables import create_dof_tables, create_responses, expand_free_motion
 from vipetsc.dynamics.propagator.groups import Groups, group_dofs
 from vipetsc.dynamics.propagator.stencil import exchange
 
