@@ -10,6 +10,7 @@ from tests.models import CLEARANCE, four_band_contact
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, four_band
 from vipetsc.lattice.compliance.moments import SeriesCompliance
+from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
@@ -41,7 +42,8 @@ def condensed_breather(
     cells: int, site: int, omega: float, truncation: float = 1e-8, **options: Any
 ) -> tuple[ConservativeMotions, Point]:
     """The problem and the breather of ``omega`` in rad/s at the only contact, in cell ``site`` (counted from 1)."""
-    chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (CLEARANCE,))
+    cell = four_band("calibrated")
+    chain = Chain(cell, cells, "fixed", sites_at([site - 1], cell.pair, clearances=CLEARANCE))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
     forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
     problem = ConservativeMotions(SeriesCompliance(chain), forces, control)

@@ -122,7 +122,8 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
     """A lattice of a million cells needs at most twice the frequencies of one of 300 cells."""
     counts = {}
     for cells in (300, 1_000_000):
-        chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (CLEARANCE,))
+        cell = four_band("calibrated")
+        chain = Chain(cell, cells, "fixed", sites_at([cells // 3], cell.pair, clearances=CLEARANCE))
         compliance = CountedCompliance(chain)
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
         problem = ConservativeMotions(compliance, SiteForces([Stops.both(HERTZ, CLEARANCE)]), control)
