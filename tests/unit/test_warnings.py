@@ -10,7 +10,6 @@ from vipetsc.case import Case
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.wave_at_sites import wave_over_clearance
 from vipetsc.lattice import Contact
-from vipetsc.lattice.sites import Pair, sites_at
 
 SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband-one-site", "packet", "chirp",
           "disorder", "prediction", "law", "optimise-gate")  # fmt: skip

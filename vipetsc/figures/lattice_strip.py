@@ -12,8 +12,8 @@ from vipetsc.lattice import Chain
 def draw_lattice(axes: Axes, chain: Chain, drive_cell: float) -> None:
     """Draw the lattice as a strip: its ends, drive and contacts with their cells and clearances.
 
-    ``drive_cell`` is 0-based, and lies beyond the last cell where a wall moves. Cells have a width of 1 on the axis, and
-    the strip a height of 1.
+    ``drive_cell`` is 0-based, and lies beyond the last cell where a wall moves. Cells have a width of 1 on the axis,
+    and the strip a height of 1.
     """
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
