@@ -108,8 +108,10 @@ class Chain:
     def has_own_pairs(self) -> bool:
         """Whether a contact joins other masses than its cell's pair, or two contacts are in one cell."""
         table = self.sites.table
-        own = (table["host"] != self.cell.host) | (table["resonator"] != self.cell.resonator) | (table["offset"] > 0)
-        return bool(own.any()) or len(np.unique(table["cell"])) < len(table)
+        differs = (
+            (table["host"] != self.cell.host) | (table["resonator"] != self.cell.resonator) | (table["offset"] > 0)
+        )
+        return bool(differs.any()) or len(np.unique(table["cell"])) < len(table)
 
     def resonator_cells(self, topology: Topology | None = None) -> np.ndarray:
         """Return the cell (site,) of each site's resonator; cells follow each other as in ``topology``.
