@@ -114,14 +114,14 @@ def test_a_run_that_fails_on_one_of_three_ranks_ends_as_on_one():
 @pytest.mark.parallel(2)
 def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
     """An error of one rank in the set-up of the propagator is raised on all ranks."""
-    clusters = engine.Clusters
+    clusters = engine.SiteClusters
 
     def fail_on_rank_1(*arguments):
         if COMM.rank == 1:
             raise ValueError("no room")
         return clusters(*arguments)
 
-    monkeypatch.setattr(engine, "Clusters", fail_on_rank_1)
+    monkeypatch.setattr(engine, "SiteClusters", fail_on_rank_1)
     case = small_case(contacts={"sites": [5]}, time={"engine": "propagator"})
     with pytest.raises(ValueError, match="no room"):
         simulate(case, RunMemory(MPI.COMM_WORLD))

@@ -1,6 +1,6 @@
 """The forces of clusters of sites, nonlinear springs and driven masses within one linear step; their records and log.
 
-``Clusters`` keeps all clusters that a rank's cells feel (sec. 6 of the derivation in the package's docstring), and
+``SiteClusters`` keeps all clusters that a rank's cells feel (sec. 6 of the derivation in the package's docstring), and
 ``follow_contacts`` takes one of them through a step: ``advance`` carries it to the next change of a site's mode, the
 site is switched and the change is written in the log of impacts, until the step is over; the moments of the forces are
 then what the step adds to the lattice (sec. 5). A cluster that several ranks feel is followed by each of them, from the
@@ -138,7 +138,7 @@ def follow_contacts(cluster: Cluster, tracks: Tracks, begin: float) -> tuple[boo
     return False, tracks
 
 
-class Clusters:
+class SiteClusters:
     """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
 
     ``dofs`` are their tables, ``record`` that of all of them, ``each`` those of single ones, and ``tracker``

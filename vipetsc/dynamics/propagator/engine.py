@@ -21,7 +21,7 @@ from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
-from vipetsc.dynamics.propagator.clusters import Clusters, follow_contacts
+from vipetsc.dynamics.propagator.clusters import SiteClusters, follow_contacts
 from vipetsc.dynamics.propagator.dof_tables import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.step_choice import step_series
@@ -175,7 +175,7 @@ class Propagator(Engine):
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
-        self._clusters = on_every_rank(layout.comm, lambda: Clusters(model, layout, series, self._regions))
+        self._clusters = on_every_rank(layout.comm, lambda: SiteClusters(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
         for cell in layout.ghosts:
             self._regions.add(cell, 1)
