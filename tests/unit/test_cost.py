@@ -10,6 +10,8 @@ import pytest
 
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.cost import expected_episodes
+from vipetsc.dynamics.plan import choose_engine
+from vipetsc.lattice.sites import sites_at
 
 CYCLES = 10
 

@@ -11,7 +11,7 @@ from vipetsc.case import CaseError, NnmCase
 from vipetsc.case.bodies import bodies_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, Spring, UnitCell, fastest_speed, modes_of_a_cell, wave_bands, waves_at
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.modes.system import System
 
 INSIDE = {"start": 1, "end": 2, "stiffness": 5e3}
@@ -43,9 +43,9 @@ def test_a_cell_alone_has_modes_and_no_waves():
         assert waves_at(CELL, frequency) == ()
 
 
-def chain_of(pairs: tuple[Pair, ...]) -> Chain:
-    """Return two cells with contacts of these ``pairs`` in the first one."""
-    return Chain(CELL, 2, "free", sites=(0,) * len(pairs), clearances=(0.0,) * len(pairs), pairs=pairs)
+def bodies_with(pairs: list[Pair], gaps: list[tuple[float, float]]) -> list[int]:
+    """Return the bodies of two cells with contacts of these ``pairs`` in the first one."""
+    return bodies_of(Chain(CELL, 2, "free", sites=sites_at([0] * len(pairs), pairs, gaps=gaps)))
 
 
 def test_bodies_are_what_springs_and_pressed_contacts_hold_together():

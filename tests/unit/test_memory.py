@@ -11,7 +11,7 @@ from vipetsc.dynamics import memory, simulate
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import memory_needed
-from vipetsc.dynamics.plan import RunPlan
+from vipetsc.dynamics.plan import RunPlan, estimate
 
 HUGE = {"lattice": {"cells": 50_000_000}, "contacts": {"sites": [6], "clearance": 1e-4}}
 

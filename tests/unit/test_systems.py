@@ -9,7 +9,7 @@ from tests.models import four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 

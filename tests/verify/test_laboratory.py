@@ -7,7 +7,7 @@ from tests.conftest import DIFFERING, simulated, small_case
 from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair
 from vipetsc.studies.velocity_record import VelocityRecord
 
 

@@ -13,7 +13,7 @@ from tests.steady_states import motion_at
 from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
-from vipetsc.lattice.chain import Pair
+from vipetsc.lattice.sites import Pair, sites_at
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.response.condensation import stops_of
 from vipetsc.modes.response.state import Response
