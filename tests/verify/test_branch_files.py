@@ -103,4 +103,6 @@ def test_both_directions_are_two_branches(tmp_path):
         drawn = backbone([tmp_path / f"{name}.h5"]).get_axes()[0]
         assert drawn.get_xlim() == (min(expected), max(expected))
         curve = max((line.get_xdata() for line in drawn.lines), key=len)
-        assert np.abs(np.subtract.outer(expected, curve) / curve).min(axis=1).max() < 1e-12
+        distances = np.abs(np.subtract.outer(expected, curve) / curve)
+        assert distances.min(axis=1).max() < 1e-12
+        assert (np.diff(distances.argmin(axis=1)) > 0).all()

@@ -22,16 +22,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vipetsc.modes.balance.conservative import episodes_in_arc, fraction_closed
-from vipetsc.modes.balance.harmonic_balance import BalanceFrame, RealUnknowns
+from vipetsc.modes.balance.conservative import episodes_in_arc, folds, fraction_closed
+from vipetsc.modes.balance.harmonic_balance import BalanceFrame, RealUnknowns, check_frequency
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
 from vipetsc.modes.system import System
 
-# A frequency that changes by this factor, or its inverse, within one correction has left the branch.
-LARGE_FACTOR = 2.0
 # Step of the difference by which the energy's change along a branch is computed, in unknowns of order one.
 ALONG = 1e-6
 
@@ -63,8 +61,7 @@ class DampedFrame(BalanceFrame):
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
         """Return the residual (n + 1,) over the force of inertia of the size; raises FlowError at another frequency."""
-        if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
-            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
+        check_frequency(xi)
         x, zeta, omega = self.motion(xi)
         return np.append(self.modes.residual(x, zeta, omega) / self._force, self.modes.phase_row @ xi[:-2])
 
@@ -239,6 +236,4 @@ class DampedModes(RealUnknowns, OrbitProblem):
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Yield folds of the energy and of the frequency, between two motions that are not linear."""
-        if not self.forces.is_linear_at_rest or (left.episodes and right.episodes):
-            yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
-            yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
+        return folds(self.forces, left, right)

@@ -73,11 +73,18 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.case.nnm import NnmTable
-from vipetsc.modes.balance.harmonic_balance import MORE, BalanceFrame, Compliance, HarmonicBalance, order_needed
+from vipetsc.modes.balance.harmonic_balance import (
+    MORE,
+    BalanceFrame,
+    Compliance,
+    HarmonicBalance,
+    check_frequency,
+    order_needed,
+)
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
 
 # An episode centred on an end of the arc counts. Rounding may put its middle outside by up to 1e-9 rad at either end,
 # here as a part of the period.
@@ -126,6 +133,15 @@ def fraction_closed(series: ForceSeries) -> float:
     times = np.sort(np.array(intervals), axis=0)
     gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
     return float(times[-1, 1] - times[0, 0] - gaps) / (2 * np.pi)
+
+
+def folds(forces: SiteForces, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
+    """Yield folds of the energy and of the frequency between two motions under ``forces`` that are not linear."""
+    # Linear motions have one frequency at all energies: the test of a fold of the frequency would be rounding. A step
+    # into contact or out of it has a linear motion at one end; folds are then not sought, as in shooting.
+    if not forces.is_linear_at_rest or (left.episodes and right.episodes):
+        yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
+        yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
 
 def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -225,10 +241,6 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
     )
 
 
-# A frequency that changes by this factor, or its inverse, within one correction has left the branch.
-LARGE_FACTOR = 2.0
-
-
 class HarmonicFrame(BalanceFrame):
     """Unknowns ``xi`` (n + 1,) at and near the motion with the harmonics ``x`` (n,) in m and ``omega`` in rad/s.
 
@@ -262,12 +274,8 @@ class HarmonicFrame(BalanceFrame):
         return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """Return the residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
-
-        Raises FlowError where the frequency has changed by a factor of ``LARGE_FACTOR`` or more.
-        """
-        if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
-            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
+        """Return the residual (n,) at the unknowns ``xi`` (n + 1,) over the size; FlowError at another frequency."""
+        check_frequency(xi)
         return self.balance.residual(*self.motion(xi), self.shift) / self.size
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
@@ -405,12 +413,8 @@ class ConservativeMotions(OrbitProblem):
         frame = self._frame_at(balance, x, 2 * np.pi / point.period, float(np.abs(x).max()))
         if point.tangent.size:
             frame.tangent = unit(frame.direction(point))
-            # With another number of harmonics the point itself is corrected before a step is taken from it: else the
-            # corrections of the steps would contain the change of the harmonics, however short the steps are.
             if balance.order != point.order:
-                attempt = frame.correct(frame.xi, 0.0)
-                if attempt.converged:
-                    frame.xi = attempt.xi
+                frame.correct_here()
         return frame
 
     def _frame_at(self, balance: HarmonicBalance, x: np.ndarray, omega: float, size: float) -> HarmonicFrame:
@@ -432,11 +436,7 @@ class ConservativeMotions(OrbitProblem):
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Yield folds of the energy and of the frequency, between two motions that are not linear."""
-        # Linear motions have one frequency at all energies: the test of a fold of the frequency would be rounding. A
-        # step into contact or out of it has a linear motion at one end; folds are then not sought, as in shooting.
-        if not self.forces.is_linear_at_rest or (left.episodes and right.episodes):
-            yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
-            yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
+        return folds(self.forces, left, right)
 
     def refined(self, point: Point, keep_frequency: bool) -> Point:
         """Return motion of the frequency, or else of the amplitude, of ``point``, with as many harmonics as are needed.

@@ -49,7 +49,7 @@ from vipetsc.lattice import DenseCompliance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.newton import DenseNewton
-from vipetsc.modes.problem import Attempt, NoMotionError, unit
+from vipetsc.modes.problem import Attempt, FlowError, NoMotionError, unit
 
 # Radii, over the frequency, of circles on which Cauchy's formula gives the derivative of a real compliance. A smaller
 # one is taken where a pole is near a larger one.
@@ -557,6 +557,16 @@ def order_needed(
     return max(min(beyond // 2 * 2 + 1, order), fewest)
 
 
+# A frequency that changes by this factor, or its inverse, within one correction has left the branch.
+LARGE_FACTOR = 2.0
+
+
+def check_frequency(xi: np.ndarray) -> None:
+    """Raise FlowError where the last of the unknowns ``xi`` (n + 1,), a frequency near 1, has left the branch."""
+    if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
+        raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
+
+
 class BalanceFrame(ABC):
     """The equations of harmonic balance at and near one motion, in unknowns ``xi`` (n + 1,) of order one.
 
@@ -583,6 +593,15 @@ class BalanceFrame(ABC):
         # the predictor is the guess.
         predicted = self.xi + arclength * self.tangent
         return self.solve(guess, self.tangent, self.tangent @ predicted)
+
+    def correct_here(self) -> None:
+        """Correct the motion itself before a step is taken from it, where it has had other harmonics.
+
+        Else the corrections of the steps would contain the change of the harmonics, however short the steps are.
+        """
+        attempt = self.correct(self.xi, 0.0)
+        if attempt.converged:
+            self.xi = attempt.xi
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve for the motion with row . xi = value, (n + 1,); not converged after a NoMotionError."""

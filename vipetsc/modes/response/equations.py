@@ -243,12 +243,8 @@ class SteadyEquations(StatesWithStability):
         if states is self:
             return SteadyFrame(self, point.xi, point.tangent)
         frame = SteadyFrame(states, states.resized(point.xi), unit(states.resized(point.tangent)), whole=self)
-        # With other harmonics the state itself is corrected before a step is taken from it: else the corrections of
-        # the steps would contain the change of the harmonics, however short the steps are.
         if states is not self.of_state(point.xi):
-            attempt = frame.correct(frame.xi, 0.0)
-            if attempt.converged:
-                frame.xi = attempt.xi
+            frame.correct_here()
         return frame
 
     def tangent_near(self, point: Response, xi: np.ndarray) -> np.ndarray:
