@@ -142,10 +142,9 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
     [
         ({"each": {"restitution": [0.9, 0.4]}}, [1, 2]),
         ({"side": "plus"}, [1, 1]),
-        ({"pair": [0, 2]}, [1, 1]),
         ({"pair": [1, 1], "next_cell": True}, [1, 1]),
     ],
-    ids=["two restitutions", "one-sided", "ground", "next cell"],
+    ids=["two restitutions", "one-sided", "next cell"],
 )
 def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path):
     """Sites with laws or pairs of their own are predicted within the bounds of the small prediction.

@@ -24,7 +24,7 @@ from vipetsc.parallel import StoppedError
 
 pytestmark = pytest.mark.slow
 
-# One study of each verb: faults come through the frame that its studies share.
+# One study of each verb: claims of folders and faults come through the frame that its studies share.
 ONE_OF_EACH = list({scenario.verb.name: name for name, scenario in reversed(STUDIES.items())}.values())
 
 
@@ -84,6 +84,7 @@ def test_a_second_call_computes_nothing(name, whole, out):
     assert difference(whole.folder, out) == ""
 
 
+@pytest.mark.parametrize("name", ONE_OF_EACH, indirect=True)
 def test_results_are_resumed_only_where_there_are_some(name, tmp_path):
     with pytest.raises(FolderError, match="resume"):
         compute(name, tmp_path / "out", resume=True)
@@ -157,6 +158,7 @@ def test_damaged_records_are_computed_again(name, whole, out):
     assert difference(whole.folder, out) == ""
 
 
+@pytest.mark.parametrize("name", ONE_OF_EACH, indirect=True)
 def test_results_of_another_case_are_replaced_by_force_alone(name, whole, out):
     """They are refused, and named; ``--force`` keeps them beside the folder until the new ones are complete."""
     other = case_of(STUDIES[name], OTHERWISE[STUDIES[name].verb.name])
@@ -180,6 +182,7 @@ def test_results_of_another_case_are_replaced_by_force_alone(name, whole, out):
     assert difference(whole.folder, out) == ""
 
 
+@pytest.mark.parametrize("name", ONE_OF_EACH, indirect=True)
 def test_results_of_other_verbs_are_never_replaced(name, tmp_path):
     """Not even by ``--force``: neither those of another kind, nor files that belong to nobody."""
     kind = STUDIES[name].verb.results
