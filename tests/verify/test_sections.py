@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from vipetsc import Case, Sweep
 from vipetsc.dynamics.run import simulate
@@ -83,6 +84,41 @@ def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, follo
     assert simulate(again).dataset["displacement"].values[-1, 0, 0] == ends[order[1]][1][0]
     for before, after in pairwise(order):
         assert ends[after][0].tolist() == ends[before][1].tolist()
+
+
+def period_doubling(r: float) -> float:
+    """Return where the motion of x'' + x = sin(omega t), x <= 0, with one impact a period doubles its period.
+
+    Shaw and Holmes (1983): the map of deviations over a period has the determinant r^2; here -1 is one of its
+    multipliers where its trace is -(1 + r^2). With T = 2 pi/omega the force at the impact over the approach velocity is
+    (1 - omega^2) (1 + r) cot(T/2)/2, so that the trace is -2 r cos T + (1 + r)^2 (1 - omega^2) cos^2(T/2), and
+    cos^2(pi/omega) (omega^2 - ((1 - r)/(1 + r))^2) = 1.
+    """
+    return brentq(lambda w: np.cos(np.pi / w) ** 2 * (w**2 - ((1 - r) / (1 + r)) ** 2) - 1, 2.5, 2.8)
+
+
+@pytest.mark.parametrize(("restitution", "published"), [(0.8, 2.653348), (0.5, 2.658152)])
+def test_a_sweep_up_doubles_its_period_where_shaw_and_holmes_say(tmp_path, restitution, published):
+    """Rigid stop: up to 0.3 % below that frequency every period is alike, from 0.3 % above it every second one."""
+    onset = period_doubling(restitution)
+    assert onset == pytest.approx(published, abs=1e-6)
+    ratios = [0.99, 0.997, 1.003, 1.01]
+    contacts = {"law": "rigid", "restitution": restitution} | {
+        key: IMPACT["contacts"][key] for key in ("sites", "pair", "side", "clearance")
+    }
+    sweep = {"fields": True, "measures": ["motion"], "follow": "up"}
+    sweep["drive"] = {"frequency": [ratio * onset for ratio in ratios]}
+    table = IMPACT | {"contacts": contacts, "time": IMPACT["time"] | {"end": 1000.0}, "sweep": sweep}
+    assert run_sweep(Sweep.from_table(table), tmp_path, MPI.COMM_SELF).complete
+    parted = {}
+    for member, folder in whole_members(open_ensemble(tmp_path)):
+        with open_run(folder / "run.h5") as run:
+            (section,) = sections_of(run)
+        x = section.displacement[-40:]
+        assert np.ptp(x[::2]) < 1e-4
+        parted[round(float(member["frequency"]) / onset, 6)] = abs(x[-1] - x[-2])
+    assert max(parted[ratio] for ratio in ratios[:2]) < 1e-5
+    assert min(parted[ratio] for ratio in ratios[2:]) > 0.02
 
 
 def test_the_spectrum_of_a_sine_has_its_amplitude():
