@@ -5,7 +5,10 @@ call. A kernel that is given a ``Record`` gets one pointer instead, and reads a 
 words: ``record.field``. The memory holds numbers, and of an array its address and its shape. It does not change while
 the record lives; the numbers in its arrays do.
 
-A numba type of our own, by the documented interface for extensions (``numba.extending``).
+A numba type of our own, by the documented interface for extensions (``numba.extending``). Compiling the propagator for
+its first run takes 58 s of CPU, with named tuples 79 s. Sixteen small kernels with forty arrays: named tuple 7.2 s,
+structured array of addresses 3.9 s, records 5.5 s, ``structref`` 2.8 s, which counts references at each access. Steps
+of the propagator take 4 % more CPU than with tuples, those of ``ts`` 5 %; all results have the same bits.
 """
 
 import hashlib

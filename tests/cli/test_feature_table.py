@@ -35,7 +35,7 @@ from vipetsc.lattice import UnitCell
 PLAIN = next(feature for feature in FEATURES if feature.name == "burst")
 DEAR = {"optimise", "identify", "law", "predict", "nfrc", "wave", "condensed"}  # columns whose verbs take seconds
 EVERY = bool(os.environ.get("EVERY_FEATURE"))
-LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring"}
+LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring", "strip of the plane"}
 ENDS = {"free ends", "ring"}
 GRAINS = {"grains", "grains with resonators"}
 # Features that a verb accepts although they do not change its results. Linear modes have no drive and no dashpot, and
@@ -101,7 +101,7 @@ def picture_of_each_cell(monkeypatch):
     draw = registry.draw_bands
     drawn: dict[Any, Path] = {}
 
-    def draw_once(cell: UnitCell, path: Path, frequency: float | None) -> Path:
+    def draw_once(cell: UnitCell, path: Path, frequency: float | None, strip: object) -> Path:
         key = cell, frequency
         if key not in drawn:
             drawn[key] = draw(cell, path, frequency)
