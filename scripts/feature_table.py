@@ -263,7 +263,10 @@ FEATURES: tuple[Feature, ...] = (
     Feature("absorbing ends", _lattice(absorbing={"cells": 9, "strength": 1.0})),
     Feature("free ends", _lattice(ends="free")),
     Feature("ring", _lattice(ends="periodic")),
-    Feature("strip of the plane", _lattice(cell=None, strip={"rows": 2, "mass": 4e-3, "stiffness": 1e4})),
+    Feature(
+        "strip of the plane",
+        _lattice(cell=None, strip={"rows": 2, "kind": "triangular", "mass": 4e-3, "stiffness": 1e4}),
+    ),
     Feature(
         "one-sided stops",
         _contacts(side="plus"),

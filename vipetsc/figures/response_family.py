@@ -114,10 +114,10 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
         for part, text in zip(parts, texts, strict=True):
             part.append(text)
     texts = []
-    names = [str(curve.attrs["name"]) for curve in curves]
+    names = [str(curve.attrs.get("name", "")) for curve in curves]
     for part, curve in zip(parts, curves, strict=True):
         # A curve that was found from another one has the keys of that: the rest of its name tells them apart.
-        name = str(curve.attrs["name"])
+        name = str(curve.attrs.get("name", ""))
         origin = min((other for other in names if name.startswith(f"{other}-")), key=len, default=name)
         has_others = any(other.startswith(f"{name}-") for other in names)
         named = [*part, name[len(origin) + 1 :].replace("-", " ")]
