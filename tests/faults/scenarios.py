@@ -233,6 +233,7 @@ SAMPLES_A_CHUNK = 20
 OF_ONE_CALL = {
     "date": "when the file was written",
     "ranks": "which team of a sweep, of two ranks or one, was free for a member",
+    "revision": "the commit, if git answers in time",
     "cpu_seconds": "time that the call took",
     "sources": "hashes of files with a date in them",
 }
