@@ -93,7 +93,10 @@ def test_pictures_and_movies_show_the_cells(folder):
         kinetic = strips.Strip.of(run).kinetic(run["velocity"].values)
         np.testing.assert_array_equal(np.reshape(envelope, (10, 6)), kinetic.max(0))
         content = strips.wave_vectors(run, None).axes[0].images[0].get_array()
-        assert content.shape == (6, 10)
+        # Both ends of each axis are shown, which are one wave number.
+        assert content.shape == (7, 11)
+        np.testing.assert_array_equal(content[[0], :], content[[-1], :])
+        np.testing.assert_array_equal(content[:, [0]], content[:, [-1]])
         for quantity in ("energy", "velocity"):
             shot = Shot(quantity, width=640)
             film = strips.StripMovie(run, shot, check(run, shot))
