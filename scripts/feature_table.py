@@ -292,7 +292,13 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("restitutions of sites", _contacts(each={"restitution": [0.9, 0.7]})),
     Feature("law of a plugin", RUBBER, RUBBER),
-    Feature("rigid stops", _contacts(law="rigid", stiffness=None), _contacts(law="rigid", stiffness=None)),
+    Feature(
+        "rigid stops",
+        _contacts(law="rigid", stiffness=None),
+        _contacts(law="rigid", stiffness=None),
+        # Free motions have no loss at impacts.
+        dict.fromkeys(("reduced", "chain", "own", "condensed"), _contacts(restitution=1.0)),
+    ),
     Feature("contacts to ground", _contacts(pair=[0, 2]), _own_contacts((0, 0.2))),
     Feature("contacts between cells", _contacts(pair=[1, 1], next_cell=True)),
     Feature("several in a cell", _contacts(sites=[12, 12], each={"pair": [[1, 2], [0, 2]]})),

@@ -14,6 +14,19 @@ g-/+ being y' before and after it. Contact forces are continuous, g+ = g-: the s
 ends exactly on the change and each step uses one f'. The set of closed contacts is therefore frozen inside a step, so
 that the force is smooth there, each step is searched for its first change, and repeated so that it ends there.
 
+At a rigid stop, which conserves energy here, an impulse turns the velocity w' = h v of the contact with the row h,
+
+    v+ = P v-,    P = I - 2 mu M^-1 h^T h,    1/mu = h M^-1 h^T.
+
+Accelerations a depend on displacements alone, and are the same before and after it. With R = diag(I, P) the saltation
+matrix R + (R g- - g+) grad h^T/(grad h^T g-) takes variations (du, dv) to
+
+    du+ = P du-,    dv+ = P dv- + 2 mu M^-1 h^T (h a) (h du-)/w'-.
+
+It has no limit for w' -> 0, where the stop is grazed. Of two stops of one mass that are struck at one instant each
+order of the two has another derivative: there is none. A mass that is pressed on a stop without a speed stays there:
+it no longer moves as those equations say.
+
 **Steps** are those of Dormand and Prince's pair of order 8(5,3) (Hairer, Norsett and Wanner, Solving Ordinary
 Differential Equations I, 2nd ed. 1993, sec. II.5 and II.10, and the authors' code DOP853). Stage s is y + h sum_r
 A[s, r] k_r, the new state y + h sum_r B[r] k_r; E5 and E3 give the estimates of orders 5 and 3, which II.10 combines
@@ -56,6 +69,9 @@ MOST_LONGER = 100
 UNLIMITED = 2**62
 
 
+# Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed; the steps
+# that were allowed are done, and the flow can go on; rigid stops of one mass are struck together; one is pressed on.
+DONE, STUCK, FULL, PAUSED, TOGETHER, PRESSED = range(6)
 # Positions in a step of no change, and of a change that the interpolant cannot tell from a near miss.
 NONE = 2.0
 UNDECIDED = -1.0
@@ -65,6 +81,8 @@ DECIDED = 0.01
 ROUNDING = 16 * np.finfo(float).eps
 # The part of it at which a landing need not be improved.
 EXACT = 1 / 8
+# Contacts that are within so many of it are on their stops at one instant: landings of two of them differ by theirs.
+NEAR = 4.0
 
 
 class Change(NamedTuple):
@@ -109,14 +127,14 @@ def first_rise(gap: np.ndarray, tolerance: float, room: np.ndarray) -> float:
     return latest
 
 
-CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("elastic", ELASTIC)])
-"""A contact: its clearances in m on the sides + and -, inf where there is no stop; its elastic law.
+CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("rigid", bool), ("elastic", ELASTIC)])
+"""A contact: its clearances in m on the sides + and -, inf where there is no stop; if not ``rigid`` its elastic law.
 
 The clearance of a contact that is pressed at rest is negative, and it has no stop on the other side.
 """
 Shape = tuple[int, int, int]
 """Where ``restore`` puts forces, and how many: the first of their rows, the displacements n, the columns 1 + m."""
-# Kinds of changes in an arc's list of events.
+# Kinds of changes in an arc's list of events. An impact on a rigid stop is an onset, without a separation.
 ONSET = 1
 SEPARATION = -1
 # A step below this fraction of the arc's duration means that the flow is stuck: for a flow's ``_advance``.
@@ -256,6 +274,9 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
     for c in range(side.size):
         w = elongation(system.rows, c, y, 0, 0, system.inverse_mass.size)
         side[c] = 0
+        # A motion on a rigid stop is not beyond it, whatever its rounding.
+        if system.contacts[c].rigid:
+            continue
         if w > system.contacts[c].plus:
             side[c] = 1
         elif -w > system.contacts[c].minus:
@@ -310,6 +331,48 @@ def switch(step: FlowStep, change: Change) -> int:
     return SEPARATION
 
 
+@kernel
+def strike(step: FlowStep, change: Change, y: np.ndarray, dy: np.ndarray, near: float) -> int:
+    """Let the masses of a rigid contact part at their ``change``; returns ``DONE``, or why it has no derivative.
+
+    Column 0 of ``y`` (2n or more, 1 + m) is the state, the others are its variations; ``dy`` are their rates. Contacts
+    within ``near`` in m of a stop are on it.
+    """
+    system = step.system
+    n = system.inverse_mass.size
+    c = change.contact
+    mobility = 0.0
+    for i in range(n):
+        mobility += system.rows[c, i] ** 2 * system.inverse_mass[i]
+    rate = elongation(system.rows, c, y, n, 0, n)
+    acceleration = elongation(system.rows, c, dy, n, 0, n)
+    # Pressed, and so slow that it does not leave the stop again.
+    if change.sign * acceleration >= 0.0 and rate * rate <= 2.0 * abs(acceleration) * near:
+        return PRESSED
+
+    for j in range(y.shape[1]):
+        before = elongation(system.rows, c, y, 0, j, n)
+        impulse = 2.0 * elongation(system.rows, c, y, n, j, n) / mobility
+        if j > 0:
+            impulse -= 2.0 * before * acceleration / (rate * mobility)
+        for i in range(n):
+            moved = system.rows[c, i] * system.inverse_mass[i]
+            y[n + i, j] -= moved * impulse
+            if j > 0:
+                y[i, j] -= moved * 2.0 * before / mobility
+
+    for d in range(system.contacts.size):
+        if d == c or not system.contacts[d].rigid:
+            continue
+        shared = 0.0
+        for i in range(n):
+            shared += system.rows[c, i] * system.rows[d, i] * system.inverse_mass[i]
+        w = elongation(system.rows, d, y, 0, 0, n)
+        if shared != 0.0 and (abs(w - system.contacts[d].plus) <= near or abs(w + system.contacts[d].minus) <= near):
+            return TOGETHER
+    return DONE
+
+
 @dataclass(frozen=True)
 class ShootingMap:
     """Sections at which an arc starts and ends, and the fraction of the period that it takes.
@@ -362,6 +425,15 @@ MAPS = {
 }
 
 
+def map_between_impacts(odd: bool) -> ShootingMap:
+    """Return the map of orbits that strike rigid stops, where a motion turns: it has no impact at its start and end.
+
+    An ``odd`` system's orbits pass the centre halfway between two impacts. Other orbits rest on the side on which they
+    strike nothing, and have their impacts within a whole period from there on.
+    """
+    return MAPS["half-centre" if odd else "whole"]
+
+
 class Advance(NamedTuple):
     """What a flow's ``_advance`` gives: the ``state`` (2n, 1 + 2n) at the end, of the orbit and its variations.
 
@@ -403,6 +475,7 @@ class Flow(ABC):
         self.system = system
         contacts = np.zeros(len(system.contacts), CONTACT)
         contacts["plus"], contacts["minus"] = system.clearances.T
+        contacts["rigid"] = system.is_rigid
         contacts["elastic"] = elastic_records([pair.law for pair in system.contacts])
         self.compiled = CompiledSystem(
             inverse_mass=1 / np.asarray(system.masses, float),
@@ -454,6 +527,7 @@ class Flow(ABC):
 
         Raises FlowError if the time cannot be covered.
         """
+        self._check_start(start)
         y = self._variations.copy()
         y[:, 0] = start
         advance = self._advance(y, duration, period)
@@ -477,6 +551,15 @@ class Flow(ABC):
             closed=advance.closed,
             steps=advance.steps,
         )
+
+    def _check_start(self, start: np.ndarray) -> None:
+        """Raise FlowError where the state ``start`` (2n,) is beyond a rigid stop."""
+        if not self.system.has_rigid_stops:
+            return
+        u = start[: self.system.dofs]
+        beyond = self.system.gaps(u)[self.system.is_rigid].max()
+        if beyond > ROUNDING * (np.abs(u).max() + beyond):
+            raise FlowError(f"the orbit starts {beyond:.3g} m beyond a rigid stop")
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
         """Return the states (1 + count, 2n) of the orbit from ``start`` (2n,) on, every ``interval`` seconds.
@@ -621,9 +704,6 @@ def grown(h: float, error: float, largest: float) -> float:
     return min(largest, h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125)))
 
 
-# Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed; the steps
-# that were allowed are done, and the flow can go on.
-DONE, STUCK, FULL, PAUSED = range(4)
 # Contact changes of one arc beyond which a flow gives up: thirty times as many as the in-phase branch of the paper's
 # model (bilinear) has in a quarter period up to 5 J, 67.
 MOST_CHANGES = 2000
@@ -797,7 +877,15 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray,
             if progress.changes >= events.shape[0]:
                 outcome = FULL
                 break
-            _fill_event(events[progress.changes], t, change, switch(step, change))
+            kind = ONSET
+            if step.system.contacts[change.contact].rigid:
+                observe(step, stepper.start, stepper.stages[0], step.start)
+                outcome = strike(step, change, stepper.start, stepper.stages[0], NEAR * change.tolerance)
+                if outcome != DONE:
+                    break
+            else:
+                kind = switch(step, change)
+            _fill_event(events[progress.changes], t, change, kind)
             progress.changes += 1
             observe(step, stepper.start, stepper.stages[0], step.start)
 
@@ -892,7 +980,12 @@ class Dop853Flow(Flow):
             progress["pause"] = self.check(int(progress["steps"][0]))
             outcome = _flow_through(stepper, orbit, interval, states, self._events, progress)
         if outcome != DONE:
-            why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}
+            why = {
+                STUCK: "the step became too small",
+                FULL: f"more than {MOST_CHANGES} contact changes",
+                TOGETHER: "rigid stops that share a mass are struck at one instant, where the motion has no derivative",
+                PRESSED: "a mass is pressed on a rigid stop at no speed: it sticks there",
+            }
             count = progress["changes"][0]
             raise FlowError(f"the flow stopped after {count} contact changes in {interval:.6g} s: {why[outcome]}")
         return progress[0]

@@ -101,3 +101,7 @@ class OrbitProblem(PeriodicProblem[Point]):
         It is 0 at an equilibrium, and infinite where no rest of the orbit is known.
         """
         return np.inf
+
+    def has_corner(self, before: Point, after: Point) -> bool:
+        """Return whether the branch has a corner between two points, where no step is short enough for the guards."""
+        return False

@@ -79,7 +79,8 @@ class SpecialKind(Generic[S]):
     """A kind of special point: where ``test`` changes sign, by more than a ``floor`` on both sides.
 
     ``accept`` says whether a point that was found is of the kind, where the test alone does not tell. ``finish``
-    (point, left, right) adds the quantities that only such points have.
+    (point, left, right) adds the quantities that only such points have. A ``corner`` of the branch is the end
+    of a step at which the test is negative.
     """
 
     name: str
@@ -87,6 +88,18 @@ class SpecialKind(Generic[S]):
     floor: float = 0.0
     accept: Callable[[S], bool] | None = None
     finish: Callable[[S, S, S], S] | None = None
+    corner: bool = False
+
+
+@dataclass(frozen=True)
+class Corner(Generic[S]):
+    """A corner of a branch at a ``point``, whose tangent is that of the branch beyond.
+
+    The branch goes on as the point + s tangent + s^2 ``bend`` for small s >= 0, with tangent and bend (n + 1,).
+    """
+
+    point: S
+    bend: np.ndarray
 
 
 class Frame(Protocol[S]):
@@ -146,6 +159,10 @@ class PeriodicProblem(ABC, Generic[S]):
     def turn(self, before: S, after: S) -> float:
         """Return the angle in rad between the tangents of two points in relative units; 0 where there is one chart."""
         return 0.0
+
+    def turned_at_corner(self, point: S) -> Corner[S] | None:
+        """Return the corner of the branch at a ``point``; None where it has none."""
+        return None
 
     @abstractmethod
     def special_kinds(self, left: S, right: S) -> Iterator[SpecialKind[S]]:

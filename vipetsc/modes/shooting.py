@@ -38,7 +38,7 @@ from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.flow import MOST_LONGER, UNLIMITED, Arc, Flow, ShootingMap
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, StartError, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, Corner, FlowError, SpecialKind, StartError, unit
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
 from vipetsc.modes.system import ContactPair, System
@@ -227,6 +227,8 @@ ROUNDING = 8
 # If the smallest singular value of the derivative is below this fraction of the largest, there is a second null vector,
 # and the tangent is not unique.
 DEGENERATE = 1e-12
+# Part of the interval of two samples by which an arc to a touch ends before it.
+AHEAD = 0.01
 # Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
 # than ``TOUCH``.
 SAMPLES = 2000
@@ -527,10 +529,69 @@ class Shooting(OrbitProblem):
 
     def grazing(self, point: Point) -> list[int]:
         """Return numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
-        start = self.arc(point.x, point.period).start
-        interval = self.map.fraction * point.period / SAMPLES
-        u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
-        return grazing_contacts(self.system, u)
+        arc = self.arc(point.x, point.period)
+        u = self._samples(arc, point.period)
+        # Wherever a rigid stop is struck the contact is on it: that is no touch.
+        touched = {number + 1 for number, _ in self._touches(arc, u)}
+        yields = np.flatnonzero(~self.system.is_rigid) + 1
+        return sorted(touched.union(set(grazing_contacts(self.system, u)).intersection(yields.tolist())))
+
+    def _samples(self, arc: Arc, period: float) -> np.ndarray:
+        """Return displacements (1 + SAMPLES, n) in m along an ``arc`` at equal times."""
+        interval = arc.duration / SAMPLES
+        return self.flow.states(arc.start, interval, SAMPLES, period)[:, : self.system.dofs]
+
+    def _touches(self, arc: Arc, u: np.ndarray) -> list[tuple[int, int]]:
+        """Return contacts, from 0, whose rigid stops an ``arc`` touches at no speed, each with the sample of ``u``."""
+        touches = []
+        gaps = self.system.gaps(u)
+        for number in np.flatnonzero(self.system.is_rigid).tolist():
+            of_contact = gaps[:, number]
+            is_touch = of_contact[1:-1] >= np.maximum(of_contact[:-2], of_contact[2:])
+            is_touch &= np.abs(of_contact[1:-1]) <= 2 * TOUCH * self.system.contacts[number].stops.clearance
+            impacts = arc.events[arc.events[:, 1] == number, 0] * SAMPLES / arc.duration
+            for place in np.flatnonzero(is_touch) + 1:
+                if np.abs(impacts - place).min(initial=np.inf) > 2:
+                    touches.append((number, int(place)))
+        return touches
+
+    def turned_at_corner(self, point: Point) -> Corner[Point] | None:
+        """Return the corner at an orbit that touches a rigid stop, beyond which the stop is struck; None without one.
+
+        Let the speed there be s. To first order the orbit changes by a jump of the velocity, -2 mu s M^-1 h^T at the
+        instant of the touch, while the largest w, without the jump, exceeds D by s^2/(2 |w''|): H' (dx, dT) and what
+        the jump makes of H add up to 0, and dw = 0. To second order x changes along the gradient of w.
+        """
+        arc = self.arc(point.x, point.period)
+        u = self._samples(arc, point.period)
+        touches = self._touches(arc, u)
+        if not touches:
+            return None
+
+        n = self.system.dofs
+        jump = np.zeros(n)
+        rise = np.zeros(n)
+        bend = 0.0
+        # Several touches at one speed, by a symmetry, count each.
+        for number, place in touches:
+            row = self.system.contact_rows[number]
+            moved = row / self.system.masses
+            side = np.sign(u[place] @ row)
+            # A little before the touch, so that the arc to it strikes nothing.
+            time = (place - AHEAD) * arc.duration / SAMPLES
+            before = self.flow.arc(arc.start, time, point.period).sensitivity
+            rest = np.linalg.solve(before.T, arc.sensitivity[self.zero].T).T
+            jump += rest[:, n:] @ (-2 * side * moved / (row @ moved))
+            rise = side * row @ before[:n, self.free]
+            bend = 0.5 / abs(moved @ self.system.forces(u[place]))
+
+        matrix = np.vstack([self.jacobian(arc), np.append(rise, 0.0)])
+        tangent = np.linalg.solve(matrix, np.append(-jump, 0.0))
+        return Corner(replace(point, tangent=tangent), np.append(bend * rise / (rise @ rise), 0.0))
+
+    def has_corner(self, before: Point, after: Point) -> bool:
+        """Return whether a rigid stop is first struck, or no longer, between two points."""
+        return self.system.has_rigid_stops and before.episodes != after.episodes
 
     def acceleration(self, point: Point) -> float:
         """Return largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
@@ -553,6 +614,10 @@ class Shooting(OrbitProblem):
         A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
         doubles the period (the others); 0 doubles the period of quarter-period orbits.
         """
+        # Tangents and half-traces are others on the two sides of a corner.
+        if self.has_corner(left, right):
+            yield touch_of(max(left.episodes, right.episodes), corner=True)
+            return
         # Where all contacts are as at rest an orbit may lie on a linear branch, whose energy and frequency turn by
         # rounding alone: folds are then sought between two orbits that both have contacts which close or open.
         if not self.system.is_linear_at_rest or (left.episodes and right.episodes):
@@ -655,16 +720,20 @@ def repetitions(problem: Shooting, point: Point) -> int:
     return 1
 
 
-def touch_of(count: int) -> SpecialKind[Point]:
+def touch_of(count: int, corner: bool = False) -> SpecialKind[Point]:
     """Return points at which the number of contact episodes becomes ``count``, or falls below it.
 
-    A mere touch is no episode: such a point has one fewer.
+    A mere touch is no episode: such a point has one fewer. A rigid stop makes a ``corner`` of the branch there.
     """
 
     def above(point: Point) -> float:
         return 1.0 if point.episodes >= count else -1.0
 
-    return SpecialKind("grazing", above, finish=lambda point, left, right: replace(point, episodes=count - 1))
+    def finish(point: Point, left: Point, right: Point) -> Point:
+        # Several stops may be struck from a corner on, by a symmetry; the point itself has the episodes before it.
+        return point if corner else replace(point, episodes=count - 1)
+
+    return SpecialKind("grazing", above, finish=finish, corner=corner)
 
 
 def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
@@ -683,6 +752,12 @@ def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     if problem.map.starts_at_rest:
         amplitude /= omega[mode]
     x = shapes[:, mode] * amplitude
+    if problem.system.has_rigid_stops and problem.map.starts_at_rest:
+        # The arc begins on the side on which the motion comes to its stops last.
+        w = problem.system.contact_rows @ x
+        reach, reach_of_opposite = (np.max(np.abs(w) / problem.system.clearances_at(side)) for side in (w, -w))
+        if reach_of_opposite < reach:
+            x = -x
     frame = problem.frame_at("relative", x, 2 * np.pi / omega[mode], np.empty(0))
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
     attempt = frame.solve(frame.xi, row, row @ frame.xi)

@@ -80,6 +80,8 @@ class System:
         for pair in self.contacts:
             if pair.stops.clearance == 0:
                 raise ValueError("clearance 0.0 must be positive (m), or negative of a contact that is pressed at rest")
+            if pair.stops.is_pressed and pair.law.is_rigid:
+                raise ValueError("a rigid stop has no indentation, and is not pressed at rest")
             if pair.stops.is_pressed and max(pair.stops.plus, pair.stops.minus) < np.inf:
                 raise ValueError(
                     f"clearance {pair.stops.clearance!r} is that of a contact pressed at rest, which has one stop"
@@ -187,6 +189,16 @@ class System:
     def is_pressed(self) -> np.ndarray:
         """Mask (contacts,) of the contacts that are pressed at rest."""
         return np.array([pair.stops.is_pressed for pair in self.contacts], bool)
+
+    @cached_property
+    def is_rigid(self) -> np.ndarray:
+        """Mask (contacts,) of the contacts whose stops do not yield."""
+        return np.array([pair.law.is_rigid for pair in self.contacts], bool)
+
+    @property
+    def has_rigid_stops(self) -> bool:
+        """Whether any contact has stops that do not yield."""
+        return bool(self.is_rigid.any())
 
     @property
     def is_linear_at_rest(self) -> bool:

@@ -33,6 +33,7 @@ from vipetsc.case.nnm.checks import (
     check_lattice,
     check_options,
     check_reduced,
+    check_rigid_stops,
     check_size,
     check_start_sites,
     rigid_motions,
@@ -74,8 +75,7 @@ class NnmCase(CaseFile):
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system and the map with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
-        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself",
-        "rigid stops": "not yet: neither orbits that are shot nor harmonics have the jumps of velocity at a rigid stop",
+        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself"
     }
 
     @classmethod
@@ -134,6 +134,8 @@ class NnmCase(CaseFile):
         if nnm.system != "own":
             refusable["lattice"] = lattice
         problems = [*check_options(nnm), *refusals(cls, refusable, valid)]
+        if valid("contacts.law"):
+            problems += check_rigid_stops(nnm, contacts)
         if nnm.system == "own":
             problems += _check_own(nnm, contacts, problems, valid)
             if nnm.custom is not None:

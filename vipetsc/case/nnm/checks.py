@@ -9,6 +9,7 @@ from vipetsc.case.contacts import (
     check_joined,
     check_pairs,
     has_equal_sides,
+    is_rigid_of_sites,
     lists_of,
     pairs_of_sites,
     path_of,
@@ -50,6 +51,28 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     for key, start, end in pairs:
         if start == end or max(start, end) > masses:
             yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
+
+
+def check_rigid_stops(nnm: NnmTable, contacts: ContactsTable) -> Iterator[Problem]:
+    """Yield problems with rigid stops, which only orbits that are shot may have, without loss."""
+    count = max((len(values) for values in lists_of(contacts).values()), default=1)
+    is_rigid = is_rigid_of_sites(contacts, count)
+    if not any(is_rigid):
+        return
+    if nnm.system == "condensed" or nnm.method != "shooting":
+        key = "nnm.system" if nnm.system == "condensed" else "nnm.method"
+        remedy = 'the harmonics of an impulse do not decay; use method = "shooting" and a system of all masses'
+        yield Problem(key, getattr(nnm, key.removeprefix("nnm.")), f"{remedy}, or a law that yields")
+    restitutions = values_of_sites(contacts, "restitution", count)
+    lossy = [r for r, rigid in zip(restitutions, is_rigid, strict=True) if rigid and r < 1]
+    if lossy:
+        remedy = "a rigid stop takes a part of the energy at each impact, so that no free motion repeats itself"
+        yield Problem(path_of(contacts, "restitution"), lossy[0], f"{remedy}; set it to 1")
+    if nnm.map != "auto":
+        remedy = "orbits begin and end where they strike no rigid stop, which depends on the system"
+        yield Problem("nnm.map", nnm.map, f"{remedy}; remove it")
+    if nnm.chart != "relative":
+        yield Problem("nnm.chart", nnm.chart, "orbits do not begin on a rigid stop; remove it")
 
 
 def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Problem]:

@@ -18,7 +18,7 @@ from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor, value
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, StepRule, at_energy
 from vipetsc.modes.continuation.switching import switch
-from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap
+from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap, map_between_impacts
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError, PeriodicProblem, SpecialKind
 from vipetsc.modes.shooting import Shooting, linear_start
@@ -117,6 +117,8 @@ def map_of(options: NnmTable, system: System) -> ShootingMap:
     """Return the part of the period that is shot."""
     if options.map != "auto":
         return MAPS[options.map]
+    if system.has_rigid_stops:
+        return map_between_impacts(system.odd)
     # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
     if system.odd:
         return MAPS["quarter"]

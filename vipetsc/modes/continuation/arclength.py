@@ -137,6 +137,8 @@ MOST_GROWTH = 2
 FAILED_FACTOR = 0.4
 # The same for the repetition of a step that a guard has refused.
 AIM_AGAIN = 0.8
+# Largest correction of the first step beyond a corner, over its length.
+BEYOND_CORNER = 0.1
 # Bounds of the factor of such a step.
 LEAST_FACTOR = 0.1
 MOST_FACTOR = 0.7
@@ -242,6 +244,9 @@ class GuardedSteps:
                 why="Newton's method ends at an equilibrium, which has no period",
                 remedy="nnm.largest_step",
             )
+        if self.problem.has_corner(before, after):
+            # Steps come to the corner itself, where the branch has another tangent.
+            return Verdict(accepted=False, step=after.step * LEAST_FACTOR, why="the branch has a corner")
         size, guard = largest_change(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
             # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
@@ -384,7 +389,33 @@ class Continuation(Generic[S]):
             self.step = verdict.step
             if verdict.accepted:
                 return replace(point, next_step=self.step)
+        beyond = self._beyond_corner(last)
+        if beyond is not None:
+            return beyond
         raise ContinuationError(self.rule.stuck(last, attempt, verdict))
+
+    def _beyond_corner(self, last: S) -> S | None:
+        """Return the first point beyond a corner at the ``last`` one; None if there is none, or no point is found.
+
+        No guard holds across a corner: what is found must lie near the direction in which the branch leaves it.
+        """
+        corner = self.problem.turned_at_corner(last)
+        if corner is None:
+            return None
+        frame = self.problem.frame(corner.point, self.rule.chart)
+        length = np.linalg.norm(frame.direction(corner.point))
+        bend = frame.direction(replace(corner.point, tangent=corner.bend)) / length**2
+        step = self.rule.first_step
+        while step >= self.rule.smallest_step:
+            guess = frame.xi + step * frame.tangent + step**2 * bend
+            attempt = frame.correct(guess, step)
+            if attempt.converged and np.linalg.norm(attempt.xi - guess) < BEYOND_CORNER * step:
+                tangent = frame.tangent_at(attempt.xi)
+                point = replace(frame.measures(attempt, tangent), index=last.index + 1, step=step)
+                self.step = step
+                return replace(point, next_step=step)
+            step *= FAILED_FACTOR
+        return None
 
 
 def _corrected(frame: Frame[S], step: float) -> tuple[Attempt, np.ndarray | None]:
@@ -575,7 +606,7 @@ class Segment(Generic[S]):
         """Return point where the kind's test, of two signs at the ends, vanishes; raises NoMotionError without one."""
         # So that the command line can report what a run is doing (``cli.messages``).
         sys.audit("vipetsc.landing", kind.name)
-        point = self._find(kind)
+        point = self._corner(kind) if kind.corner else self._find(kind)
         if kind.finish is not None:
             point = kind.finish(point, self.left, self.right)
         return replace(point, kind=kind.name, step=self.begin + point.step)
@@ -585,7 +616,13 @@ class Segment(Generic[S]):
         # The root is one of the arclengths at which a value was asked for: its point is not computed twice.
         at = cache(self.at)
         value = partial(self._value, kind.test, at)
-        return at(float(brentq(value, 0.0, self.length, xtol=EXACT * self.length)))
+        return at(float(brentq(value, 0.0, self.length, xtol=EXACT * abs(self.length))))
+
+    def _corner(self, kind: SpecialKind[S]) -> S:
+        """Return the end of the segment at which the branch has its corner, to which steps have come."""
+        if kind.test(self.left) < 0:
+            return replace(self.left, index=self.right.index, step=0.0)
+        return replace(self.right, step=self.length)
 
     def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
         """Return value of a test at an arclength; at the ends it is that of their points, which need no correction."""
