@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import run_of, small_case
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.dynamics import simulate
 
 pytestmark = pytest.mark.parallel(1)
@@ -180,6 +180,53 @@ def test_masses_that_stick_go_on_together(engine):
     np.testing.assert_allclose(log["loss"].sum(), 0.4, rtol=1e-9)
 
 
+PUSH = {"waveform": "step", "ramp": RAMP, "amplitude": 3.0, "cell": 1}
+LOOP = {
+    "lattice": {"cells": 1, "cell": {"masses": [1.0, 2.0, 3.0], "springs": [], "contact": [1, 2]}},
+    "contacts": {"sites": [1, 1, 1], "pair": None, "next_cell": False, "each": {"pair": [[1, 2], [2, 3], [1, 3]]}},
+}
+
+
+@pytest.mark.parametrize(
+    ("engine", "count", "changes", "reactions"),
+    [
+        ("ts", 6, {}, None),
+        ("propagator", 30, {}, None),
+        # The third stop bears nothing: the other two hold all three masses.
+        ("ts", 3, LOOP, [2.5, 1.5, 0.0]),
+        ("propagator", 3, LOOP, [2.5, 1.5, 0.0]),
+    ],
+)
+def test_a_row_that_is_pushed_moves_as_one(engine, count, changes, reactions):
+    """A force on the first of masses that touch: each stop bears what accelerates the masses behind it."""
+    time = {"end": 0.3, "sample_interval": 0.02}
+    touching = {"contacts": {"clearance": 0.0} | changes.get("contacts", {}), "drive": PUSH, "time": time}
+    data = run_of(row(count, 0.0, engine, **(changes | touching)).varied(without=["initial"]))
+    v = data["velocity"].values.reshape(len(data["time"]), -1)
+    total = 6.0 if reactions else count
+    np.testing.assert_allclose(v[-1], 3.0 * (0.3 - RAMP / 2) / total, rtol=1e-9)
+    if reactions is None:
+        reactions = 3.0 * (1 - np.arange(1, count) / count)
+    np.testing.assert_allclose(np.abs(data["sites/force"].values[-1]), reactions, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("count", "restitution"), [(6, 0.5), (5, 0.9), (12, 0.0)])
+def test_a_ring_of_masses_that_touch_goes_on_as_one(count, restitution, engine):
+    """Nothing can part in a closed ring without gaps: after one blow all masses have its momentum in equal parts."""
+    ring = {"lattice": {"ends": "periodic"}, "contacts": {"clearance": 0.0, "sites": [*range(1, count + 1)]}}
+    _, data = impacts(row(count, restitution, engine, **ring))
+    np.testing.assert_allclose(data["velocity"].values[1:].ravel(), 1 / count, rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_mass_that_is_held_to_its_stop_has_no_error_of_energy(engine):
+    """Where no work is done the balance has nothing to miss."""
+    result = simulate(ball(0.5, engine, contacts={"clearance": 0.0}))
+    assert result.statistics["ledger_error"] < 1e-10
+    assert not [warning for warning in result.warnings if "energy" in warning]
+
+
 @pytest.mark.parametrize(("restitution", "frequency"), [(0.8, 2.4), (0.6, 2.6)])
 def test_the_impact_oscillator_has_the_orbit_and_multipliers_of_its_formula(restitution, frequency):
     """One impact a period: V by Dux's formula; V comes to it as r and the trace of the jump times free motion say."""
@@ -260,6 +307,18 @@ def test_keys_of_stops_that_yield_are_refused(changes, key):
         ball(0.5, **changes)
     assert key in [problem.key for problem in error.value.problems]
     assert "rigid" in str(error.value)
+
+
+def test_a_sweep_has_rigid_stops_beside_others():
+    """Each law takes its own of the keys that all members have."""
+    table = row(2, 1.0).varied_table()
+    table["contacts"] |= {"stiffness": 1e9, "damping": "exact", "exponent": 1.2}
+    table["sweep"] = {"contacts": {"law": ["rigid", "bilinear", "power"]}}
+    sweep = Sweep.from_table(table)
+    laws = [member.case.contacts for member in sweep.members()]
+    assert [law.law for law in laws] == ["rigid", "bilinear", "power"]
+    assert [law.stiffness for law in laws] == [None, 1e9, 1e9]
+    assert [law.exponent for law in laws] == [None, None, 1.2]
 
 
 def test_a_motion_beyond_the_stop_is_refused():

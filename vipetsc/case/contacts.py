@@ -77,6 +77,18 @@ def check_per_site(
     yield from wrong or check_touching(contacts, gaps, at_rest)
 
 
+# Keys of stops that yield.
+YIELDING = "stiffness", *MATERIAL, "damping", "adhesion", "approach_floor"
+
+
+def keys_of_other_laws(law: str) -> list[str]:
+    """Return keys of ``[contacts]`` that a ``law`` does not take, and others do."""
+    keys = [key for key, parameter in PARAMETERS.items() if parameter.law != law]
+    if law == RIGID:
+        keys += YIELDING
+    return keys
+
+
 def _check_rigid(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """Yield problems with keys that mean nothing to rigid stops, at all sites, and with precompression.
 

@@ -17,6 +17,7 @@ import tomli_w
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseFile
+from vipetsc.case.contacts import keys_of_other_laws
 from vipetsc.case.html import html_table
 from vipetsc.case.reading import Table, put, read_section
 from vipetsc.case.schema import number
@@ -33,6 +34,7 @@ MOST_TRIED_SITES = 200_000
 # Ramp, in periods, of a harmonic drive that goes on from the run before: the full force is there at once, as far as a
 # ramp, which must be positive, allows. A sine has grown to 6e-3 of its amplitude by then.
 SHORT_RAMP = 1e-3
+LAW = "contacts.law"
 # A key, and the beginnings of those that it fills in.
 MATRICES = "lattice.cell.matrices"
 OF_MATRICES = tuple(f"lattice.cell.{key}" for key in ("masses", "springs", "grounding"))
@@ -169,6 +171,14 @@ class Sweep(StudyCase):
             for key, values in axis.items():
                 # A copy, since members must not have one list or table in common.
                 problems += put(table, key, copy.deepcopy(values[i]))
+
+        # Where laws vary, each takes its own of the keys that all members have: a rigid stop has no stiffness.
+        varied = {key for axis in self.axes for key in axis}
+        contacts = table.get("contacts")
+        if LAW in varied and isinstance(contacts, dict):
+            for key in keys_of_other_laws(str(contacts.get("law"))):
+                if f"contacts.{key}" not in varied:
+                    contacts.pop(key, None)
         return table, problems
 
     def member(self, number: int) -> SweepMember:

@@ -2,7 +2,8 @@ r"""Contacts: the contact force, the search for changes of contact, the landing 
 
 A site is a pair of masses, host and resonator, with the relative displacement w = u_resonator - u_host and a
 clearance D on both sides. ``law`` contains the compiled force, ``search`` the guaranteed root search and the landing on
-a root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log.
+a root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log, ``together`` what
+keeps stuck rigid sites closed that share masses.
 
 **Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host in contact is
 

@@ -199,14 +199,15 @@ class Ledger(Observer):
             self.last_even_power = float(powers[even][-1])
 
     def statistics(self) -> dict[str, Any]:
-        """Return ``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end.
+        """Return ``ledger_error``, largest residual over the largest work, if any; ``work``, ``dissipated`` at the end.
 
         Where the loss of dashpots is what the balance leaves, ``damping_quadrature`` in J is that of the trapezoidal
         rule, and ``damping_quadrature_error`` its estimated error.
         """
         numbers = {"ledger_error": 0.0}
         if self.most_work:
-            numbers["ledger_error"] = self.worst / self.most_work
+            # Where hardly any work is done, as by a force that holds a mass to its stop, both are rounding.
+            numbers["ledger_error"] = self.worst / max(self.most_work, self.setup.meter.negligible)
         if np.isnan(self.work):
             return numbers
 

@@ -69,7 +69,8 @@ def check_ranks(plan: RunPlan, ranks: int) -> None:
     if ranks > 1 and plan.engine.name == TS and plan.model.has_rigid_sites and len(plan.model.shared_masses):
         mass = int(plan.model.shared_masses[0])
         cell = mass // plan.model.chain.cell.dofs + 1
-        remedy = f"rigid stops that share a mass, as in cell {cell}, run by {TS} on one rank: start it without mpirun"
+        reason = f"rigid stops that share a mass, as in cell {cell}: blows pass from mass to mass at one instant, which"
+        remedy = f"{reason} {TS} follows on one rank alone; start it without mpirun, or use the {PROPAGATOR}"
         raise CaseError([Problem("contacts.sites", None, remedy)])
 
 

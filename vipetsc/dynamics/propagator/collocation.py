@@ -56,6 +56,7 @@ from scipy.special import binom
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import STUCK, contact_force, side_of
+from vipetsc.contact.together import entry, join, solve
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS
@@ -78,10 +79,6 @@ SMALLEST_RESPONSE = 1e-18
 # rounding. The hundredfold margin is for other forces, and cheap: half of it saves 8 % of the substeps of the built-in
 # case, twice as much costs 9 %.
 SUPERCONVERGENCE = 0.02
-# Sweeps over stuck sites that share masses in which their reactions are found, and the change of a reaction, relative
-# to the largest one, at which they are. A cluster has 32 sites at most: a row of so many takes 3,800 sweeps.
-MOST_ROUNDS = 10_000
-HELD = 1e-15
 # Half of the time over which the rate of a force is a difference, in units of H.
 RATE_SHIFT = 1e-4
 # Binomial coefficients binom(p, k), p down, k across, of all powers of s that a series may have.
@@ -145,25 +142,34 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 def _balance(cluster: Cluster, given: np.ndarray, forces: np.ndarray) -> None:
     """Find ``forces`` (dof,) of stuck sites i with ``given`` (dof,) + sum over all j of g_ij forces_j = 0 there.
 
-    g_ij is the acceleration of i by a force on j at once. Forces of other DoFs are given.
+    g_ij is the acceleration of i by a force on j at once. Forces of other DoFs are given, those of stuck sites are 0;
+    ``given`` is overwritten.
     """
-    for _ in range(MOST_ROUNDS):
-        change = 0.0
-        largest = 0.0
-        any_shared = False
-        for i in range(cluster.contacts.size):
-            if abs(cluster.contacts[i].mode) != STUCK:
-                continue
-            total = given[i]
-            for j in range(forces.size):
-                total += cluster.response[i, j, 0] * forces[j]
-            correction = -total / cluster.response[i, i, 0]
-            forces[i] += correction
-            change = max(change, abs(correction))
-            largest = max(largest, abs(forces[i]))
+    any_shared = False
+    for i in range(cluster.contacts.size):
+        if abs(cluster.contacts[i].mode) == STUCK:
             any_shared |= cluster.contacts[i].shares
-        if not any_shared or change <= HELD * largest:
-            break
+            for j in range(forces.size):
+                given[i] += cluster.response[i, j, 0] * forces[j]
+            given[i] /= -cluster.response[i, i, 0]
+    if any_shared:
+        _balance_together(cluster.contacts, given)
+    for i in range(cluster.contacts.size):
+        if abs(cluster.contacts[i].mode) == STUCK:
+            forces[i] += given[i]
+
+
+@kernel
+def _balance_together(contacts: np.ndarray, alone: np.ndarray) -> None:
+    """Replace the forces ``alone`` (site or more,) of stuck sites, each by itself, by those that hold all together."""
+    sites = np.empty(contacts.size, np.int64)
+    corrections = np.empty((contacts.size, 1))
+    for i in range(contacts.size):
+        sites[i] = i
+        corrections[i, 0] = alone[i]
+    _correct_together(contacts, sites, corrections)
+    for i in range(contacts.size):
+        alone[i] = corrections[i, 0]
 
 
 @kernel
@@ -322,29 +328,41 @@ def _fill_residuals(cluster: Cluster, trial: Trial) -> None:
 @kernel
 def _find_corrections(cluster: Cluster, trial: Trial) -> None:
     """Find the corrections of the reactions at the nodes whose accelerations at once balance the residuals."""
-    sums = trial.sums
-    active = trial.active
-    sites = trial.closed.size
-    for _ in range(MOST_ROUNDS):
-        largest = 0.0
-        last = 0.0
-        any_shared = False
-        for target in range(sites):
-            i = active[target]
-            if abs(cluster.contacts[i].mode) != STUCK:
-                continue
+    any_shared = False
+    for target in range(trial.closed.size):
+        i = trial.active[target]
+        if abs(cluster.contacts[i].mode) == STUCK:
             any_shared |= cluster.contacts[i].shares
             for node in range(NODES):
-                total = sums.residuals[target, node]
-                for source in range(sites):
-                    if abs(cluster.contacts[active[source]].mode) == STUCK:
-                        total += cluster.response[i, active[source], 0] * sums.corrections[source, node]
-                step = total / cluster.response[i, i, 0]
-                sums.corrections[target, node] -= step
-                last = max(last, abs(step))
-                largest = max(largest, abs(sums.corrections[target, node]))
-        if not any_shared or last <= HELD * largest:
-            break
+                trial.sums.corrections[target, node] = -trial.sums.residuals[target, node] / cluster.response[i, i, 0]
+    if any_shared:
+        _correct_together(cluster.contacts, trial.closed, trial.sums.corrections)
+
+
+@kernel
+def _correct_together(contacts: np.ndarray, closed: np.ndarray, corrections: np.ndarray) -> None:
+    """Replace forces on stuck sites that each would need alone by those that hold all of them together.
+
+    They are ``corrections`` (row, column), whose first rows belong to the sites ``closed``, stuck or not.
+    """
+    stuck = np.empty(closed.size, np.int64)
+    places = np.empty(closed.size, np.int64)
+    count = 0
+    for target in range(closed.size):
+        if abs(contacts[closed[target]].mode) == STUCK:
+            stuck[count] = closed[target]
+            places[count] = target
+            count += 1
+
+    joined = join(contacts, stuck[:count])
+    x = np.empty(count)
+    for column in range(corrections.shape[1]):
+        # The response at once is the matrix of ``join`` in units of H.
+        for k in range(count):
+            x[k] = corrections[places[k], column] * entry(contacts, stuck[k], stuck[k])
+        solve(joined, x)
+        for k in range(count):
+            corrections[places[k], column] = x[k]
 
 
 @kernel

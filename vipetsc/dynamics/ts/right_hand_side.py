@@ -16,6 +16,7 @@ import numpy as np
 from vipetsc.compiled import cfunc, kernel
 from vipetsc.contact.changes import first_change
 from vipetsc.contact.law import FREE, STUCK, contact_force
+from vipetsc.contact.together import join, solve
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.equation import acceleration
@@ -25,11 +26,6 @@ from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import add_nonlinear_accelerations, damping_powers, inverse_mass, spring_accelerations
 from vipetsc.records import Record, record_at
-
-# Sweeps over the stuck sites of a row of masses, and the change of a reaction, relative to it, at which it holds. Each
-# sweep leaves cos(pi/(n + 1))^2 of the error in a row of n equal masses: 100 of them take 33,000.
-MOST_SWEEPS = 100_000
-HELD = 1e-15
 
 
 @kernel
@@ -116,27 +112,56 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
 def hold_stuck_sites(f: np.ndarray, lattice: LatticeRecord) -> None:
     """Add the reactions of stuck sites to the rates ``f`` (component,), with ghosts: w'' = 0 at each of them.
 
-    The reactions of sites that share a mass depend on one another: each is made to hold in turn, until none changes.
+    The reactions of sites that share a mass depend on one another, and are found together.
     """
+    count = 0
+    any_shared = False
     for i in range(lattice.site_dofs.size):
-        lattice.contacts[i].reaction = 0.0
-    for _ in range(MOST_SWEEPS):
-        is_held = True
-        for i in range(lattice.site_dofs.size):
-            site = lattice.contacts[i]
-            if abs(site.mode) != STUCK:
-                continue
-            host = lattice.site_dofs[i].host.v
-            resonator = lattice.site_dofs[i].resonator.v
+        site = lattice.contacts[i]
+        site.reaction = 0.0
+        if abs(site.mode) == STUCK:
+            count += 1
+            any_shared |= site.shares
+    if any_shared:
+        _hold_together(f, lattice, count)
+        return
+    for i in range(lattice.site_dofs.size):
+        if abs(lattice.contacts[i].mode) == STUCK:
             _, acceleration = relative_motion(f, lattice.site_dofs, i)
-            change = site.reduced_mass * acceleration
-            site.reaction += change
-            if host >= 0:
-                f[host] += change * site.host_inverse
-            f[resonator] -= change * site.resonator_inverse
-            is_held &= not site.shares or abs(change) <= HELD * abs(site.reaction)
-        if is_held:
-            break
+            _react(f, lattice, i, lattice.contacts[i].reduced_mass * acceleration)
+
+
+@kernel
+def _hold_together(f: np.ndarray, lattice: LatticeRecord, count: int) -> None:
+    """Add the reactions of all stuck sites, so many, to the rates ``f``, as ``hold_stuck_sites``."""
+    sites = np.empty(count, np.int64)
+    k = 0
+    for i in range(lattice.site_dofs.size):
+        if abs(lattice.contacts[i].mode) == STUCK:
+            sites[k] = i
+            k += 1
+
+    joined = join(lattice.contacts, sites)
+    reactions = np.empty(count)
+    # Once more for the rounding of the first time, which is that of a large force on light masses.
+    for _ in range(2):
+        for k in range(count):
+            _, acceleration = relative_motion(f, lattice.site_dofs, sites[k])
+            reactions[k] = acceleration
+        solve(joined, reactions)
+        for k in range(count):
+            _react(f, lattice, sites[k], reactions[k])
+
+
+@kernel
+def _react(f: np.ndarray, lattice: LatticeRecord, i: int, force: float) -> None:
+    """Add a ``force`` in N to the reaction of site ``i``, and what it does to its masses to the rates ``f``."""
+    site = lattice.contacts[i]
+    host = lattice.site_dofs[i].host.v
+    site.reaction += force
+    if host >= 0:
+        f[host] += force * site.host_inverse
+    f[lattice.site_dofs[i].resonator.v] -= force * site.resonator_inverse
 
 
 ONSET = np.dtype([("time", np.float64), ("duration", np.float64)])
