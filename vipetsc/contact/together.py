@@ -21,7 +21,7 @@ from vipetsc.compiled import kernel
 DEPENDENT = 1e-11
 
 
-class Joined(NamedTuple):
+class JoinedSites(NamedTuple):
     """The matrix A of sites that are held together, or its factors, below the diagonal row by row.
 
     Row i has the entries (i, j) for j from ``first[i]`` to i - 1 in ``values`` from ``start[i]`` on, and the diagonal
@@ -80,7 +80,7 @@ def _first_neighbours(contacts: np.ndarray, sites: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def join(contacts: np.ndarray, sites: np.ndarray) -> Joined:
+def join(contacts: np.ndarray, sites: np.ndarray) -> JoinedSites:
     """Return the factors of A of the ``sites`` (k,), numbers of ``contacts``."""
     count = sites.size
     first = _first_neighbours(contacts, sites)
@@ -90,7 +90,7 @@ def join(contacts: np.ndarray, sites: np.ndarray) -> Joined:
         start[i] = used
         used += i - first[i]
 
-    joined = Joined(first, start, np.empty(used), np.empty(count))
+    joined = JoinedSites(first, start, np.empty(used), np.empty(count))
     for i in range(count):
         joined.diagonal[i] = entry(contacts, sites[i], sites[i])
         for j in range(first[i], i):
@@ -100,7 +100,7 @@ def join(contacts: np.ndarray, sites: np.ndarray) -> Joined:
 
 
 @kernel
-def factorise(joined: Joined) -> None:
+def factorise(joined: JoinedSites) -> None:
     """Replace the matrix by its factors, L below the diagonal and D on it; a D that vanishes is 0 to the bit."""
     first, start, values, diagonal = joined
     for i in range(diagonal.size):
@@ -125,7 +125,7 @@ def factorise(joined: Joined) -> None:
 
 
 @kernel
-def solve(joined: Joined, x: np.ndarray) -> None:
+def solve(joined: JoinedSites, x: np.ndarray) -> None:
     """Replace ``x`` (k,) by the solution R of A R = x, by the factors; dependent sites have R = 0."""
     first, start, values, diagonal = joined
     for i in range(x.size):

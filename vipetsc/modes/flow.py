@@ -807,6 +807,23 @@ def _fill_event(event: np.ndarray, t: float, change: Change, kind: int) -> None:
 
 
 @kernel
+def _pass(stepper: Stepper, change: Change, t: float, event: np.ndarray) -> int:
+    """Pass a ``change`` at the ``start`` of a stepper, at ``t`` in s, and fill its ``event``; returns the outcome."""
+    step = stepper.step
+    kind = ONSET
+    if step.system.contacts[change.contact].rigid:
+        observe(step, stepper.start, stepper.stages[0], step.start)
+        outcome = strike(step, change, stepper.start, stepper.stages[0], NEAR * change.tolerance)
+        if outcome != DONE:
+            return outcome
+    else:
+        kind = switch(step, change)
+    _fill_event(event, t, change, kind)
+    observe(step, stepper.start, stepper.stages[0], step.start)
+    return DONE
+
+
+@kernel
 def _begin(stepper: Stepper, length: float, progress: Any) -> None:
     """Begin a flow at the ``start`` of a stepper, with a first step of ``length`` s."""
     progress.has_begun = 1
@@ -877,17 +894,10 @@ def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray,
             if progress.changes >= events.shape[0]:
                 outcome = FULL
                 break
-            kind = ONSET
-            if step.system.contacts[change.contact].rigid:
-                observe(step, stepper.start, stepper.stages[0], step.start)
-                outcome = strike(step, change, stepper.start, stepper.stages[0], NEAR * change.tolerance)
-                if outcome != DONE:
-                    break
-            else:
-                kind = switch(step, change)
-            _fill_event(events[progress.changes], t, change, kind)
+            outcome = _pass(stepper, change, t, events[progress.changes])
+            if outcome != DONE:
+                break
             progress.changes += 1
-            observe(step, stepper.start, stepper.stages[0], step.start)
 
     progress.time = t
     progress.length = h

@@ -133,9 +133,7 @@ class NnmCase(CaseFile):
         # A user-defined system ignores the section [lattice].
         if nnm.system != "own":
             refusable["lattice"] = lattice
-        problems = [*check_options(nnm), *refusals(cls, refusable, valid)]
-        if valid("contacts.law"):
-            problems += check_rigid_stops(nnm, contacts)
+        problems = [*check_options(nnm), *refusals(cls, refusable, valid), *check_rigid_stops(nnm, contacts)]
         if nnm.system == "own":
             problems += _check_own(nnm, contacts, problems, valid)
             if nnm.custom is not None:
