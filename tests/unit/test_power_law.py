@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from vipetsc.spectra import doubt, normalised, power_law
+from vipetsc.spectra.fits import r2_adjusted
 
 METHODS = ("log-log", "nonlinear")
 X = np.geomspace(0.1, 20, 12)
@@ -96,6 +97,30 @@ def test_units_change_the_factor_alone(seed, scale_y, scale_x):
         assert scaled.factor == pytest.approx(scale_y * fit.factor * scale_x**-fit.exponent, rel=100 * rel)
 
 
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    """About 95 % of 400 intervals of 95 % contain the exact exponent."""
+    inside = []
+    for seed in range(400):
+        low, high = power_law(X, scattered_law(seed)).exponent_interval
+        inside.append(low <= EXPONENT <= high)
+
+    # The standard deviation of the fraction is (0.95 * 0.05/400)^1/2 = 0.011.
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.04)
+
+
+def test_a_fit_that_runs_away_is_nan():
+    """A fit without a minimum has NaN as its numbers.
+
+    The last point alone is large: the steeper the law through it, the smaller the sum of squares.
+    """
+    x = [1.0, 2.0, 3.0, 3.01]
+    y = [1e-3, 2e-6, 1e-9, 1.0]
+
+    assert np.isfinite(power_law(x, y, "log-log").exponent)
+    fit = power_law(x, y, "nonlinear")
+    assert np.isnan([fit.exponent, fit.r2_adjusted, *fit.exponent_interval]).all()
+
+
 @settings(max_examples=30)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=20, unique=True))
 def test_normalised_spans_its_range(values):
@@ -106,6 +131,13 @@ def test_normalised_spans_its_range(values):
     assert scaled.max() == 1.0
     assert np.all(np.diff(scaled[np.argsort(values)]) >= 0)
     assert normalised(np.array(values) * 4.0) == pytest.approx(scaled, abs=1e-9)
+
+
+def test_normalised_keeps_gaps_and_refuses_a_constant():
+    """NaN stays where it is; equal values have no range to be mapped from."""
+    assert normalised([1.0, np.nan, 3.0, 2.0], 0, 10) == pytest.approx([0, np.nan, 10, 5], nan_ok=True)
+    with pytest.raises(ValueError, match="constant"):
+        normalised([2.0, 2.0])
 
 
 @pytest.mark.parametrize(
@@ -122,6 +154,11 @@ def test_points_without_a_law_are_refused(x, y, message):
     """Too few points, all at one place, values without a logarithm or without an abscissa raise ValueError."""
     with pytest.raises(ValueError, match=message):
         power_law(x, y)
+
+
+def test_a_constant_has_no_coefficient_of_determination():
+    """R^2 of values that do not vary is 0/0: NaN, without an error."""
+    assert np.isnan(r2_adjusted([1.0, 1.0, 1.0], [1.0, 1.0, 1.0]))
 
 
 def test_three_points_or_no_fit_are_no_power_law():
