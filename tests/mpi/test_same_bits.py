@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+import vipetsc
 from tests.conftest import small_case
 from tests.mpi.alike import as_alone
 from tests.verify.test_lyapunov import EXPONENT_OF_CHAIN
@@ -14,6 +17,7 @@ from tests.zoo import ZOO
 from vipetsc.case import Case, CaseError
 from vipetsc.dynamics import simulate
 
+EXAMPLES = Path(vipetsc.__file__).parent / "examples"
 ENGINES = [(name, engine) for name, kind in ZOO.items() for engine in kind.engines]
 
 
@@ -170,6 +174,16 @@ def exponent(engine: str) -> Case:
     return Case.from_table(EXPONENT_OF_CHAIN | {"time": time})
 
 
+def users_law(engine: str) -> Case:
+    """Return a lattice with the law of a user's module, which each rank compiles."""
+    table = tomllib.loads((EXAMPLES / "own-law.toml").read_text())
+    table["plugins"]["modules"] = [str(EXAMPLES / "own_law.py")]
+    table["lattice"]["cells"] = 24
+    table["contacts"] |= {"sites": [6, 12, 13], "clearance": 2e-4}
+    table["time"] |= {"end": 0.05, "engine": engine}
+    return Case.from_table(table)
+
+
 BOTH = "ts", "propagator"
 ACROSS = {
     joined_cells: BOTH,
@@ -183,6 +197,7 @@ ACROSS = {
     sharing_masses: ("propagator",),
     strip: BOTH,
     exponent: BOTH,
+    users_law: BOTH,
 }
 # Blocks that differ in size, a rank without cells, and ranks between two others.
 ON_THREE = [
@@ -214,6 +229,13 @@ def test_what_lies_across_a_border_has_the_bits_of_one_rank(create, engine):
 @pytest.mark.parallel([3])
 @pytest.mark.parametrize(("create", "engine"), ON_THREE)
 def test_three_ranks_have_the_bits_of_one(create, engine):
+    assert_as_alone(create, engine)
+
+
+@pytest.mark.parallel([4])
+@pytest.mark.parametrize(("create", "engine"), [(joined_cells, "ts"), (curved_springs, "propagator")])
+def test_four_ranks_have_the_bits_of_one(create, engine):
+    """Two ranks lie between two others."""
     assert_as_alone(create, engine)
 
 
