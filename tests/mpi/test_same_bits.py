@@ -233,7 +233,7 @@ def test_three_ranks_have_the_bits_of_one(create, engine):
 
 
 @pytest.mark.parallel([4])
-@pytest.mark.parametrize(("create", "engine"), [(joined_cells, "ts"), (curved_springs, "propagator")])
+@pytest.mark.parametrize(("create", "engine"), [(joined_cells, "ts"), (sticking, "ts"), (curved_springs, "propagator")])
 def test_four_ranks_have_the_bits_of_one(create, engine):
     """Two ranks lie between two others."""
     assert_as_alone(create, engine)
