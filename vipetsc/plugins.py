@@ -168,6 +168,11 @@ def load(name: str) -> Plugin:
     return plugin
 
 
+def is_imported(name: str) -> bool:
+    """Return whether the module ``name`` has been imported in this process."""
+    return name in _PLUGINS
+
+
 def _imported(name: str) -> Plugin:
     """Return the module ``name``, imported."""
     # Modules that register parts during this import belong to it: the module may import others.

@@ -171,6 +171,24 @@ def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplo
     assert warned == [f"vipetsc: {folder / 'factors.py'} has changed since the case was resolved that used it"]
 
 
+def test_modules_of_one_name_in_two_folders_keep_their_own_records(tmp_path, caplog):
+    """Neither is taken for the other one, changed, where results are read; without its file each keeps its hash."""
+    text = "from vipetsc import register\n"
+    text += "register.measure('of_{0}', unit='1', text='one', power=0.0)(lambda record: 1.0)\n"
+    modules = []
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "same.py").write_text(text.format(name))
+        modules.append(str(tmp_path / name / "same.py"))
+    case = Case.from_table({"plugins": {"modules": modules}})
+    assert Case.from_toml(case.to_toml()).plugins == case.plugins
+    assert not [line for line in caplog.messages if "has changed" in line]
+
+    moved = case.to_toml().replace(str(tmp_path), str(tmp_path / "moved"))
+    sources = Case.from_toml(moved).plugins.sources
+    assert [source.sha256 for source in sources.values()] == [s.sha256 for s in case.plugins.sources.values()]
+
+
 def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
     """A module that changes after its import is refused: results would be recorded with the hash of the new source."""
     # The law gets another name, because names are registered for the whole process.
@@ -194,6 +212,8 @@ def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
     else:
         assert Case.from_toml(text).contacts.law == "hardening"
         assert "its parts are left out" in caplog.text
+        with open(out / "run.h5") as run:
+            assert Case.of(run.assign_attrs(case=text)).contacts.law == "hardening"
 
 
 def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkeypatch):

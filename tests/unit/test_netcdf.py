@@ -171,10 +171,15 @@ def test_a_file_is_one_that_xarray_opens_as_a_tree(tmp_path, below, above):
     ],
 )
 def test_errors_of_numbers_are_blamed_on_numbers_that_are_no_longer_finite(tmp_path, error, is_spoilt, is_blamed):
-    """Numbers that were missing by right when they were written, as the end of a gap, are no cause."""
+    """Numbers that were missing by right when they were written, as the end of a gap, are no cause.
+
+    Nor are dimensions that are empty in runs without contact.
+    """
     path = tmp_path / "a.h5"
     edges = variable("edge", [0.0, 1.0, np.inf], "rad/s", "edges")
-    write_netcdf(path, xr.Dataset({"edge": variable("edge", [1, 2, 3], "1", "edge"), "edges": edges}))
+    clusters = variable("bands/cluster", np.zeros(0, int), "1", "cluster")
+    data = xr.Dataset({"edge": variable("edge", [1, 2, 3], "1", "edge"), "edges": edges, "bands/cluster": clusters})
+    write_netcdf(path, data)
     if is_spoilt:
         with h5py.File(path, "r+") as file:
             file["edges"][1] = np.nan

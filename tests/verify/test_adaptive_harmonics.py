@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
 from tests.steady_states import curve_of, nfrc_case
+from vipetsc.cli.verbs.branch_verbs import curve_rows
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod
 
@@ -53,6 +56,11 @@ def test_states_have_as_many_harmonics_as_the_truncation_needs(tmp_path, over):
         folds = [[p.xi[-1] for p in c.points if p.kind == "fold"] for c in (curve, whole)]
         assert folds[0]
         np.testing.assert_allclose(*folds, rtol=3e-4)
+
+        # A state may have too few harmonics for its perturbations: the summary says which key gives it more.
+        first = curve.points[0]
+        curve.points[0] = replace(first, measures=first.measured._replace(unstable=-1))
+        assert "nfrc.truncation" in dict(curve_rows(case, curve))["undecided"]
 
 
 def test_a_stopped_curve_goes_on_to_the_same_bits(tmp_path):

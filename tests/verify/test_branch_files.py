@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from mpi4py import MPI
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +15,8 @@ import xarray as xr
 from vipetsc.case.nnm import NnmCase
 from vipetsc.endings import Ending
 from vipetsc.figures.frequency_energy import backbone
+from vipetsc.figures.registry import drawings
+from vipetsc.figures.sweep_members import Files
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
 from vipetsc.modes.branches.files import read_branch, write_branch
@@ -106,3 +110,11 @@ def test_both_directions_are_two_branches(tmp_path):
         distances = np.abs(np.subtract.outer(expected, curve) / curve)
         assert distances.min(axis=1).max() < 1e-12
         assert (np.diff(distances.argmin(axis=1)) > 0).all()
+
+    # Warnings of the part towards smaller energies are those of the joined picture, too.
+    with h5py.File(tmp_path / f"{NAME}-down.h5", "r+") as file:
+        file.attrs["warnings"] = json.dumps(["a warning"])
+    with Files() as files:
+        labels = {one.stem: one.draw().get_label() for one in drawings("branches", [tmp_path], files, ["branch"])}
+    assert set(labels) == {NAME, f"{NAME}-down"}
+    assert all("a warning" in label for label in labels.values())

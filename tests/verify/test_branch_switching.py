@@ -10,6 +10,8 @@ import pytest
 from tests.rigs import after_a_period, period_map
 from tests.steady_states import motion_at
 from tests.verify.test_special_responses import FLIP, UNEVEN, case_of
+from vipetsc.figures.registry import every_branch
+from vipetsc.figures.sweep_members import Files
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.steady import SteadyStates
@@ -32,6 +34,9 @@ def test_the_curve_that_leaves(changes, kind, multiplier, curves, odd_one, tmp_p
     assert len(followed) == curves
     trunk, crossing = followed
     assert crossing.name == f"{trunk.name}-{kind}-1"
+    with Files() as files:
+        # Pictures of all curves name the first one first.
+        assert [path.stem for path in every_branch([tmp_path], files)] == [f"branch-{curve.name}" for curve in followed]
     point = next(point for point in trunk.points if point.kind == kind)
     states = SteadyStates(case, 1.0, case.nfrc.fixed[0])
     state = np.ravel(motion_at(states, point.xi, np.arange(2)))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import tomli_w
 
 from vipetsc.case.cell_matrices import with_matrices
-from vipetsc.case.parts import PluginsTable, missing_modules, module_names, warn_once, with_sources
+from vipetsc.case.parts import PluginsTable, changed_modules, missing_modules, module_names, warn_once, with_sources
 from vipetsc.case.reading import (
     Table,
     parsed,
@@ -123,8 +123,10 @@ class CaseFile(Section):
             raise TypeError(f"{cls.__name__}.of takes a dataset of results, with its case in attrs['case']")
         case = _kept_case(cls, text)
         assert isinstance(case, cls)
-        # A kept case was read before, and the modules that it names may be gone by now: this reports them.
-        case.import_plugins()
+        # A kept case was read before, and the modules that it names may have changed since.
+        problems = changed_modules(case.plugins) if case.plugins else []
+        if problems:
+            raise CaseError(problems, case.name)
         return case
 
     @classmethod

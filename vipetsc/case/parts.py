@@ -124,11 +124,11 @@ def with_sources(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
 
     # Absolute paths, since results are read from other folders than the one in which they were computed.
     table = with_located(table, Path())
-    recorded = _by_file_name(table["plugins"].get("sources"))
+    recorded = _recorded(table["plugins"].get("sources"))
     sources: dict[str, dict[str, str]] = {}
     problems = []
     for number, name in enumerate(module_names(table)):
-        before = recorded.get(Path(name).name)
+        before = recorded.get(name) or recorded.get(Path(name).name)
         try:
             now = _source(name)
         except plugins.PluginError as error:
@@ -183,6 +183,14 @@ def missing_modules(table: PluginsTable) -> list[Problem]:
     return problems
 
 
+def changed_modules(table: PluginsTable) -> list[Problem]:
+    """Return problems with modules of a resolved case that this process has imported, and that are others by now.
+
+    Others that are missing are none: the case was read without them.
+    """
+    return [problem for problem in missing_modules(table) if plugins.is_imported(str(problem.value))]
+
+
 def _source(name: str) -> dict[str, str] | None:
     """Return the record of the module ``name``; None if it registers figures alone. Raises PluginError."""
     plugin = plugins.load(name)
@@ -191,12 +199,18 @@ def _source(name: str) -> dict[str, str] | None:
     return {"version": plugin.version, "sha256": plugin.sha256}
 
 
-def _by_file_name(recorded: Any) -> dict[str, dict[str, str]]:
-    """Return the records in ``plugins.sources`` by the last part of the path: files may have been moved since."""
-    if not isinstance(recorded, dict):
+def _recorded(sources: Any) -> dict[str, dict[str, str]]:
+    """Return the records in ``plugins.sources`` by their paths, and by the last parts of these, since files are moved.
+
+    Files of one name in two folders have records by their paths alone.
+    """
+    if not isinstance(sources, dict):
         return {}
     # The check of types reports other entries.
-    return {Path(name).name: row for name, row in recorded.items() if isinstance(row, dict)}
+    rows = {name: row for name, row in sources.items() if isinstance(row, dict)}
+    files = [Path(name).name for name in rows]
+    alone = {file: row for file, row in zip(files, rows.values(), strict=True) if files.count(file) == 1}
+    return alone | rows
 
 
 def _texts(table: Mapping[str, Any]) -> set[str]:

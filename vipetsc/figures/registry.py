@@ -405,16 +405,23 @@ def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files
         stem = stem.replace(BRANCH, spec.name, 1)
     elif folders > 1:
         stem = stem.replace(BRANCH, "branches", 1)
-    draw_branches = warned(partial(spec.function, paths), _shown_branches(paths, branches))
+    draw_branches = warned(partial(spec.function, paths), _shown_branches(paths, branches, files))
     yield Drawing(stem, draw_branches, figure=spec.name)
 
 
-def _shown_branches(paths: Sequence[Path], branches: Sequence[xr.Dataset]) -> list[Shown]:
-    """Return the ``branches`` by their names, those of one name by their folders' names too."""
+def _shown_branches(paths: Sequence[Path], branches: Sequence[xr.Dataset], files: Files) -> list[Shown]:
+    """Return the ``branches`` by their names, those of one name by their folders' names too.
+
+    A branch towards larger energies is shown with the one towards smaller energies, if the mode has both.
+    """
     names = [str(branch.attrs["name"]) for branch in branches]
     if len(set(names)) < len(names):
         names = [f"{path.parent.name}, {name}" for path, name in zip(paths, names, strict=True)]
-    return [Shown(name, [branch]) for name, branch in zip(names, branches, strict=True)]
+    shown = []
+    for name, path, branch in zip(names, paths, branches, strict=True):
+        below = path.with_name(f"{path.stem}{branch_kinds.DOWN}.h5")
+        shown.append(Shown(name, [branch, open_branch(below, files)] if below.exists() else [branch]))
+    return shown
 
 
 def open_branch(path: Path, files: Files) -> xr.Dataset:
@@ -437,7 +444,8 @@ def branches_by_name(folders: Sequence[Path]) -> list[list[Path]]:
 
 def every_branch(folders: Sequence[Path], files: Files) -> list[Path]:
     """Return the files of all branches in ``folders`` that have a point; they are opened as ``files``."""
-    paths = [path for folder in folders for path in sorted(folder.glob("branch-*.h5"))]
+    # By their stems: a curve comes before those that were found from it, whose names go on with a hyphen.
+    paths = [path for folder in folders for path in sorted(folder.glob("branch-*.h5"), key=lambda path: path.stem)]
     return [path for path in paths if has_points(open_branch(path, files))]
 
 

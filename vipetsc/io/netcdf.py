@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 NOT_FINITE = "not_finite"
 # Errors of calculations with numbers that are not finite, or with none.
 OF_NUMBERS = (ValueError, IndexError, ArithmeticError, np.linalg.LinAlgError)
-MAY_BE_EMPTY = ("site", "episode")  # dimensions of runs without sites, or without contact
+MAY_BE_EMPTY = ("site", "episode", "cluster")  # dimensions, of any group, of runs without sites, or without contact
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
 Node: TypeAlias = "h5py.Group | h5py.Dataset"
@@ -248,7 +248,8 @@ def _spoilt(data: xr.Dataset) -> list[str]:
     for name, item in data.variables.items():
         if not_finite_in(item.values).get(NOT_FINITE, 0) != item.attrs.get(NOT_FINITE, 0):
             infinite.append(str(name))
-    empty = [str(name) for name, size in data.sizes.items() if size == 0 and name not in MAY_BE_EMPTY]
+    without = [str(name) for name, size in data.sizes.items() if size == 0]
+    empty = [name for name in without if name.rpartition("/")[2] not in MAY_BE_EMPTY]
     sentences = []
     if infinite:
         sentences.append(f"{file} holds numbers that are not finite in {shortened(infinite)}")

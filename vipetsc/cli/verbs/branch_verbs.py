@@ -268,6 +268,8 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     undecided = int(np.sum(unstable < 0))
     if undecided:
         remedy = f"more than nfrc.harmonics = {options.harmonics} may decide them"
+        if options.truncation is not None:
+            remedy = f"a smaller nfrc.truncation than {options.truncation:g}, or more nfrc.harmonics, may decide them"
         rows.append(("undecided", f"{counted(undecided, 'point')}; {remedy}"))
     if options.infinite:
         # The balance of energies is none of the equations that were solved, and so checks the whole computation.
