@@ -439,6 +439,11 @@ class RunMemory:
         """The run as of ``open_run``, on rank 0; None on the others and before the end."""
         if self._variables is None:
             return None
+        # What is not finite is counted where a file counts it: not in the histories, which are large.
+        large = {*self.recording.of_sites, *self.recording.fields}
+        for name, item in self._variables.items():
+            if name not in large:
+                item.attrs |= not_finite_in(item.values)
         # In one call, since xarray compares the dimensions of all variables whenever some are added.
         return with_point_names(chunks.run_dataset(self, self._variables, self._attributes))
 
