@@ -1,7 +1,7 @@
 """The manual's table of verbs and features: each yes is computed by the verb, each no is the verb's own message.
 
-Fast verbs compute every third feature, and those that take seconds every ninth, each verb others. A variable asks for
-all of them, which takes minutes of CPU: ``EVERY_FEATURE=1 python -m pytest tests/cli/test_feature_table.py``. That
+Fast verbs compute every third feature, runs and verbs that take seconds every ninth, each verb others. A variable asks
+for all of them, which takes minutes of CPU: ``EVERY_FEATURE=1 python -m pytest tests/cli/test_feature_table.py``. That
 engines agree on what a run computes is tested with the lattices of ``tests/zoo.py``.
 """
 
@@ -33,7 +33,8 @@ from vipetsc.figures import registry
 from vipetsc.lattice import UnitCell
 
 PLAIN = next(feature for feature in FEATURES if feature.name == "burst")
-DEAR = {"optimise", "identify", "law", "predict", "nfrc", "wave", "condensed"}  # columns whose verbs take seconds
+# Columns whose verbs take seconds, and those of runs, whose features are in ``tests/zoo.py``.
+DEAR = {"run", "propagator", "optimise", "identify", "law", "predict", "nfrc", "wave", "condensed"}
 EVERY = bool(os.environ.get("EVERY_FEATURE"))
 LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring", "strip of the plane"}
 ENDS = {"free ends", "ring"}
@@ -61,7 +62,7 @@ def answer(column: Column, feature: Feature) -> str:
 
 
 def is_in_turn(column: Column, feature: Feature) -> bool:
-    """Whether a yes is computed: every third one of a fast verb, every ninth one of a verb that takes seconds."""
+    """Whether a yes is computed: every third one of a fast verb, every ninth one of the columns ``DEAR``."""
     place = COLUMNS.index(column) + FEATURES.index(feature)
     return EVERY or place % (9 if column.heading in DEAR else 3) == 0
 

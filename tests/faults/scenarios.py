@@ -99,6 +99,8 @@ direction = "down"
 energy = [1e-4, 0.3]
 points = 3
 first_step = 1e-2
+harmonics = 41
+truncation = 1e-3
 """
 DESIGN = """
 [design]
@@ -189,6 +191,7 @@ range = [0.84, 0.9]
 fixed = [1.0, 2.0]
 harmonics = 1
 largest_step = 1.0
+points = 40
 [optimise]
 budget = 4
 population = 4

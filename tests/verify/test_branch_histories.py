@@ -150,6 +150,6 @@ class History(RuleBasedStateMachine):
 
 
 History.TestCase.settings = settings(
-    max_examples=8, stateful_step_count=4, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=4, stateful_step_count=3, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestHistory = History.TestCase

@@ -62,7 +62,7 @@ def test_folds_of_the_duffing_oscillator(tmp_path):
 )
 def test_the_curve_meets_special_points_of_other_amplitudes(changes, kind):
     """A special point that a curve over the frequency has at another amplitude lies on the curve of special points."""
-    options = {"harmonics": 21, "isola_reach": 1.2, "largest_step": 0.05, "points": 300}
+    options = {"harmonics": 21, "isola_reach": 1.04, "largest_step": 0.05, "points": 300}
     _, *special = follow_all(case_of(changes, curves_of=[kind], **options), None, MPI.COMM_SELF)
     amplitude = 0.205
     (other,) = follow_all(case_of(changes, fixed=[amplitude], **options), None, MPI.COMM_SELF)

@@ -48,7 +48,7 @@ STUDIES: dict[str, tuple[dict[str, Any], Any, Callable[[Any, Path], None], float
     "smooth modes": (nnm(system="own", own=KERSCHEN, start_energy=1e-3, energy=[0.0, 10.0]), NnmCase, branches, 0.0),
     "modes in contact": ({"lattice": LATTICE, "contacts": SITE, **nnm()}, NnmCase, branches, 0.0),
     "breathers": (
-        {"lattice": LATTICE, "contacts": SITE, **nnm(system="condensed", start_frequency=[1400.0])},
+        {"lattice": LATTICE, "contacts": SITE, **nnm(system="condensed", start_frequency=[1400.0], points=12, truncation=1e-4)},
         NnmCase,
         branches,
         1e-6,

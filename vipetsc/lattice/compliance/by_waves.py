@@ -90,7 +90,7 @@ class WaveCompliance(ChainCompliance):
         """The highest frequency of a wave in rad/s."""
         return pass_bands(self.chain.cell)[-1].high
 
-    @property
+    @cached_property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
         joined = [mass for pair in self._elements for mass in pair if mass != WALL]
@@ -218,8 +218,9 @@ class WaveCompliance(ChainCompliance):
         scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
         return complex(amplitude * scale * wave.factor**steps)
 
+    @cached_property
     def _stretches(self) -> list[Stretch]:
-        """Return the stretches without loads, from lower to higher cells; a ring's last one leads back to the first."""
+        """The stretches without loads, from lower to higher cells; a ring's last one leads back to the first."""
         cells = self.cells
         last = len(cells) - 1
         stretches = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
@@ -248,7 +249,7 @@ class WaveCompliance(ChainCompliance):
         blocks = coupling_blocks(chain.cell)
         coupling = blocks.out @ blocks.into.T
         half = blocks.out.shape[1]
-        stretches = self._stretches()
+        stretches = self._stretches
         size = len(self.cells) * d
         total = size + sum(stretch.unknowns(half) for stretch in stretches)
 
@@ -303,7 +304,7 @@ class WaveCompliance(ChainCompliance):
 
         half = solution.waves.factor.shape[1] // 2
         start = len(cells) * d
-        for stretch in self._stretches():
+        for stretch in self._stretches:
             stop = start + stretch.unknowns(half)
             place = self._place(cell, stretch)
             if place is not None:

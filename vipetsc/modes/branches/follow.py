@@ -53,6 +53,7 @@ from vipetsc.modes.branches.growth import Growth, Listener
 from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.shared_frequencies import check_modes_alone
 from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.sources import source_key
@@ -151,9 +152,14 @@ class Follower:
             self.growth.run(branch, problem, start, method.rule, direction)
         except interruptions:
             if method.finishes_interrupted and branch.points:
-                method.finish(problem, branch)
+                self._finish(problem, branch)
             raise
-        method.finish(problem, branch)
+        self._finish(problem, branch)
+
+    def _finish(self, problem: PeriodicProblem[Any], branch: Branch[Any]) -> None:
+        """Add what belongs to the whole branch (``Method.finish``), unless nobody would read it."""
+        if self.folder or not self.method.finishes_files_alone:
+            self.method.finish(problem, branch)
 
     def _stored_or_new(self, name: str) -> Branch[Any]:
         """Return the branch of that ``name`` as it is in its file when results are resumed, else one without points.

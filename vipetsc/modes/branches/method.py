@@ -42,7 +42,8 @@ class Method(ABC, Generic[S]):
 
     ``kind`` is the kind of their files. ``failures`` end a branch and not the program. ``keeps_empty``: a branch
     without points leaves a file that says why. ``finishes_interrupted``: a branch that failed or was stopped has the
-    additions to the file of a whole branch, too (``finish``). ``locates``: special points are looked for between the
+    additions to the file of a whole branch, too (``finish``). ``finishes_files_alone``: these are of no use without a
+    file, as in a search, whose branches stay in memory. ``locates``: special points are looked for between the
     regular ones, those where a contact grazes only with ``locates_grazing``. ``counts_start``: the start is one of the
     points of which the case gives the largest number.
     """
@@ -53,6 +54,7 @@ class Method(ABC, Generic[S]):
     counts_start: ClassVar[bool] = False
     keeps_empty: ClassVar[bool] = True
     finishes_interrupted: ClassVar[bool] = False
+    finishes_files_alone: ClassVar[bool] = False
     locates_grazing: bool = False
     locates: bool = True
 

@@ -46,6 +46,7 @@ class ResponseMethod(Method[Response]):
     kind = RESPONSES
     failures = FAILURES
     keeps_empty = False  # pictures and tables of curves need a first state
+    finishes_files_alone = True  # the linear motions take longer than a short curve
     counts_start = True
 
     case: NfrcCase
