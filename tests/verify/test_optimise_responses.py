@@ -117,7 +117,7 @@ def searched(tmp_path_factory):
     """The plan, the folder and the summary of a small search."""
     folder = tmp_path_factory.mktemp("search")
     # Curves of few points are enough, since the tests compare values of the same curves.
-    plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": {"largest_step": 0.3}}))
+    plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": {"largest_step": 0.3, "points": 200}}))
     return plan, folder, run_search(plan, folder, MPI.COMM_SELF).attrs["summary"]
 
 

@@ -20,7 +20,7 @@ DAMPING = 0.1
 
 def duffing(**nfrc) -> NfrcCase:
     """Return the case of the cubic oscillator by one harmonic, with the curve of its folds."""
-    options = {"source": "force", "over": "frequency", "range": [0.5, 2.0], "fixed": [0.2], "harmonics": 1}
+    options = {"source": "force", "over": "frequency", "range": [0.5, 2.0], "fixed": [0.2], "harmonics": 1, "isola_reach": 4.5}
     drive = {"waveform": "harmonic", "frequency": 1.0, "amplitude": 1.0, "cell": 1}
     tables = CUBIC_OSCILLATOR | {"name": "duffing", "drive": drive, "time": {"end": 1.0}}
     return NfrcCase.from_table(tables | {"nfrc": options | {"curves_of": ["fold"]} | nfrc})
@@ -62,8 +62,8 @@ def test_folds_of_the_duffing_oscillator(tmp_path):
 )
 def test_the_curve_meets_special_points_of_other_amplitudes(changes, kind):
     """A special point that a curve over the frequency has at another amplitude lies on the curve of special points."""
-    options = {"harmonics": 21, "isola_reach": 1.04, "largest_step": 0.05, "points": 300}
-    _, *special = follow_all(case_of(changes, curves_of=[kind], **options), None, MPI.COMM_SELF)
+    options = {"harmonics": 21, "isola_reach": 1.03, "points": 300}
+    _, *special = follow_all(case_of(changes, curves_of=[kind], largest_step=0.05, **options), None, MPI.COMM_SELF)
     amplitude = 0.205
     (other,) = follow_all(case_of(changes, fixed=[amplitude], **options), None, MPI.COMM_SELF)
     expected = next(point.measured.frequency for point in other.points if point.kind == kind)

@@ -58,7 +58,7 @@ def test_motions_close_after_three_periods_and_have_their_stability():
     small = 0.05
     curves = follow_all(duffing(small, range=[3.1, 3.6], harmonics=27), None, MPI.COMM_SELF)
     numbers = set()
-    for point in [point for curve in curves[1:] for point in curve.regular()[::8]]:
+    for point in [point for curve in curves[1:] for point in curve.regular()[::16]]:
         omega = point.measured.frequency
         z = (point.measured.outputs["spring_harmonics"] + 1j * point.measured.outputs["spring_harmonics_imaginary"])[0]
         rates = 1j * omega / 3 * np.arange(len(z))
