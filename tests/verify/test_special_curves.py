@@ -20,7 +20,14 @@ DAMPING = 0.1
 
 def duffing(**nfrc) -> NfrcCase:
     """Return the case of the cubic oscillator by one harmonic, with the curve of its folds."""
-    options = {"source": "force", "over": "frequency", "range": [0.5, 2.0], "fixed": [0.2], "harmonics": 1, "isola_reach": 4.5}
+    options = {
+        "source": "force",
+        "over": "frequency",
+        "range": [0.5, 2.0],
+        "fixed": [0.2],
+        "harmonics": 1,
+        "isola_reach": 4.5,
+    }
     drive = {"waveform": "harmonic", "frequency": 1.0, "amplitude": 1.0, "cell": 1}
     tables = CUBIC_OSCILLATOR | {"name": "duffing", "drive": drive, "time": {"end": 1.0}}
     return NfrcCase.from_table(tables | {"nfrc": options | {"curves_of": ["fold"]} | nfrc})

@@ -109,7 +109,14 @@ def test_modes_responses_and_fits_of_a_strip(tmp_path):
     # Below its clearance the response is the sum over the modes, with dashpots of 20/s to the ground.
     force, frequency = 0.05, 700.0
     drive = {"amplitude": force, "waveform": "harmonic", "frequency": frequency, "place": [2, 2]}
-    nfrc = {"source": "force", "over": "amplitude", "range": [0.5 * force, force], "fixed": [frequency], "harmonics": 5, "points": 20}
+    nfrc = {
+        "source": "force",
+        "over": "amplitude",
+        "range": [0.5 * force, force],
+        "fixed": [frequency],
+        "harmonics": 5,
+        "points": 20,
+    }
     table["lattice"]["damping"] = {"mass": 20.0}
     case = NfrcCase.from_table(
         table | {"drive": drive, "nfrc": nfrc, "output": {"points": [{"name": "far", "place": [4, 1]}]}}

@@ -25,6 +25,7 @@ pytestmark = pytest.mark.slow
 
 SITE = {"law": "bilinear", "stiffness": 1e7, "sites": [9], "clearance": 3e-4}
 LATTICE = {"cells": 24, "cell": PAIR}
+BREATHERS = {"system": "condensed", "start_frequency": [1400.0], "points": 12, "truncation": 1e-4}
 
 
 def branches(case: Any, folder: Path) -> None:
@@ -47,12 +48,7 @@ def nnm(**options: Any) -> dict[str, Any]:
 STUDIES: dict[str, tuple[dict[str, Any], Any, Callable[[Any, Path], None], float]] = {
     "smooth modes": (nnm(system="own", own=KERSCHEN, start_energy=1e-3, energy=[0.0, 10.0]), NnmCase, branches, 0.0),
     "modes in contact": ({"lattice": LATTICE, "contacts": SITE, **nnm()}, NnmCase, branches, 0.0),
-    "breathers": (
-        {"lattice": LATTICE, "contacts": SITE, **nnm(system="condensed", start_frequency=[1400.0], points=12, truncation=1e-4)},
-        NnmCase,
-        branches,
-        1e-6,
-    ),
+    "breathers": ({"lattice": LATTICE, "contacts": SITE, **nnm(**BREATHERS)}, NnmCase, branches, 1e-6),
     "responses": (
         {
             "lattice": LATTICE,
