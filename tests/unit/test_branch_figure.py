@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import branch_curves, nfrc, registry, response_family, response_outputs, style
+from vipetsc.figures.frequency_energy import slope
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.modes.branches.files import stored_states
@@ -111,6 +112,25 @@ def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
     assert branch_curves.lowest(branch).tolist() == [True, False, False, False, False, True, True]
 
 
+@pytest.mark.parametrize("change", [1e-14, 1e-8])
+def test_the_slope_of_a_linear_motion_is_not_drawn(change):
+    """It is the rounding of the period: a sentence takes its place."""
+    energy = np.geomspace(1e-7, 1e-4, 8)
+    columns = {
+        "energy": energy,
+        "frequency": np.full(8, 90.0),
+        "slope": 90 * change / energy * np.resize([1.0, -0.5], 8),
+        "kind": np.full(8, "regular"),
+        "contacts": np.zeros(8),
+        "region": np.ones(8),
+    }
+    axes = Figure().subplots()
+    slope(axes, xr.Dataset({name: ("point", values) for name, values in columns.items()}))
+    assert bool(axes.lines) == (change > 1e-12)
+    said = ["the frequency does not change with the energy"] * (not axes.lines)
+    assert [text.get_text() for text in axes.texts] == said
+
+
 def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
     assert set(registry.BRANCH_FIGURES) == set(branch_kinds.BRANCH_KINDS)
     assert len(registry.FIGURES) == len(registry._SPECS)
@@ -150,6 +170,9 @@ def test_undecided_states_look_the_same_in_all_panels_of_responses(draw, unstabl
     axes = Figure().subplots()
     draw(axes, branch)
     assert crosses_of(axes) == [i for i in range(3) if unstable[i] < 0]
+    if draw is nfrc._draw_energies:
+        # Its lines are told apart in grey by their dashes.
+        assert axes.get_legend().handlelength == style.DASHES_SEEN
     (broad,) = [line for line in axes.lines if line.get_linewidth() > 1 and line.get_marker() == "None"]
     assert np.isfinite(broad.get_ydata()).tolist() == [count == 0 for count in unstable]
     thin = [line for line in axes.lines if line.get_linewidth() <= 0.6 and line.get_alpha() is None]

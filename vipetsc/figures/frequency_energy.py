@@ -50,6 +50,7 @@ LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 
 MOST_ORBITS = 4  # whose portraits have room
 SLOPE = r"|d$f$/d$E$| (Hz/J)"
+ROUNDING = 1e-12  # of a frequency: its change from energy 0 on, by the slope, that a linear motion has
 
 # Heights of the panels of a column, in units of 1.55 inches.
 FREQUENCY_HEIGHT = 1.5
@@ -233,7 +234,7 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
     energy = branch["energy"].values[shown]
     steepness = np.abs(branch["slope"].values)[shown]
     is_lowest = lowest(branch)[shown]
-    if not np.any(steepness > 0):
+    if not np.any(steepness * energy > ROUNDING * branch["frequency"].values[shown]):
         # A logarithmic axis has no place for 0. The axis of the energy stays, as panels below may share it.
         axes.set(yticks=[], ylabel=SLOPE)
         reason = "the frequency does not change with the energy"

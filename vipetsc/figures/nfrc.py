@@ -284,4 +284,4 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     if np.nanmax(branch["share"].values) > 0.5:
         axes.set_ylim(-0.02, 1.04)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=6, loc="best")
+        axes.legend(fontsize=6, loc="best", handlelength=style.DASHES_SEEN)
