@@ -30,21 +30,22 @@ def lattice_table(**sections: dict[str, Any]) -> dict[str, Any]:
 def measured_table(
     folder: Path, table: dict[str, Any], noise: float = 0.0, seed: int = 1, quantity: str = "velocity"
 ) -> dict[str, Any]:
-    """Write the motion of the ``POINTS`` in a run of ``table`` into a file, and return the table of that record.
+    """Write the motion of the points in a run of ``table`` into a file, and return the table of that record.
 
     ``noise`` is the standard deviation of normal errors, as a fraction of the root mean square of each point's motion.
     """
+    points = table["output"]["points"]
     run = run_of(Case.from_table(table))
     values = run[f"points/{quantity}"].values
     size = np.sqrt(np.mean(values**2, axis=0))
     values = values + noise * size * np.random.default_rng(seed).standard_normal(values.shape)
     path = folder / f"{table['name']}-{quantity}-{seed}.csv"
     rows = np.column_stack([run["time"].values, values])
-    names = ",".join(["t", *(point["name"] for point in POINTS)])
+    names = ",".join(["t", *(point["name"] for point in points)])
     np.savetxt(path, rows, delimiter=",", header=names, comments="", fmt="%.17g")
     sensors = [
         {"quantity": quantity, "column": point["name"], "cell": point["cell"], "mass": point["mass"]}
-        for point in POINTS
+        for point in points
     ]
     return {"file": str(path), "time": "t", "sensors": sensors}
 
