@@ -73,8 +73,10 @@ def test_search_leaves_its_file_its_pictures_and_a_table(in_process, case, tmp_p
 
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     """A search without a cell whose masses move out of phase ends with 0, says so and has no optimum."""
-    # The resonators' springs are at least fifty times as stiff as the paper's.
-    stiff = set_words("design.lambda.first=5.0", "design.lambda.last=6.0")
+    # The resonators' springs are at least fifty times as stiff as the paper's. Each cell that is left is refined.
+    stiff = set_words(
+        "design.lambda.first=5.0", "design.lambda.last=6.0", "design.lambda.count=2", "design.eta.count=3"
+    )
 
     done = in_process("design", case, "--out", tmp_path / "out", *stiff)
     assert done.returncode == 0, done.stderr

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import os
 
-import pytest
-
-from tests.conftest import clean_environment
-
 TINY = """
 [lattice]
 preset = "diatomic"
@@ -41,14 +37,6 @@ def test_a_marker_that_is_no_text_is_another_case(in_process, tmp_path):
     (out / "case.toml").write_bytes(b"\x89HDF")
     assert "its case.toml cannot be read" in in_process("run", case, "--out", out).stderr
     assert in_process("run", case, "--out", out, "--force").returncode == 0
-
-
-@pytest.mark.slow
-def test_a_backend_of_windows_is_of_no_matter(vipetsc, tmp_path):
-    """An unknown backend in MPLBACKEND has no effect, although matplotlib reads the variable at its import."""
-    ended = vipetsc(0, "bands", "--out", tmp_path, env=clean_environment() | {"MPLBACKEND": "foo"})
-    assert ended.returncode == 0, ended.stderr
-    assert (tmp_path / "bands.png").exists()
 
 
 def test_samples_in_a_folder_whose_name_is_no_text_are_refused(in_process, tmp_path):

@@ -58,18 +58,21 @@ def loaded_by(*commands: tuple[object, ...]) -> list[set[str]]:
     return [HEAVY & {*line[2:]} for line in lines]
 
 
-def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_kernels(tmp_path):
+def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_kernels(tmp_path, monkeypatch):
     """Help, schema, manual and examples load none of the libraries, ``validate`` at most scipy.optimize.
 
     None of them starts MPI or PETSc. A search refines the bands. ``validate`` estimates the cost of a run from its
     steps, without the engines' kernels, which ``bands`` does not load either.
     """
+    # Matplotlib reads this variable at its import. A backend that it does not know has no effect.
+    monkeypatch.setenv("MPLBACKEND", "foo")
     nothing = [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts"), ("examples",)]
     loaded = loaded_by(*nothing, ("validate", CASE), ("bands", CASE, "--out", tmp_path))
     assert loaded[:5] == [set()] * 5
     assert loaded[5] <= {"scipy.optimize"}
     # The module that draws bands also draws runs, and must not load kernels.
     assert "numba" not in loaded[6]
+    assert (tmp_path / "bands.png").exists()
 
 
 def test_what_one_process_answers_are_verbs_and_a_flag():
