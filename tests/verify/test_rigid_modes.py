@@ -167,6 +167,38 @@ def test_orbits_close_by_an_independent_integration(side, mode):
         assert np.trace(whole) == pytest.approx(2 + 2 * np.sum(point.half_traces).real, rel=1e-6, abs=1e-6)
 
 
+TWINS = {
+    "masses": [1.0, 1.0],
+    "springs": [{"start": i, "end": j, "stiffness": k} for i, j, k in [(0, 1, 4.0), (1, 2, 1.0), (0, 2, 4.0)]],
+    "contacts": [{"host": 0, "resonator": i, "clearance": 1.0} for i in (1, 2)],
+}
+
+
+def test_two_stops_that_are_touched_at_one_instant_make_one_corner():
+    """Two equal masses in opposite phase have stops to the ground: each moves as one mass with omega^2 = 4 + 2."""
+    nnm = {"system": "own", "modes": [2], "energy": [0.0, 50.0], "own": TWINS}
+    (branch,) = followed({"name": "twins", "contacts": {"law": "rigid"}, "nnm": nnm}, Ending.OUT_OF_ENERGIES)
+    struck = [point for point in branch.points if point.episodes]
+    assert len(struck) > 30
+    for point in struck:
+        amplitude = np.sqrt(point.energy / 6.0)
+        assert point.period == pytest.approx(4 * np.arcsin(1 / amplitude) / np.sqrt(6.0), rel=1e-10, abs=0)
+
+
+def test_a_stop_that_yields_makes_no_corner():
+    """Beside a rigid stop a bilinear one is met first: the branch goes on smoothly there."""
+    stops = [{"host": 0, "resonator": 1, "clearance": 1.0}, {"host": 0, "resonator": 2, "clearance": 1.4}]
+    own = {"masses": [1.0, 2.0], "springs": [{"start": 0, "end": 1, "stiffness": 4.0}], "contacts": stops}
+    own["springs"].append({"start": 1, "end": 2, "stiffness": 3.0})
+    contacts = {"stiffness": 100.0, "each": {"law": ["rigid", "bilinear"]}}
+    nnm = {"system": "own", "modes": [1], "energy": [0.0, 2.4], "points": 150, "own": own}
+    (branch,) = followed({"name": "mixed", "contacts": contacts, "nnm": nnm}, Ending.OUT_OF_ENERGIES)
+    grazing = [point for point in branch.points if point.kind == "grazing"]
+    assert [point.episodes for point in grazing] == [0, 1]
+    energy = System.assemble([1.0, 2.0], [(None, 0, 4.0), (0, 1, 3.0)], [ContactPair(None, 1, 1.4, RIGID)])
+    assert grazing[0].energy == pytest.approx(energy.grazing_energy(0), rel=1e-7)
+
+
 def test_the_cell_of_the_built_in_lattice_has_rigid_modes():
     """Both modes of the reduced model reach their stops, and their frequencies rise from there on."""
     table = {"name": "four-band", "contacts": {"law": "rigid"}, "nnm": {"points": 80}}

@@ -147,7 +147,8 @@ def sites_at(
     # Many sites have few laws, and most share the objects: each object is looked at once.
     objects = {id(law): law for law in laws}
     distinct = tuple(dict.fromkeys(objects.values()))
-    numbers = {key: distinct.index(law) for key, law in objects.items()}
+    order = {law: number for number, law in enumerate(distinct)}
+    numbers = {key: order[law] for key, law in objects.items()}
 
     table["cell"] = cells
     table["law"] = [numbers[id(law)] for law in laws]

@@ -229,6 +229,8 @@ ROUNDING = 8
 DEGENERATE = 1e-12
 # Part of the interval of two samples by which an arc to a touch ends before it.
 AHEAD = 0.01
+# Rows of touches that differ by less than this are those of one contact, of which samples are near each touch.
+ALIKE = 0.01
 # Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
 # than ``TOUCH``.
 SAMPLES = 2000
@@ -560,7 +562,7 @@ class Shooting(OrbitProblem):
 
         Let the speed there be s. To first order the orbit changes by a jump of the velocity, -2 mu s M^-1 h^T at the
         instant of the touch, while the largest w, without the jump, exceeds D by s^2/(2 |w''|): H' (dx, dT) and what
-        the jump makes of H add up to 0, and dw = 0. To second order x changes along the gradient of w.
+        the jump makes of H add up to 0, and dw = 0. To second order x changes along the gradients of w.
         """
         arc = self.arc(point.x, point.period)
         u = self._samples(arc, point.period)
@@ -570,8 +572,8 @@ class Shooting(OrbitProblem):
 
         n = self.system.dofs
         jump = np.zeros(n)
-        rise = np.zeros(n)
-        bend = 0.0
+        rises = []
+        bends = []
         # Several touches at one speed, by a symmetry, count each.
         for number, place in touches:
             row = self.system.contact_rows[number]
@@ -582,16 +584,26 @@ class Shooting(OrbitProblem):
             before = self.flow.arc(arc.start, time, point.period).sensitivity
             rest = np.linalg.solve(before.T, arc.sensitivity[self.zero].T).T
             jump += rest[:, n:] @ (-2 * side * moved / (row @ moved))
-            rise = side * row @ before[:n, self.free]
-            bend = 0.5 / abs(moved @ self.system.forces(u[place]))
+            rises.append(side * row @ before[:n, self.free])
+            bends.append(0.5 / abs(moved @ self.system.forces(u[place])))
 
-        matrix = np.vstack([self.jacobian(arc), np.append(rise, 0.0)])
-        tangent = np.linalg.solve(matrix, np.append(-jump, 0.0))
-        return Corner(replace(point, tangent=tangent), np.append(bend * rise / (rise @ rise), 0.0))
+        # By least squares, since the touches of one contact have equal rows. The shortest bend has all speeds alike.
+        matrix = np.vstack([self.jacobian(arc), np.pad(rises, [(0, 0), (0, 1)])])
+        tangent = np.linalg.lstsq(matrix, np.append(-jump, np.zeros(len(rises))), rcond=None)[0]
+        bend = np.linalg.lstsq(np.array(rises), np.array(bends), rcond=ALIKE)[0]
+        return Corner(replace(point, tangent=tangent), np.append(bend, 0.0))
 
     def has_corner(self, before: Point, after: Point) -> bool:
         """Return whether a rigid stop is first struck, or no longer, between two points."""
-        return self.system.has_rigid_stops and before.episodes != after.episodes
+        if before.episodes == after.episodes or not self.system.has_rigid_stops:
+            return False
+        # Contacts that yield make no corner.
+        return bool(self.system.is_rigid.all()) or self._impacts(before) != self._impacts(after)
+
+    def _impacts(self, point: Point) -> int:
+        """Return the number of impacts on rigid stops in the arc of an orbit."""
+        events = self.arc(point.x, point.period).events
+        return np.count_nonzero(self.system.is_rigid[events[:, 1].astype(int)])
 
     def acceleration(self, point: Point) -> float:
         """Return largest acceleration where an orbit rests, over that of a harmonic motion of the same size and period.
