@@ -29,7 +29,7 @@ SHORT = [scenario.name for scenario in SCENARIOS.values() if scenario.is_short]
 # The reduced system passes through the same phases as a system of one's own.
 ONE_CELL = {"reduced"}
 # The number of kills: each ends a worker, and a new one takes seconds.
-KILLS = 1
+KILLS = 2
 
 
 def test_every_verb_that_leaves_results_meets_faults_and_kills():
