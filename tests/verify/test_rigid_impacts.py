@@ -335,12 +335,13 @@ def test_keys_of_stops_that_yield_are_refused(changes, key):
 def test_a_sweep_has_rigid_stops_beside_others():
     """Each law takes its own of the keys that all members have."""
     table = row(2, 1.0).varied_table()
-    table["contacts"] |= {"stiffness": 1e9, "damping": "exact", "exponent": 1.2}
+    table["contacts"] |= {"damping": "exact", "exponent": 1.2}
+    table["contacts"]["each"] = {"stiffness": [1e9]}
     table["sweep"] = {"contacts": {"law": ["rigid", "bilinear", "power"]}}
     sweep = Sweep.from_table(table)
     laws = [member.case.contacts for member in sweep.members()]
     assert [law.law for law in laws] == ["rigid", "bilinear", "power"]
-    assert [law.stiffness for law in laws] == [None, 1e9, 1e9]
+    assert [law.each and law.each.stiffness for law in laws] == [None, [1e9], [1e9]]
     assert [law.exponent for law in laws] == [None, None, 1.2]
 
 

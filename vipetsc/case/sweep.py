@@ -179,6 +179,9 @@ class Sweep(StudyCase):
             for key in keys_of_other_laws(str(contacts.get("law"))):
                 if f"contacts.{key}" not in varied:
                     contacts.pop(key, None)
+                each = contacts.get("each")
+                if isinstance(each, dict) and f"contacts.each.{key}" not in varied:
+                    each.pop(key, None)
         return table, problems
 
     def member(self, number: int) -> SweepMember:
