@@ -173,7 +173,7 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     case = absorber(0.05, 0.01, largest_step=0.3)
     [curve] = follow_all(case, None, MPI.COMM_SELF)
     # Linear motions for comparison are of use in files alone, and take longer than the curve.
-    assert not curve.extra
+    assert not [name for name in curve.extra if name.startswith("linear")]
     # A complete curve is taken there and back: turning back by itself would need impacts.
     ended = Ending.CLOSED.with_numbers()
     there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ended=ended)
