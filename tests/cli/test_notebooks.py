@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,14 @@ def cells(path: Path, kind: str) -> list[str]:
     """Return the texts of a notebook's cells of one kind."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+def test_the_four_are_there():
+    """The manual has four notebooks, and its chapter *notebooks* has a link to each."""
+    assert {path.stem for path in NOTEBOOKS} == {"own-lattice", "sweep-heat-map", "breather", "measured-data"}
+    chapter = (FOLDER.parent / "notebooks.md").read_text(encoding="utf-8")
+    for path in NOTEBOOKS:
+        assert f"(notebooks/{path.name})" in chapter
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -93,3 +104,25 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
         assert "in s? In ms, their spectrum would be largest at 10" in printed
         assert printed.splitlines()[-2] == "[]"
         assert names["result"].statistics["episodes"] > 0
+
+
+EXECUTE = """
+import sys, nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], as_version=4)
+nbclient.NotebookClient(notebook, timeout=240).execute()
+nbformat.write(notebook, "executed.ipynb")
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_executes_one(tmp_path):
+    """The shortest notebook ends in a kernel of its own, with the display of its case."""
+    for name in ("ipykernel", "nbclient", "nbformat"):
+        if find_spec(name) is None:
+            pytest.skip(f"{name} is not installed")
+
+    # In a process of its own: a client loads ipykernel, and progress would take this process for a notebook.
+    subprocess.run([sys.executable, "-c", EXECUTE, FOLDER / "own-lattice.ipynb"], cwd=tmp_path, check=True, timeout=300)
+    cells = json.loads((tmp_path / "executed.ipynb").read_text(encoding="utf-8"))["cells"]
+    kinds = {kind for cell in cells for out in cell.get("outputs", []) for kind in out.get("data", {})}
+    assert "text/html" in kinds
