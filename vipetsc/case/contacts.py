@@ -263,8 +263,10 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> list[Contact]:
     per_site = lists_of(contacts)
     # Sides and pairs are no part of a law: the sites of the chain hold them.
     keys = [key for key in per_site if key not in SIDES + JOINS]
-    if not keys or not count:
-        return [contact_of(contacts)] * count if count else []
+    if not count:
+        return []
+    if not keys:
+        return [contact_of(contacts)] * count
 
     # Each site has the common law, with the changes of the lists; sites with the same changes have one law.
     laws: dict[str, Contact] = {}

@@ -139,6 +139,5 @@ def solve(joined: JoinedSites, x: np.ndarray) -> None:
             x[i] = 0.0
     for i in range(x.size - 1, -1, -1):
         for j in range(first[i], i):
+            # Of a dependent site j this entry is 0, so that its 0 stays.
             x[j] -= values[start[i] + j - first[i]] * x[i]
-        if diagonal[i] == 0.0:
-            x[i] = 0.0
