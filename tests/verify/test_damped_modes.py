@@ -80,9 +80,9 @@ def test_a_free_motion_decays_as_the_mode_says():
     assert ratios.max() / ratios.min() > 1.15
 
     point = branch.points[-1]
-    order = 63
+    order = point.order
     count = order // 2 + 1
-    parts = point.x[:-1].reshape(2, 2 * count)
+    parts = point.x[1:].reshape(2, 2 * count)
     omega = 2 * np.pi / point.period
     u = parts[:, :count].sum(axis=1)
     v = -omega * (parts[:, count:] * np.arange(1, order + 1, 2)).sum(axis=1)

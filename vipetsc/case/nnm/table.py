@@ -10,7 +10,7 @@ from vipetsc.case.section import BY_SHAPE, Section, described
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
 MOST_MASSES = 4000
-# Last harmonic of damped modes at most; their number does not adapt to the motion.
+# Last harmonic of damped modes at most: all masses have harmonics.
 MOST_OF_DAMPED = 63
 
 Bounds = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(rising)]

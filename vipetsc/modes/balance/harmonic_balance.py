@@ -272,6 +272,7 @@ class RealUnknowns:
     def __init__(self, rows: int, order: int, odd: bool, cosines: bool) -> None:
         self.rows = rows
         self.order = order
+        self.odd = odd
         self.cosines = cosines
         self.orders = np.arange(order + 1)
         if odd:
@@ -355,7 +356,6 @@ class HarmonicBalance(RealUnknowns):
         super().__init__(forces.pairs, order, odd, cosines)
         self.compliance = compliance
         self.forces = forces
-        self.odd = odd
         self.weight = weight
         if shifted is None:
             shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
@@ -374,6 +374,10 @@ class HarmonicBalance(RealUnknowns):
         """Return the forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
         key = x.tobytes(), omega
         return self._series.get(key, lambda: self.forces.series(self.unpack(x), omega))
+
+    def elongations(self, x: np.ndarray) -> np.ndarray:
+        """Return harmonics (pairs, K + 1) complex in m of the elongations, which are the unknowns themselves."""
+        return self.unpack(x)
 
     def shift(self, omega: float) -> np.ndarray:
         """Return the stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
@@ -532,7 +536,7 @@ MOST_GROWTH = 2.0
 
 
 def order_needed(
-    balance: HarmonicBalance, x: np.ndarray, truncation: float, allowed: float, fewest: int, fewer: float = FEWER
+    balance: RealUnknowns, x: np.ndarray, truncation: float, allowed: float, fewest: int, fewer: float = FEWER
 ) -> int:
     """Return the order, odd and at least ``fewest``, for motions near one with a ``truncation`` where ``allowed`` is.
 

@@ -249,78 +249,73 @@ def _condensed_variables(branch: Branch[Point]) -> Variables:
     if all(p.order % 2 and len(p.x) <= p.order // 2 * places + places for p in points):
         orders = 2 * orders + 1
     axes = "point", "place", "order"
-    last = np.array([p.order for p in points], int)
-    left_out = np.array([p.truncation for p in points], float)
-    elongations = branch.column("elongations").reshape(len(points), places)
     return _nnm_variables(branch) | {
-        "place": variable("place", np.arange(1, places + 1), "1", "contact, then smooth spring"),
         "order": variable("order", orders, "1", "harmonic of the frequency"),
         "harmonics": variable(axes, harmonics, "m", "cosine of the elongation (of a contact, w)"),
         "tangent": variable(axes, tangent, "m", "tangent of the branch: harmonics"),
-        "elongation": variable(("point", "place"), elongations, "m", "elongation at phase 0, at rest"),
-        "harmonics_kept": variable("point", last, "1", "number of the last harmonic"),
-        "truncation": variable(
-            "point", left_out, "1", "estimated size of the neglected harmonics over that of the motion"
-        ),
+        **_balance_variables(branch),
     }
 
 
-def _damped_variables(branch: Branch[Point]) -> Variables:
-    """Return harmonics of all masses and the damping ratio of damped modes, as unknowns, and their tangents."""
-    count = branch.dofs
-    x = branch.column("x").reshape(len(branch.points), count)
-    # The first point of a branch that has gone no further has no tangent.
-    directions = [p.tangent[:-1] if p.tangent.size else np.full(count, np.nan) for p in branch.points]
-    elongations = np.array([p.elongations for p in branch.points]).reshape(len(branch.points), -1)
-    text = "mass by mass, cosines of all harmonics and then minus their sines (m); last, the damping ratio"
-    return _nnm_variables(branch) | {
-        "unknown": variable("unknown", np.arange(1, count + 1), "1", "number of the unknown"),
-        "x": variable(("point", "unknown"), x, "1", text),
-        "tangent": variable(("point", "unknown"), np.reshape(directions, x.shape), "1", "tangent of the branch"),
-        "truncation": variable("point", branch.column("truncation"), "1", "estimated size of the neglected harmonics"),
-        "place": variable("place", np.arange(1, elongations.shape[1] + 1), "1", "contact, then smooth spring"),
+def _balance_variables(branch: Branch[Point]) -> Variables:
+    """Return what all motions by harmonic balance have: elongations, and how many harmonics."""
+    elongations = branch.column("elongations").astype(float).reshape(len(branch.points), branch.dofs)
+    left_out = "estimated size of the neglected harmonics over that of the motion"
+    return {
+        "place": variable("place", np.arange(1, branch.dofs + 1), "1", "contact, then smooth spring"),
         "elongation": variable(("point", "place"), elongations, "m", "elongation at phase 0"),
-        "harmonics_kept": variable("point", branch.column("order"), "1", "number of the last harmonic"),
+        "harmonics_kept": variable("point", branch.column("order").astype(int), "1", "number of the last harmonic"),
+        "truncation": variable("point", branch.column("truncation").astype(float), "1", left_out),
+    }
+
+
+def _balance_fields(data: xr.Dataset) -> list[dict[str, Any]]:
+    """Return fields of ``Point`` that all motions by harmonic balance have, of every point in a file."""
+    points = _nnm_fields(data)
+    for i, fields in enumerate(points):
+        fields["order"] = int(data["harmonics_kept"].values[i])
+        fields["truncation"] = float(data["truncation"].values[i])
+        fields["elongations"] = data["elongation"].values[i]
+    return points
+
+
+def _damped_variables(branch: Branch[Point]) -> Variables:
+    """Return the unknowns of damped modes, and their tangents, padded with NaN to the most harmonics."""
+    points = branch.points
+    x = _padded([p.x for p in points])
+    # The first point of a branch that has gone no further has no tangent.
+    tangent = np.full(x.shape, np.nan)
+    for row, point in zip(tangent, points, strict=True):
+        row[: max(len(point.tangent) - 1, 0)] = point.tangent[:-1]
+    text = "the damping ratio; then, mass by mass, cosines of all harmonics and minus their sines (m)"
+    return _nnm_variables(branch) | {
+        "unknown": variable("unknown", np.arange(1, x.shape[1] + 1), "1", "number of the unknown"),
+        "x": variable(("point", "unknown"), x, "1", text),
+        "tangent": variable(("point", "unknown"), tangent, "1", "tangent of the branch"),
+        **_balance_variables(branch),
     }
 
 
 def _damped_modes(data: xr.Dataset) -> list[Point]:
     """Return the damped modes of a file."""
     points = []
-    for i, fields in enumerate(_nnm_fields(data)):
+    for i, fields in enumerate(_balance_fields(data)):
+        x = data["x"].values[i]
         tangent = np.append(data["tangent"].values[i], data["tangent_period"].values[i])
-        point = Point(
-            **fields,
-            x=data["x"].values[i],
-            zeta=float(data["x"].values[i, -1]),
-            tangent=tangent[np.isfinite(tangent)],
-            truncation=float(data["truncation"].values[i]),
-            elongations=data["elongation"].values[i],
-            order=int(data["harmonics_kept"].values[i]),
-        )
-        points.append(point)
+        points.append(Point(**fields, x=x[np.isfinite(x)], zeta=float(x[0]), tangent=tangent[np.isfinite(tangent)]))
     return points
 
 
 def _condensed_motions(data: xr.Dataset) -> list[Point]:
     """Return the condensed motions of a file."""
     points = []
-    for i, fields in enumerate(_nnm_fields(data)):
-        order = int(data["harmonics_kept"].values[i])
-        count = int(np.count_nonzero(data["order"].values <= order))
+    for i, fields in enumerate(_balance_fields(data)):
+        count = int(np.count_nonzero(data["order"].values <= fields["order"]))
         tangent_period = data["tangent_period"].values[i]
         tangent = np.empty(0)
         if np.isfinite(tangent_period):
             tangent = np.append(data["tangent"].values[i, :, :count].ravel(), tangent_period)
-        point = Point(
-            **fields,
-            x=data["harmonics"].values[i, :, :count].ravel(),
-            tangent=tangent,
-            order=order,
-            truncation=float(data["truncation"].values[i]),
-            elongations=data["elongation"].values[i],
-        )
-        points.append(point)
+        points.append(Point(**fields, x=data["harmonics"].values[i, :, :count].ravel(), tangent=tangent))
     return points
 
 
@@ -398,6 +393,6 @@ FORMATS = {
     CONDENSED: Format(
         ("point", "harmonics", "tangent", "next_step"), "place", _condensed_variables, _condensed_motions
     ),
-    DAMPED: Format(("point", "x", "tangent", "next_step"), "unknown", _damped_variables, _damped_modes),
+    DAMPED: Format(("point", "x", "tangent", "next_step"), "place", _damped_variables, _damped_modes),
     RESPONSES: Format(("xi", "tangent", "next_step"), "site", _response_variables, _responses),
 }
