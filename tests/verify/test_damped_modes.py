@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 from vipetsc.case import NnmCase
+from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
 
 pytestmark = pytest.mark.parallel(1)
@@ -52,6 +53,17 @@ def test_a_duffing_oscillator_has_the_conservative_frequency():
         square = np.sqrt(1 + 4 * point.energy) - 1
         period = 4 * ellipk(square / (2 * (1 + square))) / np.sqrt(1 + square)
         assert point.period == pytest.approx(period, rel=1e-8)
+
+
+def test_a_file_has_the_motions_of_different_orders(tmp_path):
+    """The harmonics of a branch adapt to the motion; a file returns each point with its own."""
+    (branch,) = follow_all(case_of(TWO_MASSES, modes=[1], energy=[0.0, 3.0]), None, MPI.COMM_SELF)
+    assert len(set(branch.column("order").tolist())) > 1
+    write_branch(branch, tmp_path, {})
+    read = read_branch(tmp_path / f"branch-{branch.name}.h5")
+    for point, stored in zip(branch.points, read.points, strict=True):
+        for name in ("x", "tangent", "zeta", "loss", "period", "order", "truncation", "elongations"):
+            assert np.array_equal(getattr(point, name), getattr(stored, name)), name
 
 
 def test_small_motions_are_the_complex_modes():
