@@ -7,6 +7,7 @@ if the checks that come after reading it (of an engine, of linear modes) accept 
 message that refuses it.
 """
 
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,6 +26,7 @@ ROOT = Path(__file__).parents[1]
 CHAPTER = ROOT / "vipetsc" / "manual" / "features.md"
 YES = "yes"
 UNREAD = "-"  # the verb reads no section that has the feature
+SEPARATOR = "\n"  # between the sentences that refuse one feature
 
 # A chain of masses on which resonators sit: pass bands 0-1468 and 1936-3405 rad/s.
 HOST_SPRING = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
@@ -113,7 +115,7 @@ def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
 
 def _sentences(error: CaseError) -> str:
     """The remedies of ``error``, each once, without the keys and the values of the small case."""
-    return "; ".join(dict.fromkeys(problem.remedy for problem in error.problems))
+    return SEPARATOR.join(dict.fromkeys(problem.remedy for problem in error.problems))
 
 
 def _propagator_refusal(case: Case) -> str:
@@ -354,39 +356,51 @@ def answers() -> Mapping[str, Sequence[str]]:
 
 
 def chapter() -> str:
-    """The manual's chapter with the table, and the reasons below it."""
+    """Return the manual's chapter: a table of the refusals by feature, and the reasons below it."""
     rows = answers()
-    reasons = list(dict.fromkeys(reason for row in rows.values() for reason in row if reason not in (YES, UNREAD)))
-    return "\n".join([*_introduction(), *_table(rows, reasons), "", *_reasons(reasons), ""])
+    refused = [answer for row in rows.values() for answer in row if answer not in (YES, UNREAD)]
+    reasons = list(dict.fromkeys(reason for answer in refused for reason in answer.split(SEPARATOR)))
+    return "\n".join([*_introduction(rows), *_table(rows, reasons), "", *_reasons(reasons), ""])
 
 
-def _introduction() -> Iterator[str]:
-    yield from (
-        "# Verbs and features",
-        "",
-        "Each answer is that of the program to a small case with one feature: **yes**, or the number of the message",
-        f"that refuses it, below the table; `{UNREAD}` where the verb reads no section that has the feature. A message",
-        "with *not yet* gives no reason of physics: the verb could accept the feature, but is not written for it.",
-        "",
-        "The columns are verbs, and some of their forms: `run` by `ts` and by the `propagator` (a run that it refuses",
-        "goes on with `ts`), `bands --modes` (linear modes, without dashpots), `nfrc` of a force or a moved wall and",
-        "of an incident `wave`, and `nnm` of each system, of which `condensed` has the breathers. `plot` and `export`",
-        "accept the run of every feature.",
-        "",
-    )
+def _introduction(rows: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    accepted = [name for name, row in rows.items() if set(row) <= {YES, UNREAD}]
+    text = f"""
+        The table lists which verbs refuse a feature of a case; all other verbs accept it. A number stands for the
+        message below the table. A message with *not yet* gives no reason of physics: the verb could accept the feature,
+        but is not written for it. Every verb accepts {", ".join(accepted[:-1])} and {accepted[-1]}.
+
+        `propagator` is `run` by that engine (a run that it refuses goes on with `ts`), `bands` is `bands --modes`
+        (linear modes, without dashpots), `nfrc` has a force or a moved wall, `wave` is `nfrc` with an incident wave, and
+        the last four are the systems of `nnm`, of which `condensed` has the breathers. `nnm` reads no drive and no
+        initial motion, and its system `own` neither the lattice nor the sites. `plot` and `export` accept the run of
+        every feature.
+    """
+    yield "# Verbs and features"
+    for paragraph in textwrap.dedent(text).strip().split("\n\n"):
+        yield ""
+        yield textwrap.fill(paragraph.replace("\n", " "), 120, break_on_hyphens=False)
+    yield ""
 
 
 def _table(rows: Mapping[str, Sequence[str]], reasons: Sequence[str]) -> Iterator[str]:
-    """The lines of the table, whose entries refer to the ``reasons`` by numbers."""
-    shown = {reason: str(number) for number, reason in enumerate(reasons, 1)} | {YES: YES, UNREAD: UNREAD}
-    yield f"| feature | {' | '.join(column.heading for column in COLUMNS)} |"
-    yield "|---" * (len(COLUMNS) + 1) + "|"
+    """Yield the lines of the table, whose entries refer to the ``reasons`` by numbers."""
+    number = {reason: str(place) for place, reason in enumerate(reasons, 1)}
+    yield "| feature | refused by |"
+    yield "|---|---|"
     for name, row in rows.items():
-        yield f"| {name} | {' | '.join(shown[reason] for reason in row)} |"
+        columns: dict[str, list[str]] = {}
+        for column, answer in zip(COLUMNS, row, strict=True):
+            if answer not in (YES, UNREAD):
+                numbers = ", ".join(number[reason] for reason in answer.split(SEPARATOR))
+                columns.setdefault(numbers, []).append(f"`{column.heading}`")
+        if columns:
+            refused = [f"{', '.join(headings)} ({numbers})" for numbers, headings in columns.items()]
+            yield f"| {name} | {'; '.join(refused)} |"
 
 
 def _reasons(reasons: Sequence[str]) -> Iterator[str]:
-    """The numbered ``reasons``."""
+    """Yield the numbered ``reasons``."""
     for number, reason in enumerate(reasons, 1):
         yield f"{number}. {reason}"
 

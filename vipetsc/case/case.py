@@ -347,7 +347,7 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
     initial = sections.get("initial")
     has_wave = drive.amplitude != 0 or bool(drive.wave_choices)
     if initial is not None and initial.frequency and has_wave and valid("initial", "drive"):
-        yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; omit this key")
+        yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; remove this key")
     if drive.amplitude != 0:
         return
 

@@ -143,7 +143,7 @@ def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any
     left, right = _boundaries(boundary, size)
     if right and {"K_next", "C_next"} & matrices.keys():
         raise MatrixError(
-            "has K_next, the coupling to the next cell, which lattice.cell.boundary describes too; omit one"
+            "has K_next, the coupling to the next cell, which lattice.cell.boundary describes too; remove one"
         )
 
     none = np.zeros((size, size))
@@ -172,7 +172,7 @@ def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any
     for spring in springs:
         if spring["stiffness"] == 0:
             raise MatrixError(
-                f"C couples {spring['start']} and {spring['end']}, which K does not; add K there, or omit C"
+                f"C couples {spring['start']} and {spring['end']}, which K does not; add K there, or remove C"
             )
     filled: dict[str, Any] = {"masses": masses, "springs": springs}
     grounding = _to_ground(damping)

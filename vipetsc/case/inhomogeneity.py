@@ -111,7 +111,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], 
             remedy = (
                 "some springs or dashpots of the cell are negative: whether cells that differ are stable is not known"
             )
-            problems.append(Problem(path, None, f"{remedy}; omit it"))
+            problems.append(Problem(path, None, f"{remedy}; remove it"))
             return
         # A view into the array of all cells, which the change is written into.
         column = arrays[name][:, index]
@@ -203,7 +203,7 @@ def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
     springs = [chain.spring(last, number) for number, spring in enumerate(cell.springs) if spring.offset]
     if all(spring.is_linear for spring in springs):
         return []
-    remedy = f"a wall can only move a linear spring: omit quadratic and cubic in cell {lattice.cells}"
+    remedy = f"a wall can only move a linear spring: remove quadratic and cubic in cell {lattice.cells}"
     return [Problem(key, "right", remedy)]
 
 

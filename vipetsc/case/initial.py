@@ -237,7 +237,7 @@ def check_initial(
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
     elif initial.kind in ("mode", "packet") and cell and not cell.joins_cells:
-        remedy = "without springs from cell to cell a lattice has no waves, and its modes are those of single cells"
+        remedy = "without springs from cell to cell a lattice has no waves, and only modes of single cells"
         remedy += '; kind = "velocity" gives velocities to masses'
         yield Problem("initial.kind", initial.kind, remedy)
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):

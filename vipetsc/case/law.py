@@ -51,7 +51,7 @@ class LawTable(Section):
     """
 
     site: int | None = described(
-        "number of a site, from 1: the law is that of its kind; default: the site nearest to the drive", None, ge=1
+        "number of a site, from 1, whose kind the law has; default: the site nearest to the drive", None, ge=1
     )
     clearance: Positive | None = described(
         "clearance of the single site; default: geometric mean over the sites", None, unit="m"
@@ -147,12 +147,12 @@ class LawCase(Case):
         "nonlinear springs": "with nonlinear springs, waves depend on amplitude even without contact",
         "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
-        "strips": "the waves that leave a site of a strip go to all sides, and the law has those of one direction",
-        "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
-        "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
-        "rigid stops": "sites are compared by the stiffness of stops that yield, which a rigid stop does not have",
-        "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
-        "many drives": "the law is that of one wave",
+        "strips": "the waves that leave a site of a strip go to all sides",
+        "absorbing ends": "runs end before waves return, so that nothing has to be absorbed",
+        "touching stops": "the law is one of amplitude over clearance, and there is no clearance",
+        "rigid stops": "sites are compared by the stiffness of their stops",
+        "initial motion": "fractions refer to the work of the drive, in a lattice at rest",
+        "many drives": "the law has one wave",
         "other waveforms": 'the scattering law needs a finite single-frequency wave: use waveform = "burst"',
     }
     waveforms = ("burst",)
@@ -189,7 +189,7 @@ class LawCase(Case):
             return
         cell, _ = check_cell(sections["lattice"])
         if cell is not None and not cell.joins_cells:
-            remedy = "only contacts join the cells, so that no linear wave arrives at a site, which the law is about"
+            remedy = "only contacts join the cells, so that no linear wave arrives at a site"
             yield Problem("lattice.cell.springs", None, f"{remedy}; add springs with next_cell, or use run")
 
     @classmethod
@@ -357,8 +357,8 @@ def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
     for number, clearance in enumerate(lesser):
         if clearance <= 0:
             remedy = (
-                f"site {number + 1} is pressed at rest and acts on the weakest wave; the law is one of amplitude over"
-                " clearance, which has no value there; remove it"
+                f"site {number + 1} is pressed at rest; the law is one of amplitude over clearance, and there is no"
+                " clearance: remove it"
             )
             yield Problem(path_of(contacts, "precompression"), pressed[number], remedy)
             return

@@ -54,7 +54,7 @@ class PredictCase(LawCase):
         feature: reason
         for feature, reason in LawCase.refuses.items()
         if feature not in ("absorbing ends", "other waveforms")
-    } | {"damped wall": "its dashpot adds the rate of the waveform, and waves are composed of the waveform alone"}
+    } | {"damped wall": "not yet: a moved wall acts through its spring alone"}
 
     def warnings(self) -> list[str]:
         """Return warnings about the waves of the prediction; its runs do not store fields."""
@@ -80,7 +80,7 @@ class PredictCase(LawCase):
         """Return problems with a wave without an end, or with one that is not narrow in frequency."""
         model = self.model()
         if not np.isfinite(model.drive.duration):
-            remedy = "a prediction is that of a wave that ends; give drive.duration"
+            remedy = "the wave must end; set drive.duration"
             return [Problem("drive.waveform", self.drive.kind, remedy)]
         narrow = narrow_fraction(model.chain.cell, model.drive, model.drive_mass, WIDTH)
         if self.drive.kind == DEFAULT or narrow >= NARROW:

@@ -155,7 +155,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str], comm: "MPI.Comm
         if all_meet(comm, PATIENCE):
             text = f"vipetsc: {error}"
             if getattr(options, "force", False):
-                text += "; omit --force, which would start again"
+                text += "; leave out --force, which would start again"
             echo(comm, text, sys.stderr)
         return STOPPED
 

@@ -137,9 +137,9 @@ def _claim(
         content = f"results of the kind {others[0]}" if others else "other files"
         raise FolderError(f"{path}: contains {content}; choose another --out for results of the kind {kind.noun}")
     if resume and not filled:
-        raise FolderError(f"{path}: contains no {kind.noun} to resume; omit --resume")
+        raise FolderError(f"{path}: contains no {kind.noun} to resume; leave out --resume")
     if extend and not filled:
-        raise FolderError(f"{path}: contains no {kind.noun} to extend; omit --extend")
+        raise FolderError(f"{path}: contains no {kind.noun} to extend; leave out --extend")
 
     going_on = filled and not force
     if going_on:

@@ -60,7 +60,7 @@ def read_measured_records(plan: IdentifyCase) -> list[Measured]:
         except MeasuredError as error:
             raise CaseError([Problem(f"{at}.{error.key}", error.value, error.remedy)], plan.name) from None
         if record.sha256 != table.sha256:
-            raise CaseError([Problem(f"{at}.sha256", table.sha256, "the file has changed; omit this key")], plan.name)
+            raise CaseError([Problem(f"{at}.sha256", table.sha256, "the file has changed; remove this key")], plan.name)
         records.append(record)
     return records
 

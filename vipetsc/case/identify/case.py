@@ -66,8 +66,8 @@ class IdentifyCase(StudyCase):
 
     verb = section = "identify"
     refuses: ClassVar[Mapping[str, str]] = {
-        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
-        "rigid stops": "not yet: the derivatives of a motion by its parameters have no jumps at impulses",
+        "disorder": "the lattice that was measured does not scatter",
+        "rigid stops": "not yet: derivatives have no jumps at impulses",
     }
 
     @classmethod
@@ -217,7 +217,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.quantity", quantity, "every record gives its amplitude; none is left to be sought")
         if QUANTITIES[quantity].of in ("mass", "spring") and (base.lattice.profiles or base.lattice.absorbing):
             remedy = (
-                "masses, springs and dashpots are sought in lattices of equal cells only; omit profiles and absorbing"
+                "masses, springs and dashpots are sought in lattices of equal cells only; remove profiles and absorbing"
             )
             yield Problem(f"{at}.quantity", quantity, remedy)
         if quantity in DASHPOTS and any(value == 0 for value in values) and unknown.start is None:

@@ -193,7 +193,7 @@ def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives:
         if sensor.quantity == "force":
             if sensor.cell is not None or sensor.mass is not None:
                 yield Problem(
-                    f"{path}.cell", sensor.cell, "a force is that of a drive: give drive in place of cell and mass"
+                    f"{path}.cell", sensor.cell, "a force sensor measures a drive: use drive in place of cell and mass"
                 )
             if (sensor.drive or 1) > drives:
                 yield Problem(f"{path}.drive", sensor.drive, f"the case has {counted(drives, 'drive')}")

@@ -71,10 +71,10 @@ class NfrcCase(Case):
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     refuses: ClassVar[Mapping[str, str]] = {
-        "rigid stops": "the harmonics of an impulse do not decay, so that no number of them gives a steady state",
-        "initial motion": "a curve has all steady states, whatever the motion at t = 0",
-        "damped wall": "the force of its dashpot grows with the frequency, and curves have one force for a motion",
-        "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",
+        "rigid stops": "the harmonics of an impulse do not decay",
+        "initial motion": "steady states do not depend on the motion at t = 0",
+        "damped wall": "not yet: a moved wall acts through its spring alone",
+        "other waveforms": 'a steady state needs a sine: use waveform = "harmonic" or "burst"',
     }
     waveforms = ("burst", "harmonic")
 
@@ -182,9 +182,11 @@ class NfrcCase(Case):
         if not nfrc.range[0] > 0:
             yield Problem("nfrc.range", nfrc.range, "must be above 0")
         if nfrc.source == "wave" and nfrc.infinite is False:
-            yield Problem("nfrc.infinite", False, "an incident wave needs an infinite lattice; omit it")
+            yield Problem(
+                "nfrc.infinite", False, 'an incident wave needs an infinite lattice; remove it, or use source = "force"'
+            )
         if nfrc.source == "wave" and valid("drive") and sections["drive"].end:
-            remedy = 'a wave that comes from far away is moved by no wall; omit it, or nfrc.source = "force"'
+            remedy = 'an incident wave comes from far away; remove drive.end, or set nfrc.source = "force"'
             yield Problem("drive.end", sections["drive"].end, remedy)
         if nfrc.open_ends and valid("lattice", "drive"):
             yield from check_open_ends(sections)
@@ -192,7 +194,7 @@ class NfrcCase(Case):
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if nfrc.over == "amplitude" and nfrc.isolas and nfrc.subharmonic == 1:
             remedy = (
-                "looked for over other amplitudes, along which this curve runs itself; omit it, or vary the frequency"
+                "looked for over other amplitudes, along which this curve runs itself; remove it, or vary the frequency"
             )
             yield Problem("nfrc.isolas", nfrc.isolas, remedy)
         if nfrc.curves_of and nfrc.over != "frequency":
@@ -212,7 +214,7 @@ class NfrcCase(Case):
             contacts = sections["contacts"]
             yield from check_stiffness(contacts, contacts.sites not in (0, []), valid)
             if nfrc.restitutions and contacts.each and contacts.each.restitution:
-                remedy = "each site has a restitution of its own, contacts.each.restitution; omit one of them"
+                remedy = "each site has a restitution of its own, contacts.each.restitution; remove one of them"
                 yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
             dampings = lists_of(contacts).get("damping", [contacts.damping])
             least = max(least_restitution(damping or "paper") for damping in dampings)
@@ -356,7 +358,7 @@ def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
     """Yield problems with drives besides the first: none acts with an incident wave, and all have one frequency."""
     for path, drive in drives.every[1:]:
         if nfrc.source == "wave":
-            yield Problem(path, None, 'a wave that is incident acts alone; omit it, or nfrc.source = "force"')
+            yield Problem(path, None, 'an incident wave acts alone; remove it, or set nfrc.source = "force"')
         elif drive.frequency != drives.frequency:
             remedy = "a steady state repeats itself with one period, and so must all drives; give that of the first one"
             yield Problem(f"{path}.frequency", drive.frequency, f"{remedy}, {drives.frequency:.15g} rad/s")
@@ -366,14 +368,14 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     """Yield problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
     gaps = chain.sites.gaps
     if nfrc.symmetric and not has_equal_sides(gaps):
-        yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; omit it")
+        yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; remove it")
     if nfrc.symmetric and not chain.is_odd:
-        yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
+        yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; remove it")
     smallest = gaps.min(initial=np.inf)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
         yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
     if nfrc.source == "wave" and smallest <= 0:
-        remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
+        remedy = 'a wave is counted in clearances, and a touching contact has none; use source = "force"'
         yield Problem("nfrc.source", "wave", remedy)
     if not has_waves(chain):
         yield from no_waves(nfrc, chain)

@@ -33,17 +33,17 @@ def are_contacts_springs(nfrc: NfrcTable, lattice: LatticeTable, chain: Chain) -
 
 def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
     """Yield problems with an incident wave or an infinite lattice where motions of ``chain`` are no Bloch waves."""
-    reason = "a wave in springs that are not linear changes its shape as it travels"
+    reason = "a wave changes its shape in nonlinear springs"
     if not chain.cell.joins_cells:
-        reason = "no linear wave travels through cells that contacts alone join"
+        reason = "cells that contacts alone join have no linear waves"
     elif chain.is_damped:
-        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
+        reason = "with dashpots a wave decays before it arrives"
     elif not chain.linearised().is_uniform():
-        reason = "a wave of equal cells does not pass cells that differ as it came"
+        reason = "cells that differ scatter a wave"
     if nfrc.source == "wave":
-        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
+        yield Problem("nfrc.source", "wave", f'{reason}; use source = "force"')
     elif nfrc.infinite:
-        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
+        yield Problem("nfrc.infinite", True, f"{reason}; remove the key, and use absorbing ends")
 
 
 def check_ground(nfrc: NfrcTable, lattice: LatticeTable, chain: Chain) -> Iterator[Problem]:
@@ -60,7 +60,7 @@ def check_ground(nfrc: NfrcTable, lattice: LatticeTable, chain: Chain) -> Iterat
         return
     if nfrc.infinite:
         reason = "a mean force of the ground moves an infinite lattice without bound, since no wall holds it"
-        yield Problem("contacts.pair", None, f"{reason}; give equal stops on both sides, or nfrc.infinite = false")
+        yield Problem("contacts.pair", None, f"{reason}; use equal stops on both sides, or nfrc.infinite = false")
     elif not are_contacts_springs(nfrc, lattice, chain):
         reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
         remedy = 'use ends = "fixed", a precompression, or equal stops on both sides'
@@ -73,11 +73,11 @@ def check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
     cell, _ = check_cell(sections["lattice"])
     moved = sections["drive"].end
     if sections["nfrc"].source == "wave":
-        yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; omit it")
+        yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; remove the key")
     elif not absorbing:
-        yield Problem("nfrc.open_ends", True, "says that absorbing ends reflect nothing; give [lattice.absorbing]")
+        yield Problem("nfrc.open_ends", True, "takes the place of absorbing ends; add [lattice.absorbing]")
     elif cell is not None and sections["lattice"].nonlinear_keys:
-        remedy = "beyond its ends a lattice goes on with linear springs; omit it, or quadratic and cubic"
+        remedy = "beyond its ends a lattice has linear springs; remove the key, or quadratic and cubic"
         yield Problem("nfrc.open_ends", True, remedy)
     elif moved and absorbing.end in (moved, "both"):
         yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")

@@ -44,5 +44,5 @@ def key_problems(table: Table) -> list[Problem]:
     if not nfrc.get("fixed"):
         problems.append(Problem("nfrc.fixed", [], "give the amplitudes of the curves; their frequency is the drive's"))
     if key == "contacts.restitution" and "restitutions" in nfrc:
-        problems.append(Problem("nfrc.restitutions", nfrc["restitutions"], f"{key} varies along the curve; omit it"))
+        problems.append(Problem("nfrc.restitutions", nfrc["restitutions"], f"{key} varies along the curve; remove it"))
     return problems

@@ -75,7 +75,7 @@ class NnmCase(CaseFile):
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system and the map with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
-        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself"
+        "absorbing ends": "absorbing ends are dashpots, and free motions then decay"
     }
 
     @classmethod
@@ -110,7 +110,7 @@ class NnmCase(CaseFile):
             reason = "a system of one's own"
             if system == "reduced":
                 reason = f"{ONE_CONTACT} and one cell, which"
-            wrong.append(Problem("disorder", None, f"{reason} has nothing that scatters; omit [disorder]"))
+            wrong.append(Problem("disorder", None, f"{reason} has nothing that scatters; remove [disorder]"))
         if problems or wrong:
             return fields, problems + wrong
         resolved = fields | {"contacts": resolved_contacts(contacts, lattice)}
@@ -245,9 +245,9 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
         return
     for key in ("pair", "next_cell"):
         if getattr(contacts, key) is not None or (contacts.each and getattr(contacts.each, key)):
-            yield Problem(path_of(contacts, key), None, "[nnm.own] names the masses of each contact; omit the key")
+            yield Problem(path_of(contacts, key), None, "[nnm.own] names the masses of each contact; remove the key")
     if nnm.chart == "grazing" and not custom.contacts:
-        yield Problem("nnm.chart", "grazing", "its unknown is the gap of a contact, and there is no contact; omit it")
+        yield Problem("nnm.chart", "grazing", "its unknown is the gap of a contact, and there is no contact; remove it")
     yield from check_stiffness(contacts, bool(custom.contacts), valid)
     for problem in _check_stops(contacts, [pair.clearance for pair in custom.contacts], valid):
         # The contacts of such a system have their clearances in [nnm.own].

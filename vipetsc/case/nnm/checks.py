@@ -111,22 +111,22 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
     given = lists_of(contacts)
     for key in ("pair", "next_cell"):
         if getattr(contacts, key) is not None or key in given:
-            remedy = "the reduced model is that of the two masses in contact within a cell, cell.contact; omit the key"
+            remedy = "the reduced model has the two masses of cell.contact; remove the key"
             yield Problem(path_of(contacts, key), getattr(contacts, key), remedy)
             return
 
     if given:
-        yield Problem("contacts.each", None, f"{ONE_CONTACT}; omit the lists over sites")
+        yield Problem("contacts.each", None, f"{ONE_CONTACT}; remove the lists over sites")
     if cell.is_damped:
-        remedy = "the reduced model holds springs at their middle, where a dashpot has none; its contact may dissipate"
-        yield Problem("lattice", "damped", f"{remedy}; omit [lattice.damping] and the dashpots of the cell")
+        remedy = "the reduced model has no dashpots"
+        yield Problem("lattice", "damped", f'{remedy}; remove them, or use system = "chain"')
     for key in ("profiles", "scatter"):
         if getattr(lattice, key):
-            remedy = "the reduced model is that of one cell, which stands for all others; omit cells that differ"
+            remedy = 'the reduced model has one cell; use system = "chain" for cells that differ'
             yield Problem(f"lattice.{key}", None, remedy)
     for key in lattice.nonlinear_keys:
-        remedy = "the reduced model holds springs at their middle, with half of their stiffness; a quadratic or cubic"
-        yield Problem(key, None, f"{remedy} part has no such half; omit quadratic and cubic")
+        remedy = 'the reduced model has linear springs; remove quadratic and cubic, or use system = "chain"'
+        yield Problem(key, None, remedy)
 
 
 def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Problem]:

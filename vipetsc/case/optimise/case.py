@@ -217,7 +217,7 @@ def _problems(options: OptimiseTable, base: Case, given: Table, responses: NfrcC
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
         yield Problem("optimise.start", options.start, "the start matches clearances: let clearance or profile vary")
     if options.curve and not has_free_amplitude(base):
-        yield Problem("optimise.curve", options.curve, f"{FILE_AMPLITUDE}; omit it")
+        yield Problem("optimise.curve", options.curve, f"{FILE_AMPLITUDE}; remove it")
     for at, table in options.measured_at:
         yield from measured_problems(table, at, base, bounds.varies_cell, responses)
     for number, constraint in enumerate(options.constraint or [], 1):
@@ -235,7 +235,7 @@ def _amplitude_problems(options: OptimiseTable) -> Iterator[Problem]:
     varying = [key for key in options.variables.keys_of_case() if key in AMPLITUDES]
     for at, table in options.measured_at:
         if varying and table.amplitudes:
-            remedy = f"would take the place of {varying[0]}, which varies; omit one of them"
+            remedy = f"would take the place of {varying[0]}, which varies; remove one of them"
             yield Problem(f"{at}.amplitudes", table.amplitudes, remedy)
 
 

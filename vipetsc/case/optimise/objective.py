@@ -130,7 +130,7 @@ def measured_problems(
     for a case without ``[nfrc]``, or with an invalid one.
     """
     if objective.amplitudes and not has_free_amplitude(base):
-        yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; omit them")
+        yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; remove them")
     if objective.below and not objective.is_of_responses:
         yield Problem(
             f"{at}.below", objective.below, "only measures of responses have a range below a level; remove it"
@@ -209,7 +209,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
             remedy += "; those of points need output.points, forces output.forces"
         yield Problem(f"{at}.measure", name, remedy)
     if objective.amplitudes:
-        remedy = "the amplitudes of responses are those of [nfrc]; omit them"
+        remedy = "responses have the amplitudes of [nfrc]; remove these"
         yield Problem(f"{at}.amplitudes", objective.amplitudes, remedy)
     if objective.band:
         yield Problem(f"{at}.band", objective.band, "responses have no bands; part is a part of nfrc.range")

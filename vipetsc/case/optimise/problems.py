@@ -78,7 +78,7 @@ def _twice(key: str, given: Any, paths: Iterable[str]) -> Iterator[Problem]:
     """Yield the problem of a ``key`` that varies, whole or in part, by one of the ``paths`` already."""
     for path in paths:
         if is_within(path, [key]) or is_within(key, [path]):
-            yield Problem(f"{AT}.{key}", given, "varies by another variable already; omit one of them")
+            yield Problem(f"{AT}.{key}", given, "varies by another variable already; remove one of them")
             return
 
 
