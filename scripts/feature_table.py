@@ -371,8 +371,8 @@ def _introduction(rows: Mapping[str, Sequence[str]]) -> Iterator[str]:
         but is not written for it. Every verb accepts {", ".join(accepted[:-1])} and {accepted[-1]}.
 
         `propagator` is `run` by that engine (a run that it refuses goes on with `ts`), `bands` is `bands --modes`
-        (linear modes, without dashpots), `nfrc` has a force or a moved wall, `wave` is `nfrc` with an incident wave, and
-        the last four are the systems of `nnm`, of which `condensed` has the breathers. `nnm` reads no drive and no
+        (linear modes, without dashpots), `nfrc` has a force or a moved wall, `wave` is `nfrc` with an incident wave,
+        and the last four are the systems of `nnm`, of which `condensed` has the breathers. `nnm` reads no drive and no
         initial motion, and its system `own` neither the lattice nor the sites. `plot` and `export` accept the run of
         every feature.
     """

@@ -193,3 +193,13 @@ def test_antiphase_to_the_drive_is_a_lag_of_180_degrees():
     lag = lag_of(xr.Dataset({"harmonics": (names, harmonics), "harmonics_imaginary": (names, imaginary)}))
 
     assert lag == pytest.approx(np.array([180, 180, 0, 180]), abs=1e-9)
+
+
+@pytest.mark.parametrize(("low", "high", "step"), [(-30, 565, 180), (0, 2000, 540), (0, 200, 45)])
+def test_ticks_of_a_phase_are_parts_of_a_revolution(axes, low, high, step):
+    """Over more than a revolution an axis in degrees has multiples of 180, over half of one multiples of 45."""
+    axes.set_ylim(low, high)
+    panels.mark_degrees(axes)
+    ticks = axes.get_yticks()
+    assert 3 <= ((ticks >= low) & (ticks <= high)).sum() <= 6
+    assert np.allclose(ticks % step, 0)

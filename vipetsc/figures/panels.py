@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, to_rgba
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import ArrayLike
 
 from vipetsc import spectra
@@ -317,15 +317,20 @@ def continuous_phase(angle: np.ndarray, begin: float) -> np.ndarray:
 
 
 def mark_degrees(axes: Axes) -> None:
-    """Put few ticks on a vertical axis in degrees: multiples of 1, 1.5, 3, 4.5 or 9 times a power of ten.
+    """Put few ticks on a vertical axis in degrees.
 
-    Over a revolution these are multiples of 45 or 90 degrees, over small ranges round numbers. The axis spans
-    ``LEAST_SPAN`` or more, so that the rounding of a constant phase is not seen; all curves must be there.
+    They are multiples of 180 degrees on an axis of more than a revolution, and otherwise multiples of 1, 1.5, 3, 4.5 or
+    9 times a power of ten, such as 45 and 90. The axis spans ``LEAST_SPAN`` or more, so that the rounding of a constant
+    phase is not seen; all curves must be there.
     """
     low, high = axes.get_ylim()
     if high - low < LEAST_SPAN:
         middle = (low + high) / 2
         axes.set_ylim(middle - LEAST_SPAN / 2, middle + LEAST_SPAN / 2)
+    if high - low > 360:
+        half_revolutions = (high - low) / 180
+        axes.yaxis.set_major_locator(MultipleLocator(180 * np.ceil(half_revolutions / 5)))
+        return
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 
