@@ -68,7 +68,7 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     """The crossing branch starts at the special point, and its orbits have lost the symmetry of the first one."""
     point = kerschen_in_phase.of_kind(kind)[0]
 
-    problem, first = switch(kerschen_in_phase.problem, point, amplitude=1e-3)
+    problem, first = switch(kerschen_in_phase.problem, point)
     assert first.energy == pytest.approx(point.energy, rel=1e-3)
     assert first.period == pytest.approx(periods * point.period, rel=1e-3)
 

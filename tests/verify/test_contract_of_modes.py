@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.condensed import Condensed, state_of
+from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 
@@ -172,7 +172,7 @@ def rest_of(name: str, method: str, point: Any) -> np.ndarray:
     """Return displacements (mass,) in m of a motion where it rests."""
     if method == "shooting":
         return np.array(point.x)
-    motions = Condensed.from_case(ZOO[name].case(method)).motions
+    motions = CondensedMethod(ZOO[name].case(method)).motions
     return np.concatenate(list(state_of(motions, point, len(ZOO[name].own["masses"])).values()))
 
 

@@ -215,7 +215,6 @@ def test_the_cell_of_the_built_in_lattice_has_rigid_modes():
         ({"contacts": {"restitution": 0.9}}, "contacts.restitution"),
         ({"nnm": {"method": "condensed"}}, "nnm.method"),
         ({"nnm": {"method": "damped"}}, "nnm.method"),
-        ({"nnm": {"map": "half"}}, "nnm.map"),
         ({"nnm": {"chart": "auto"}}, "nnm.chart"),
         ({"contacts": {"each": {"law": ["rigid"], "restitution": [0.5]}}}, "contacts.each.restitution"),
     ],

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from vipetsc.io.netcdf import open_netcdf, root_attributes
+from vipetsc.io.netcdf import root_attributes
 
 ORBITS = "orbits"
 """Periodic orbits by shooting: of a reduced system, or of a whole lattice."""
@@ -33,47 +33,18 @@ DOWN = "-down"
 BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES, DAMPED)
 
 
-def branch_kind(branch: xr.Dataset) -> str:
-    """Return the kind of an open branch file, one of ``BRANCH_KINDS``; raise ValueError for any other.
-
-    Files written before the attribute existed are recognised by variables that only their kind has.
-    """
-    kind = branch.attrs.get("branch_kind")
-    if kind is None:
-        return _kind_by_variables(branch)
-    return _known(kind)
-
-
 def kind_of_file(path: Path, needs: Sequence[str] = ()) -> str:
-    """Return the kind of the branch in the file ``path``, by its attributes alone if one of them names the kind.
+    """Return the kind of the branch in the file ``path``, one of ``BRANCH_KINDS``; raise ValueError for any other.
 
-    ``needs`` and errors are those of ``open_netcdf``; further errors those of ``branch_kind``.
+    ``needs`` and further errors are those of ``open_netcdf``.
     """
-    kind = root_attributes(path, "branch", needs).get("branch_kind")
-    if isinstance(kind, str):
-        return _known(kind)
-    with open_netcdf(path, "branch", needs) as branch:
-        return branch_kind(branch)
+    kind = root_attributes(path, "branch", ("branch_kind", *needs))["branch_kind"]
+    if kind not in BRANCH_KINDS:
+        raise ValueError(f"branch_kind = {kind!r} is not one of {', '.join(BRANCH_KINDS)}: written by a later version?")
+    return str(kind)
 
 
 def kind_names(branch: xr.Dataset) -> np.ndarray:
     """Return the kind (point,) of each point of a branch file; "chosen" of points at values that the case asks for."""
     names = [name if "@" not in name else CHOSEN for name in branch["kind"].attrs["flag_meanings"].split()]
     return np.array(names)[branch["kind"].values]
-
-
-def _known(kind: str) -> str:
-    """Return the ``kind`` that an attribute names; raise ValueError if it is not one of ``BRANCH_KINDS``."""
-    if kind not in BRANCH_KINDS:
-        raise ValueError(f"branch_kind = {kind!r} is not one of {', '.join(BRANCH_KINDS)}: written by a later version?")
-    return kind
-
-
-def _kind_by_variables(branch: xr.Dataset) -> str:
-    """Return the kind of a file without the attribute, by variables that only that kind has."""
-    # Responses come first because they have harmonics, too.
-    if "share" in branch:
-        return RESPONSES
-    if "harmonics" in branch:
-        return CONDENSED
-    return ORBITS

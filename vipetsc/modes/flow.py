@@ -415,8 +415,8 @@ class ShootingMap:
         return frequency
 
 
-# The whole period is for comparison, by the case key ``nnm.map``. The derivative of its equations has a condition
-# number 4 to 55 times that of the quarter (median), 4e5 times at most, on the paper's branches up to 100 J.
+# The derivative of the whole period's equations has a condition number 4 to 55 times that of the quarter (median),
+# 4e5 times at most, on the paper's branches up to 100 J.
 MAPS = {
     "quarter": ShootingMap("quarter", "rest", "centre", 0.25),
     "half": ShootingMap("half", "rest", "rest", 0.5),

@@ -25,11 +25,7 @@ class FlowError(NoMotionError):
 
 
 class ContinuationError(NoMotionError):
-    """The branch cannot go on; the message says where, why, and which key to change."""
-
-
-class StartError(NoMotionError):
-    """There is no periodic orbit to begin a branch with."""
+    """The branch cannot begin or go on; the message says where, why, and which key to change."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -9,7 +9,7 @@ in pairs.
 from typing import NamedTuple
 
 from vipetsc.case import CaseError, NnmCase, Problem
-from vipetsc.modes.problem import StartError
+from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.system import System
 
 # Squared frequencies are equal within this fraction, or within rounding of the largest one in the eigenvalues. In
@@ -77,14 +77,14 @@ def why_not_alone(system: System, mode: int) -> str:
 
 
 def check_start(system: System, mode: int, energy: float) -> None:
-    """Raise StartError if no branch begins with ``mode`` (from 0) alone at a start ``energy`` in J.
+    """Raise ContinuationError if no branch begins with ``mode`` (from 0) alone at a start ``energy`` in J.
 
     Beyond the energy at which the mode touches a contact its motion is not linear, and nothing is checked.
     """
     if energy < system.grazing_energy(mode):
         reason = why_not_alone(system, mode)
         if reason:
-            raise StartError(reason)
+            raise ContinuationError(reason)
 
 
 def check_modes_alone(case: NnmCase) -> None:

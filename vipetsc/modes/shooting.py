@@ -38,7 +38,7 @@ from vipetsc.modes.cache import BoundedCache
 from vipetsc.modes.flow import MOST_LONGER, UNLIMITED, Arc, Flow, ShootingMap
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
-from vipetsc.modes.problem import Attempt, ContinuationError, Corner, FlowError, SpecialKind, StartError, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, Corner, FlowError, SpecialKind, unit
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
 from vipetsc.modes.system import ContactPair, System
@@ -751,12 +751,12 @@ def touch_of(count: int, corner: bool = False) -> SpecialKind[Point]:
 def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     """Return the periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
-    Raises StartError if the mode has no stiffness, if other modes share its frequency, or if Newton's method does not
-    converge from the linear mode at that energy.
+    Raises ContinuationError if the mode has no stiffness, if other modes share its frequency, or if Newton's method
+    does not converge from the linear mode at that energy.
     """
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
-        raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
+        raise ContinuationError(f"mode {mode + 1} is a rigid-body motion; it has no period")
     check_start(problem.system, mode, energy)
     # The energy of a mass-normalised mode q is (q'^2 + omega^2 q^2)/2: from rest all of it is potential, from the
     # centre, where the initial values are velocities, all of it is kinetic.
@@ -775,5 +775,5 @@ def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     attempt = frame.solve(frame.xi, row, row @ frame.xi)
     if not attempt.converged:
         why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy or increase nnm.tolerance"
-        raise StartError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
+        raise ContinuationError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
     return frame.measures(attempt)

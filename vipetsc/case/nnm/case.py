@@ -179,11 +179,11 @@ class NnmCase(CaseFile):
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 
     def physics(self) -> tuple[Any, ...]:
-        """Return keys that a resumed branch must keep: the system and the shooting map."""
+        """Return keys that a resumed branch must keep: the system and where branches begin."""
         nnm = self.nnm
         # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
-        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, begun
+        return self.lattice, self.contacts, nnm.system, nnm.custom, begun
 
     @property
     def condensed(self) -> bool:

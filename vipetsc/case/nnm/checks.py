@@ -68,9 +68,6 @@ def check_rigid_stops(nnm: NnmTable, contacts: ContactsTable) -> Iterator[Proble
     if lossy:
         remedy = "a rigid stop takes a part of the energy at each impact, so that no free motion repeats itself"
         yield Problem(path_of(contacts, "restitution"), lossy[0], f"{remedy}; set it to 1")
-    if nnm.map != "auto":
-        remedy = "orbits begin and end where they strike no rigid stop, which depends on the system"
-        yield Problem("nnm.map", nnm.map, f"{remedy}; remove it")
     if nnm.chart != "relative":
         yield Problem("nnm.chart", nnm.chart, "orbits do not begin on a rigid stop; remove it")
 

@@ -126,9 +126,6 @@ class NnmTable(Section):
     modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = described(
         "linear modes from which branches start; the lowest is 1", [1, 2], min_length=1
     )
-    map: Literal["auto", "quarter", "half", "whole"] = described(
-        "fraction of the period that is integrated; auto: a quarter if the forces are odd, otherwise half", "auto"
-    )
     chart: Literal["auto", "relative", "grazing"] = described(
         "unknowns: displacements over the size of the motion (relative), or the root of the gap of a contact (grazing);"
         " auto: grazing near a touch",
@@ -160,5 +157,4 @@ class NnmTable(Section):
         "kinds of special points at which crossing branches are followed", []
     )
     switch_points: int = described("number of points of a crossing branch", 100, ge=1)
-    switch_amplitude: Positive = described("first step onto a crossing branch, in units of the chart", 1e-3)
     guards: Guards = described("limits on a step", Guards())

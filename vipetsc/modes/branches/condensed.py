@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +18,11 @@ from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import stored_states
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
-from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
+from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, map_of, start_energy
 from vipetsc.modes.continuation.arclength import StepRule
-from vipetsc.modes.flow import MAPS, Dop853Flow
+from vipetsc.modes.flow import Dop853Flow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import FlowError, PeriodicProblem, StartError
+from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.stability import Hill
@@ -42,38 +41,6 @@ LAST_REACH = 2048
 MOST_OF_HILL = 4
 
 
-class Condensed(NamedTuple):
-    """A case condensed onto contacts and springs: its motions, and the system whose linear modes begin branches.
-
-    ``dofs`` are the masses of a cell, all masses in a system of one's own.
-    """
-
-    motions: ConservativeMotions
-    chain: Chain | None
-    system: System | None
-    dofs: int
-
-    @classmethod
-    def from_case(cls, case: NnmCase) -> "Condensed":
-        """Return the lattice of a case between its sites, or its system between its contacts and springs."""
-        options = case.nnm
-        if options.system != "condensed":
-            system = System.from_case(case)
-            dofs = system.dofs
-            if options.system == "chain":
-                dofs = case.lattice.unit_cell().dofs
-            return cls(condensed_system(system, options), chain=None, system=system, dofs=dofs)
-
-        chain = case.chain()
-        stops = elastic_stops(case)
-        if needs_modes(chain):
-            # Bloch waves are those of equal cells with contacts of the cell's pair: other lattices have all modes.
-            motions = condensed_system(System.from_chain(chain, stops), options)
-        else:
-            motions = ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), options)
-        return cls(motions, chain=chain, system=None, dofs=chain.cell.dofs)
-
-
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
     """Return the motions of a ``system`` condensed onto its contacts and springs.
 
@@ -86,16 +53,36 @@ def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
     return ConservativeMotions(DenseCompliance(system.masses, system.stiffness_at_rest, rows), forces, options)
 
 
+def _condensed_lattice(case: NnmCase, chain: Chain) -> ConservativeMotions:
+    """Return the motions of the lattice ``chain`` of a case condensed onto its sites."""
+    stops = elastic_stops(case)
+    if needs_modes(chain):
+        # Bloch waves are those of equal cells with contacts of the cell's pair: other lattices have all modes.
+        return condensed_system(System.from_chain(chain, stops), case.nnm)
+    return ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), case.nnm)
+
+
 class CondensedMethod(NnmMethod):
     """Branches of ``ConservativeMotions``."""
 
     kind = CONDENSED
-    # Runs may begin with the states in the file: a branch that stopped or failed has them, too.
-    finishes_interrupted = True
 
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
-        self.motions, self.chain, self.system, self.dofs = Condensed.from_case(case)
+        # A lattice between its sites, or a system whose linear modes begin branches. ``dofs`` are the masses of a cell,
+        # all masses in a system of one's own.
+        self.chain: Chain | None = None
+        self.system = None
+        if case.nnm.system == "condensed":
+            self.chain = case.chain()
+            self.motions = _condensed_lattice(case, self.chain)
+            self.dofs = self.chain.cell.dofs
+        else:
+            self.system = System.from_case(case)
+            self.motions = condensed_system(self.system, case.nnm)
+            self.dofs = self.system.dofs
+            if case.nnm.system == "chain":
+                self.dofs = case.lattice.unit_cell().dofs
         self.unknowns = self.motions.forces.pairs
         self.dissipation = dissipation_of(case)
 
@@ -115,7 +102,7 @@ class CondensedMethod(NnmMethod):
             system = self.system
             elongations = system.moves(job)
             if not elongations.any():
-                raise StartError(
+                raise ContinuationError(
                     f"mode {job + 1} has a node at every contact and nonlinear spring, and is linear at all energies: "
                     'choose another one (nnm.modes), or nnm.method = "shooting"'
                 )
@@ -182,10 +169,7 @@ class CondensedMethod(NnmMethod):
     def _orbits(self) -> Shooting:
         """Orbits of all masses, with their sensitivities."""
         system = self.system or System.from_chain(self.case.chain(), elastic_stops(self.case))
-        shooting_map = MAPS["half"]
-        if self.motions.forces.odd:
-            shooting_map = MAPS["quarter"]
-        return Shooting(Dop853Flow(system), shooting_map)
+        return Shooting(Dop853Flow(system), map_of(system))
 
     def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the states at phase 0 of the first and the last point, and of those asked for."""

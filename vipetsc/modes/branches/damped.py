@@ -13,7 +13,7 @@ from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.losses import dissipation_of
 from vipetsc.modes.branches.orbits import NnmMethod, start_energy
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import PeriodicProblem, StartError
+from vipetsc.modes.problem import ContinuationError, PeriodicProblem
 from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
@@ -69,7 +69,7 @@ class DampedMethod(NnmMethod):
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """Return the motion of a linear mode at a small energy."""
         if not self.system.moves(job).any():
-            raise StartError(
+            raise ContinuationError(
                 f"mode {job + 1} has a node at every contact and nonlinear spring: its frequency and damping are those "
                 "of the linear mode at all energies; choose another one (nnm.modes)"
             )

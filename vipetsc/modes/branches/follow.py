@@ -53,7 +53,6 @@ from vipetsc.modes.branches.growth import Growth, Listener
 from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
-from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.shared_frequencies import check_modes_alone
 from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.sources import source_key
@@ -142,7 +141,6 @@ class Follower:
             branch.ended = Ending.END_OF_RANGE.with_numbers(end=method.case.nfrc.range[1])
             return
         problem = method.problem(job)
-        interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
         try:
             if branch.points:
                 start = branch.regular()[-1]
@@ -150,16 +148,10 @@ class Follower:
                 with problem.stopped_by(self.stop):
                     start = method.start(problem, job, self.stop)
             self.growth.run(branch, problem, start, method.rule, direction)
-        except interruptions:
-            if method.finishes_interrupted and branch.points:
-                self._finish(problem, branch)
-            raise
-        self._finish(problem, branch)
-
-    def _finish(self, problem: PeriodicProblem[Any], branch: Branch[Any]) -> None:
-        """Add what belongs to the whole branch (``Method.finish``), unless nobody would read it."""
-        if self.folder or not self.method.finishes_files_alone:
-            self.method.finish(problem, branch)
+        finally:
+            # Runs may begin with the states in the file: a branch that was stopped or failed has them, too.
+            if branch.points and (self.folder or not method.finishes_files_alone):
+                method.finish(problem, branch)
 
     def _stored_or_new(self, name: str) -> Branch[Any]:
         """Return the branch of that ``name`` as it is in its file when results are resumed, else one without points.

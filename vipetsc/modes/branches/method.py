@@ -41,11 +41,10 @@ class Method(ABC, Generic[S]):
     """A method that finds the branches of one case, which ``jobs`` numbers from 0 on.
 
     ``kind`` is the kind of their files. ``failures`` end a branch and not the program. ``keeps_empty``: a branch
-    without points leaves a file that says why. ``finishes_interrupted``: a branch that failed or was stopped has the
-    additions to the file of a whole branch, too (``finish``). ``finishes_files_alone``: these are of no use without a
-    file, as in a search, whose branches stay in memory. ``locates``: special points are looked for between the
-    regular ones, those where a contact grazes only with ``locates_grazing``. ``counts_start``: the start is one of the
-    points of which the case gives the largest number.
+    without points leaves a file that says why. ``finishes_files_alone``: the additions to a branch (``finish``) are of
+    no use without a file, as in a search, whose branches stay in memory. ``locates``: special points are looked for
+    between the regular ones, those where a contact grazes only with ``locates_grazing``. ``counts_start``: the start is
+    one of the points of which the case gives the largest number.
     """
 
     kind: ClassVar[str]
@@ -53,7 +52,6 @@ class Method(ABC, Generic[S]):
     failures: ClassVar[tuple[type[Exception], ...]] = (NoMotionError, np.linalg.LinAlgError)
     counts_start: ClassVar[bool] = False
     keeps_empty: ClassVar[bool] = True
-    finishes_interrupted: ClassVar[bool] = False
     finishes_files_alone: ClassVar[bool] = False
     locates_grazing: bool = False
     locates: bool = True
@@ -114,7 +112,7 @@ class Method(ABC, Generic[S]):
         return lambda point: None
 
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:
-        """Add the variables of a whole branch's file that are not of its points."""
+        """Add the variables of a branch's file that are not of its points, also where it failed or was stopped."""
 
     def further(self, branch: Branch[S], followed: Sequence[Branch[S]]) -> Iterator[CrossingBranch]:
         """Return the branches that cross a branch, and isolated ones near it, that the case asks for.

@@ -113,10 +113,8 @@ def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int)
     return GuardedSteps(cast(OrbitProblem, problem), remaining)
 
 
-def map_of(options: NnmTable, system: System) -> ShootingMap:
+def map_of(system: System) -> ShootingMap:
     """Return the part of the period that is shot."""
-    if options.map != "auto":
-        return MAPS[options.map]
     if system.has_rigid_stops:
         return map_between_impacts(system.odd)
     # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
@@ -150,8 +148,8 @@ class ShootingMethod(NnmMethod):
         self.locates_grazing = options.locate_grazing
         self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
 
-        shooting_map = map_of(options, self.system)
-        self.shooting = Shooting(Dop853Flow(self.system), shooting_map, options.tolerance, options.max_newton)
+        flow = Dop853Flow(self.system)
+        self.shooting = Shooting(flow, map_of(self.system), options.tolerance, options.max_newton)
 
     def problem(self, job: int) -> Shooting:
         """Return the shooting equations of the case."""
@@ -193,7 +191,7 @@ class ShootingMethod(NnmMethod):
         for kind in self.options.switch:
             special = [p for p in branch.points if p.kind == kind]
             for number, point in enumerate(special, 1):
-                start = partial(switch, self.shooting, point, self.options.switch_amplitude)
+                start = partial(switch, self.shooting, point)
                 yield CrossingBranch(name=f"{branch.name}-{kind}-{number}", start=start, rule=self._crossing_rule)
 
     def _crossing_rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:

@@ -1,19 +1,10 @@
 """Branch switching: the first point of a branch of less symmetry that crosses at a special point.
 
-On a branch the derivative dH/dxi (n, n + 1) of the shooting equations H(xi) = 0 has one null vector, the tangent. Where
-another branch crosses it has two: the directions of both branches lie in their plane. Let t be the old branch's
-direction, projected on the plane, and r the unit vector in the plane that is orthogonal to it. With the special point
-xi_0 and a small step s the equations
-
-    H(xi) = 0,    r . (xi - xi_0) = s
-
-have a solution on the crossing branch and none on the old one, along which r . (xi - xi_0) is of second order. Newton's
-method begins at xi_0 + s r.
-
-A map that assumes the symmetry which the new orbits lack does not see them: its derivative has one null vector there.
-Orbits of the quarter-period map are symmetric twice, u(-t) = u(t) and u(t + T/2) = -u(t). A crossing branch may keep
-the first, from rest to rest in half a period, or the product of both, u(T/2 - t) = -u(t), from centre to centre. At a
-period doubling the new orbits close after 2 T, and T is doubled in the unknowns.
+``crossing`` has the equations of that point. A map that assumes the symmetry which the new orbits lack does not see
+them: its derivative has one null vector there. Orbits of the quarter-period map are symmetric twice, u(-t) = u(t) and
+u(t + T/2) = -u(t). A crossing branch may keep the first, from rest to rest in half a period, or the product of both,
+u(T/2 - t) = -u(t), from centre to centre. At a period doubling the new orbits close after 2 T, and T is doubled in the
+unknowns.
 """
 
 from dataclasses import replace
@@ -24,15 +15,15 @@ import numpy as np
 from vipetsc.modes.continuation.crossing import crossing_row
 from vipetsc.modes.flow import MAPS
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError
+from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting import Shooting, ShootingFrame, repetitions
 
 # The numbers below were measured at eleven special points of the benchmark of Kerschen and Peeters and of the paper's
 # model with either law. At seven of these points another branch crosses.
 
-# Fractions of ``amplitude`` that are tried, one after the other, as the first step s along a crossing branch. The first
-# leads to it at six of the seven crossings, the second at the one next to grazing.
-FRACTIONS = np.array([1.0, 0.1, 0.01, 0.001])
+# First steps s along a crossing branch that are tried, over the orbit's size. The first leads to it at six of the seven
+# crossings, the second at the one next to grazing.
+STEPS = np.array([1e-3, 1e-4, 1e-5, 1e-6])
 # Largest correction by Newton's method, over s. The crossing branch may leave at an angle to r: there the correction is
 # up to 5 s on the paper's branches, and beyond 100 s where the method ends on another branch.
 ASTRAY = 20.0
@@ -62,12 +53,11 @@ class Crossing(NamedTuple):
     row: np.ndarray
 
 
-def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooting, Point]:
+def switch(old: Shooting, point: Point) -> tuple[Shooting, Point]:
     """Return the problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to centre,
-    whichever map has a second null direction at ``point``; over the doubled period at a period doubling. ``amplitude``
-    is the first step s, relative to the orbit's size; where Newton's method goes astray, parts of it are tried. The new
+    whichever map has a second null direction at ``point``; over the doubled period at a period doubling. The new
     problem has the tolerance that the map's rounding at the special point allows, and as many Newton steps as ``old``.
     Raises ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
@@ -80,7 +70,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
     for name in names:
         crossing = _crossing(old, point, name, singular)
         if crossing is not None:
-            return crossing.problem, _first_point(crossing, point, amplitude)
+            return crossing.problem, _first_point(crossing, point)
     where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"
     raise ContinuationError(f"no branch crosses {where}: smallest singular values {', '.join(singular)}")
 
@@ -115,12 +105,10 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
     return Crossing(problem=problem, frame=problem.relative_frame(x, period), row=row)
 
 
-def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
+def _first_point(crossing: Crossing, point: Point) -> Point:
     """Return first orbit off the old branch, which crosses at ``point``; raises ContinuationError if none is found."""
     problem, frame, row = crossing
-    step = np.nan
-    attempt = Attempt(converged=False, reason="not tried", history=[], xi=frame.xi)
-    for step in amplitude * FRACTIONS:
+    for step in STEPS:
         attempt = frame.solve(frame.xi + step * row, row, row @ frame.xi + step)
         astray = float(np.linalg.norm(attempt.xi - frame.xi - step * row)) > ASTRAY * step
         if attempt.converged and not astray:
@@ -129,7 +117,7 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
             if repetitions(problem, first) == 1:
                 return first
     why = f"the last attempt, at {step:g}: {attempt.reason}; residuals {attempt.residuals}"
-    remedy = f"increase nnm.tolerance (now {problem.tolerance:.1g}), or change nnm.switch_amplitude"
+    remedy = f"increase nnm.tolerance (now {problem.tolerance:.1g})"
     raise ContinuationError(f"no orbit of a crossing branch is found at E = {point.energy:.9g} J ({why}): {remedy}")
 
 

@@ -210,6 +210,9 @@ def largest_values(harmonics: np.ndarray) -> np.ndarray:
 
     From the largest of even samples Newton's method leads to the place where the rate is zero.
     """
+    # Linear motions have one harmonic, of which nothing need be sought.
+    if harmonics.shape[1] == 2 and not harmonics[:, 0].any():
+        return magnitude(harmonics[:, 1])
     samples = _samples(harmonics)
     highest = np.argmax(np.abs(samples), axis=1)
     top = np.abs(samples[np.arange(len(samples)), highest])
