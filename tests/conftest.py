@@ -48,6 +48,8 @@ from vipetsc.sources import source_key
 gc.set_threshold(500_000)
 
 ROOT = Path(__file__).parents[1]
+# Tests that scripts/test --quick leaves out, by file and name: ``scripts/test --durations`` writes this table.
+SLOW = {*(ROOT / "tests/slow_tests.txt").read_text(encoding="utf-8").split()}
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
 
 # Hypothesis tries the constants of the project's modules as examples. It would count all that Debian installs outside
@@ -60,6 +62,12 @@ with suppress(ImportError):
 # A first call may have to load kernels, or compile them.
 hypothesis.settings.register_profile("vipetsc", deadline=None)
 hypothesis.settings.load_profile("vipetsc")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark a test that is slow; a test that the table does not know is quick."""
+    if item.nodeid.partition("[")[0] in SLOW:
+        item.add_marker(pytest.mark.slow)
 
 
 @pytest.hookimpl(trylast=True)

@@ -203,7 +203,6 @@ for engine in ("ts", "propagator"):
 """
 
 
-@pytest.mark.slow
 def test_after_that_a_run_compiles_nothing(in_process, tmp_path):
     """After ``doctor --compile`` runs by both engines, and their measures, find all kernels compiled."""
     # What this process has called before was stored then.

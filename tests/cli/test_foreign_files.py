@@ -41,7 +41,6 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
     assert not (tmp_path / "out" / "curves").exists()
 
 
-@pytest.mark.slow
 def test_a_study_in_whose_place_a_foreign_file_lies_is_refused_or_computed_again(in_process, tmp_path):
     """A study replaces what is no HDF5 file in its own folder, and says so; it does not replace another program's."""
     name = "design"

@@ -29,7 +29,6 @@ def case(tmp_path):
     return path
 
 
-@pytest.mark.slow
 def test_a_record_becomes_a_case(in_process, case, tmp_path):
     """An identification leaves its files and a table, and the identified case has the true clearance within 2 %."""
     checked = in_process("validate", case)

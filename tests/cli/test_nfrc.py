@@ -30,7 +30,6 @@ def case(tmp_path):
     return path
 
 
-@pytest.mark.slow
 def test_a_curve_that_cannot_go_on_keeps_its_points(in_process, case, tmp_path):
     """A smallest step that is too long for a fold ends the curve with exit code 1; its points and picture remain."""
     out = tmp_path / "stuck"

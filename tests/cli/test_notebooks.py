@@ -72,7 +72,6 @@ def execute(path: Path) -> dict[str, Any]:
     return names
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
     """All cells run without a kernel, and their numbers are those that the notebook's text describes."""
@@ -114,7 +113,6 @@ nbformat.write(notebook, "executed.ipynb")
 """
 
 
-@pytest.mark.slow
 def test_a_kernel_executes_one(tmp_path):
     """The shortest notebook ends in a kernel of its own, with the display of its case."""
     for name in ("ipykernel", "nbclient", "nbformat"):

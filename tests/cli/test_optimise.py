@@ -26,7 +26,6 @@ def names(folder):
     return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.name[0] != "."}
 
 
-@pytest.mark.slow
 def test_two_objectives_leave_a_front_with_its_ends_and_its_knee(in_process, case, tmp_path):
     """Along the Pareto front one objective improves while the other worsens; its ends are the best designs of each."""
     out = tmp_path / "out"

@@ -27,7 +27,6 @@ def my_lattice() -> str:
     return re.search(r"```toml\n(# my-lattice.toml\n.*?)```", text, flags=re.S)[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
 def test_every_block_runs(block, tmp_path, monkeypatch, plain_pictures):
     """Each block runs alone, in a folder that holds the README's case."""
@@ -69,7 +68,6 @@ def test_completion_and_help_show_the_front_door():
     assert "result = simulate(case, progress=True)" in package.__doc__
 
 
-@pytest.mark.slow
 def test_the_example_of_help_runs():
     """The example in the package's docstring runs as it stands, with its progress on stderr."""
     lines = package.__doc__.partition("    from vipetsc import")[2]

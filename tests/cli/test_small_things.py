@@ -30,7 +30,6 @@ def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
     assert drawn.to_toml() == undrawn.to_toml()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_searches_need_not_be_drawn(in_process, with_figures, tmp_path):
     """With output.figures=false there are no pictures; the same command without it draws them."""
@@ -74,7 +73,6 @@ def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch,
     assert folders == [tmp_path]
 
 
-@pytest.mark.slow
 def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
     """A run.h5 that another program has open for writing is refused as such, not as a file that is no run."""
     case = tmp_path / "case.toml"

@@ -12,8 +12,6 @@ import pytest
 
 from tests.conftest import clean_environment
 
-pytestmark = pytest.mark.slow
-
 TINY = ("run", "--set", "lattice.cells=12", "--set", "contacts.sites=[4]", "--set", "drive.cycles=3",
         "--set", "time.end=0.02", "--set", "time.engine=propagator", "--set", "output.figures=false",
         "--set", "contacts.clearance=2e-4", "--out", "out")  # fmt: skip

@@ -71,7 +71,6 @@ def drawn(folder: Path) -> set[str]:
     return names
 
 
-@pytest.mark.slow
 def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
     """``plot`` draws the default pages, each named by its measure and by the keys that vary."""
     assert main(["plot", str(burst)]) == 0
@@ -80,7 +79,6 @@ def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
     assert drawn(burst) == {f"{name}-over-{keys}{'-band' * (name == 'bands_share')}.png" for name in PAGES}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -96,7 +94,6 @@ def test_a_figure_that_cannot_be_drawn_is_refused(burst, name, message, capsys):
     assert drawn(burst) == set()
 
 
-@pytest.mark.slow
 def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
     """A measure that is zero for every member is named instead of drawn; ``--fig`` draws it nevertheless."""
     # With clearances of metres there are no contacts.

@@ -144,7 +144,6 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.slow
 def test_an_own_lattice_with_pictures(typed, put, tmp_path):
     """Bands, check and run of the README's lattice: no warning, an energy balance within 1e-8, seven pictures."""
     put("my-lattice.toml", my_lattice())
@@ -168,7 +167,6 @@ def test_an_own_lattice_with_pictures(typed, put, tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put, in_process, tmp_path):
     """A sweep has a curve over the amplitude for each restitution, and a page for each with the slope of a branch."""
     put("rest.toml", my_lattice(), PLAIN, RESTITUTIONS, BRANCH)
@@ -201,7 +199,6 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
     assert "of 3 needed; follow the branch to more energy (nnm.energy)" in refused.stderr
 
 
-@pytest.mark.slow
 def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
     """A sweep over two keys of three or more values is drawn as a map; a page without its data is refused."""
     put("map.toml", my_lattice(), PLAIN, CLEARANCES)
@@ -221,7 +218,6 @@ def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
     assert "needs branches of the same law, in a further folder, and a sweep over drive.amplitude" in refused.stderr
 
 
-@pytest.mark.slow
 def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_path):
     """The transmission from cell 2 to cell 60 is far smaller at a drive's frequency in a gap than at ones in bands."""
     driven = my_lattice().replace("cycles = 10\n", 'waveform = "harmonic"\n')
@@ -239,7 +235,6 @@ def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_p
     assert pages(tmp_path / "runs/harmonic-sweep") == {"transmission_base-tip-over-drive.frequency"}
 
 
-@pytest.mark.slow
 def test_clearances_that_scatter_as_a_band(typed, put, tmp_path):
     """Samples of scattered clearances deviate from their mean with contacts, and not at all without contact."""
     put("scatter.toml", my_lattice(), PLAIN, SCATTER)
@@ -302,7 +297,6 @@ def test_a_measured_force_and_its_units(typed, put, tmp_path):
         assert Case.of(run).drive.samples.time[1] == float(rows[2][0])
 
 
-@pytest.mark.slow
 def test_a_breather(typed, put, tmp_path):
     """A run that begins with a breather of a branch keeps its energy, and the motion stays at its site."""
     small = "--set nnm.points=3 --set nnm.start_frequency=[1420.0] --set nnm.orbits_at=[] --set output.figures=false"
@@ -321,7 +315,6 @@ def test_a_breather(typed, put, tmp_path):
     assert speed[np.abs(cells - 100) > 20].max() < 0.03 * speed.max()
 
 
-@pytest.mark.slow
 def test_a_frequency_response(typed, put, tmp_path):
     """Curves of steady states over the amplitude, with conservative and with lossy stops, fold and turn back."""
     put("response.toml", NFRC)
@@ -344,7 +337,6 @@ def test_a_frequency_response(typed, put, tmp_path):
     assert curves["1"] != curves["0.7"]
 
 
-@pytest.mark.slow
 def test_the_best_clearances(typed, put, tmp_path):
     """A search leaves a case file of its best design, and a run of that case has the objective of the search."""
     put("search.toml", my_lattice(), PLAIN, SEARCH)

@@ -16,7 +16,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_trial
+from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, Trial, create_trial
 from vipetsc.records import Record
 
 # The mass on a stop: its mass in kg, its velocity at the onset in m/s, and the stop's (k/m)^1/2 in rad/s.
@@ -42,6 +42,12 @@ def chain_parts(ends: str, interval: float, tolerance: float, sites: tuple[int, 
     model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
     layout = Layout(model, MPI.COMM_SELF)
     return ChainParts(model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout))
+
+
+def workspace(dofs: int, terms: int) -> Trial:
+    """Return workspace of the type that the propagator's own code has: of another type, all would be compiled anew."""
+    trial = create_trial(dofs, terms)
+    return trial._replace(sums=Record(trial.sums))
 
 
 def mass_on_stop(damping: float = 0.0) -> Record:
@@ -74,7 +80,7 @@ def mass_on_stop(damping: float = 0.0) -> Record:
         energy=np.zeros(1),
         history=np.zeros(1, HISTORY),
         state=np.zeros(1, SUBSTEP_STATE),
-        trial=create_trial(1, 1),
+        trial=workspace(1, 1),
     )
     return Record(cluster)
 
@@ -110,5 +116,5 @@ def pressed_mass(gap: float, side: int = 1) -> Record:
         taylor=np.zeros((1, 4)),
         moments=np.zeros((1, 4)),
         nodes=collocation(4),
-        trial=create_trial(1, 2),
+        trial=workspace(1, 2),
     )

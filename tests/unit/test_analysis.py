@@ -55,7 +55,6 @@ def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
     assert estimate < start < estimate + 2 * INTERVAL
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("pixels", "limit"), [(600, 20_000), (7, 60_000)])
 def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit):
     """The analysis reads at most ``limit`` bytes of the field of 307 KB at once, and its results are the same.
@@ -86,7 +85,6 @@ def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit)
     assert max(sizes) <= limit
 
 
-@pytest.mark.slow
 def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
     """A coarse map has means over pixels of a fine one, a coarse spectrum sums: energies do not depend on pixels."""
     fine = analyse(run, options=AnalysisTable(pixels=600))

@@ -47,7 +47,6 @@ tolerance = 1e-11
 """
 
 
-@pytest.mark.slow
 def test_a_mass_between_two_stops_has_its_period_in_closed_form():
     """The period is four times the sum of two times, each of a harmonic motion.
 
@@ -99,7 +98,6 @@ def test_a_cubic_spring_has_the_period_of_elliptic_functions():
     assert points[-1].elongations[0] > 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("omega", [1600.0, 3700.0, 5000.0])
 def test_the_built_in_lattice_has_breathers_in_its_gaps(omega):
     """A breather of every gap, and above all bands, has the frequency asked for and a small residual."""
@@ -174,7 +172,6 @@ def whole(tmp_path_factory) -> tuple[Branch, Path]:
     return branch, folder / "branch-breather-4000.h5"
 
 
-@pytest.mark.slow
 def test_a_branch_is_stored_with_states_and_a_table_and_drawn(whole):
     """The stored state has the energy of its point, u^T K u/2 plus the contact's; the branch has a table and figure."""
     case = chain_case()

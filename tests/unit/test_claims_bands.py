@@ -113,7 +113,6 @@ def put_bands(
     put_amplitudes(root, content)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("velocity", "change", "expected", "missed"),
     [

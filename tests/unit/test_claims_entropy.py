@@ -10,8 +10,6 @@ from tests.unit.claim_files import measure, put_sweep
 from vipetsc.case import Case
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART
 
-pytestmark = pytest.mark.slow
-
 SITES = [1, 2, 3, 5, 10, 20]
 # Amplitude in N from which on there are contacts.
 ONSET = 0.7

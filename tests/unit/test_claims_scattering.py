@@ -99,7 +99,6 @@ def put_scattering(
     put_sweep(root / "scattering-amplitudes", table, content, episodes)
 
 
-@pytest.mark.slow
 def test_scattering_as_the_paper_has_it_holds(tmp_path):
     """Claims C1 to C6 hold for fractions of the energy as in the paper, with the prescribed values."""
     put_scattering(tmp_path)
@@ -121,7 +120,6 @@ def test_partitions_that_miss_more_than_one_per_cent_do_not_reconstruct(tmp_path
     assert measure("C6", tmp_path).verdict == expected
 
 
-@pytest.mark.slow
 def test_scattering_off_the_branches_holds_in_part(tmp_path):
     """Claim C3 holds in part if 30 % of the medium run's spectrum is off the Bloch branches."""
     put_scattering(tmp_path, new=(0.0, 0.5, 0.6), off_branches=0.3)

@@ -50,7 +50,6 @@ def put_transfer(
     put_sweep(root / "interband", table, content, episodes, analyses=False)
 
 
-@pytest.mark.slow
 def test_transfer_as_the_paper_has_it_holds(tmp_path):
     """Claims C11 and C14 hold for a transfer as in the paper; the floor without the record's ends is a fiftieth."""
     put_transfer(tmp_path)
@@ -90,7 +89,6 @@ def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, ons
     assert found.value["amplitudes with contact on one side alone, bilinear"] == (onset > 20)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("weak_below", "expected"), [(0.0, 10**0.25), (90.0, 10.0)])
 def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
     """The onset is the ratio of the last amplitude on the floor and the first one at half the maximum."""
@@ -100,7 +98,6 @@ def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
     assert ratio == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.slow
 def test_transfer_of_another_size_holds_in_part(tmp_path):
     """Claims C11 and C14 hold in part if floor and maxima have other sizes than the paper's."""
     put_transfer(tmp_path, maximum=0.2, floor=1e-3, one_site=0.3)

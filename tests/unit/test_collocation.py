@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.special import ellipj
 
-from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop
+from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop, workspace
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.propagator.collocation import (
     accumulate_moments,
@@ -18,7 +18,7 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, create_trial
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
 
 
 def one_substep(cluster: Cluster, substep: Substep) -> Trial:
@@ -145,7 +145,7 @@ def test_springs_accelerate_the_sites_next_to_them():
         contacts=open_stop.contacts,
         taylor=taylor,
         response=np.full((2, 2, 1), cubic.interval**2 / MASS),
-        trial=create_trial(2, 1),
+        trial=workspace(2, 1),
     )
     motion = np.zeros((1, 3))
     evaluate_site_motion(cluster, taylor, motion)

@@ -60,7 +60,6 @@ def site_rows(chain: Chain) -> np.ndarray:
 FINITE = [(1, (0,)), (2, (0, 1)), (12, (0, 2, 3, 11))]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize(("cells", "sites"), FINITE)

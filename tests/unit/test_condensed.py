@@ -77,7 +77,6 @@ def harmonics_of(samples: np.ndarray, orders: int) -> np.ndarray:
     return harmonics
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("law", CONSERVATIVE)
 @pytest.mark.parametrize("seed", range(3))
 def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
@@ -130,7 +129,6 @@ def test_a_dissipative_contact_loses_the_work_of_its_force(law):
     assert [episode.approach for episode in series.episodes] == pytest.approx([floored] * 2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "symmetry"),
     [*itertools.product(CONSERVATIVE, ("at rest", "odd", "any")), *itertools.product(DISSIPATIVE, ("odd", "any"))],

@@ -216,7 +216,6 @@ def ensemble(tmp_path_factory):
     return open_ensemble(folder)
 
 
-@pytest.mark.slow
 def test_statistics_are_those_of_the_samples_that_came_out(ensemble):
     """Mean, deviation and quantiles over the samples leave failed members out, and are NaN where all failed."""
     mean = ensemble["statistics/ibtet/mean"]

@@ -72,7 +72,6 @@ def test_warnings_that_differ_in_numbers_alone_are_one():
     ]
 
 
-@pytest.mark.slow
 def test_a_sample_is_compared_member_by_member(folder, tmp_path):
     """Members of a sample are compared with the same members of the sweep; a difference beyond 1e-3 is no agreement.
 
@@ -100,7 +99,6 @@ def test_a_sample_is_compared_member_by_member(folder, tmp_path):
         assert row["largest"] == pytest.approx(5e-4 if row["agrees"] else 2e-3)
 
 
-@pytest.mark.slow
 def test_every_member_stands_at_the_values_of_its_keys(folder):
     """Every member has its place by the values of its keys, zipped ones too; a failed member has NaN and a status."""
     ensemble = open_ensemble(folder)

@@ -52,7 +52,6 @@ def test_a_tone_has_the_entropy_of_its_gaussian_over_the_nodes(kappa):
     assert weight[0, 3000] == pytest.approx(power.sum() / 4, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_white_noise_approaches_its_limit():
     """The spectrum S of white noise is exponentially distributed about its mean E at each node.
 

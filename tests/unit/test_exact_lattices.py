@@ -24,8 +24,6 @@ from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, c
 from vipetsc.dynamics.propagator.taylor import evaluate
 from vipetsc.lattice.sites import Pair, sites_at
 
-pytestmark = pytest.mark.slow
-
 CELLS = 24
 LATTICES = pytest.mark.parametrize(
     ("ends", "differing", "damped"),
@@ -41,7 +39,6 @@ LATTICES = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("interval", "tolerance"), [(1.5e-4, 1e-15), (3e-4, 1e-7)])
 @LATTICES
 def test_a_step_is_the_exponential_within_its_bound(ends, differing, damped, interval, tolerance):
@@ -107,7 +104,6 @@ def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
     return forms
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pairs", ["the cell's pair", "any pairs"])
 @LATTICES
 def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, pairs):

@@ -156,7 +156,6 @@ def measured(request, tmp_path_factory):
     return folder, request.param
 
 
-@pytest.mark.slow
 def test_every_figure_is_drawn_from_every_shape_of_run(measured, plain_pictures):
     """Every figure is drawn but those of ``WITHOUT``: a further reason would keep a picture from being drawn."""
     folder, shape = measured
@@ -179,7 +178,6 @@ def test_the_analysis_names_what_it_left_out(measured):
     assert not list(folder.glob(".*"))
 
 
-@pytest.mark.slow
 def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
     """xarray reads the analysis with dimensions and units; energies are those of the run; parts sum to the total."""
     xarray = pytest.importorskip("xarray")

@@ -41,7 +41,6 @@ def starting_gap(mantissas: tuple[float, ...], exponents: tuple[float, ...], sta
     return coefficients
 
 
-@pytest.mark.slow
 @given(
     mantissas=st.tuples(*[st.floats(-1, 1)] * 6),
     exponents=st.tuples(*[st.floats(-3, 0)] * 6),

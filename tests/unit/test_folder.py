@@ -181,7 +181,6 @@ def written_at(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", [("run", "--force", "--set", "time.end=0.1"), ("paper", "--quick")])
 def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command):
     """Every verb refuses a folder that another process has locked and names it; locks of killed processes are free."""

@@ -105,7 +105,6 @@ def test_every_part_has_its_floor():
     assert {part(module) for module in MODULES} == set(FLOORS)
 
 
-@pytest.mark.slow
 def test_imports_point_down():
     upward = set()
     for module in MODULES:
@@ -115,7 +114,6 @@ def test_imports_point_down():
     assert upward == set()
 
 
-@pytest.mark.slow
 def test_modules_import_in_no_circle():
     try:
         order = tuple(TopologicalSorter({module: arrows(module) for module in MODULES}).static_order())
@@ -135,7 +133,6 @@ def room(module: str) -> str:
     return module
 
 
-@pytest.mark.slow
 def test_folders_import_in_no_circle():
     """Folders import each other in no circle: a module outside lies above all modules of a folder or below all."""
     rooms: dict[str, set[str]] = {}
@@ -149,7 +146,6 @@ def test_folders_import_in_no_circle():
         pytest.fail(f"circle of folders: {' <- '.join(error.args[1])}")
 
 
-@pytest.mark.slow
 def test_importing_them_loads_neither_petsc_nor_mpi():
     """Importing all modules of the serial parts loads no PETSc, SLEPc or MPI."""
     modules = [f"vipetsc.{module}" for module in MODULES if part(module) in SERIAL]

@@ -28,7 +28,6 @@ def case_with(**sections: dict[str, Any]) -> Case:
     return Case.from_table(TABLE | sections)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_modes_solve_the_eigenvalue_problem(ends):
     """Modes, found one by one by their numbers, are those of dense matrices, also pairs of one frequency on a ring."""

@@ -14,7 +14,6 @@ def folded(masses: int) -> UnitCell:
     return UnitCell(masses=(0.01,) * masses, springs=springs, host=0, resonator=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("masses", [8, 40])
 def test_bands_of_a_folded_chain(masses):
     """A folded chain of n masses a cell has band edges 2 (k/m)^(1/2) sin(j pi/(2 n)); its long waves are fastest."""
@@ -26,7 +25,6 @@ def test_bands_of_a_folded_chain(masses):
     assert fastest_speed(folded(masses)) == pytest.approx(top / 2 / masses, rel=1e-3)
 
 
-@pytest.mark.slow
 def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
     """The fastest speed needs solutions at fewer wavenumbers than three grids, for 41 bands."""
     solved = []

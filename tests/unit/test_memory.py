@@ -27,7 +27,6 @@ def needs_of_many_sites(ranks: int = 1, end: float = 0.01) -> dict[str, float]:
     return memory_needed(case.model(), case.output, "propagator", ranks)
 
 
-@pytest.mark.slow
 def test_memory_grows_with_cells_and_sites_of_a_rank_but_not_with_samples_times_sites():
     """A million cells need 192 MB of states and each site 2.4 to 3.5 kB, as was fitted to one measured run."""
     one = needs_of_many_sites()

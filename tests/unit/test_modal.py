@@ -160,7 +160,6 @@ def test_a_long_force_drives_the_modes_as_its_integral_says(start, stop):
     assert found == pytest.approx(rate * (upper - lower), rel=1e-11, abs=1e-14)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
     """Energies of bands are those of the lattice's own modes for motions that are zero near the ends."""

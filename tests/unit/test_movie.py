@@ -94,7 +94,6 @@ def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
     assert envelopes[band, 60:120] == pytest.approx(expected[60:120], rel=0.15)
 
 
-@pytest.mark.slow
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
     """A site lights up in the frame that follows its onset, and fades by the factor FADE a frame."""
     # A frame stands for 1.5 ms.
@@ -135,7 +134,6 @@ def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monke
     assert [p.name for p in path.parent.iterdir()] == ["movie.mp4"]
 
 
-@pytest.mark.slow
 def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
     """Without ffmpeg a movie is a GIF, and a message says how to install it; a movie requested as MP4 is refused."""
     monkeypatch.setattr(movie, "ffmpeg", lambda: None)

@@ -24,7 +24,6 @@ def load(path, text, *overrides):
     return load_every(path, overrides)
 
 
-@pytest.mark.slow
 def test_spoilt_cases_are_read_or_refused(tmp_path):
     """Each of 60 case files with random changes is read, or refused by a sentence; both occur often."""
     spoilt = list(islice(mutations(11, without=SWEEPS), 60))

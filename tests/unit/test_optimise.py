@@ -70,7 +70,6 @@ def test_a_profile_is_log_spaced_and_a_cell_takes_its_masses_and_springs():
     assert case.drive.frequency != search.base.drive.frequency
 
 
-@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     # Points outside the cube are included, since samplers may step over its edge.
@@ -135,7 +134,6 @@ def recorder(plan):
     return Recorder(plan.space.to_unit(plan.begin()), np.zeros(3), smooth(3), 0.2, seed=1, population=None)
 
 
-@pytest.mark.slow
 def test_a_search_spends_its_budget_and_keeps_the_best():
     """A search makes as many designs as its budget allows, the case first, and compares the best one with it."""
     # Enough for three variables to come within 5 % of the least value.

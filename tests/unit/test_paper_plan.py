@@ -163,7 +163,6 @@ def test_no_claim_is_measured_from_results_that_are_stale_or_a_part(searched):
     assert [set(unusable) for unusable in given] == [set(), {"design"}]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tmp_path):
     """A step's failure is noted and costs no other step; cut files are computed again to the same bits."""

@@ -44,7 +44,6 @@ with p.StopRequest().listening() as stop:
 """
 
 
-@pytest.mark.slow
 def test_a_signal_that_is_sent_twice_is_one_request():
     """``timeout`` sends its signal twice: a repeat within 30 ms does not end a program that saves its state."""
     with subprocess.Popen([sys.executable, "-c", SAVES], stdout=subprocess.PIPE, text=True) as process:
@@ -73,7 +72,6 @@ with p.StopRequest().listening() as stop, stop.at_once():
 """
 
 
-@pytest.mark.slow
 def test_what_has_nothing_to_save_ends_at_once():
     """A signal ends such work wherever it is, with code 75."""
     script = [sys.executable, "-c", ENDS_AT_ONCE]

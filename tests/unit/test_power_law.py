@@ -30,7 +30,6 @@ def student_factor():
     return stats.t.ppf(0.975, len(X) - 2)
 
 
-@pytest.mark.slow
 @settings(max_examples=50)
 @given(exponent=st.floats(-4, 4), factor=st.floats(1e-6, 1e6), count=st.integers(3, 30))
 def test_an_exact_law_is_recovered(exponent, factor, count):

@@ -182,7 +182,6 @@ PAIRS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pairs", PAIRS)
 @ENDS
 def test_the_rates_are_those_of_all_forces(ends, pairs):

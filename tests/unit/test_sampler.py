@@ -155,7 +155,6 @@ def test_a_first_generation_changes_neighbours_together():
     assert np.std(points[:, 0] - points[:, 1]) < step < np.std(points[:, 0] - points[:, -1])
 
 
-@pytest.mark.slow
 def test_nsga_ii_finds_the_front_of_two_bowls():
     """The front of the squared distances from two points is the straight line between these points."""
     ends = np.array([[0.2, 0.2, 0.2], [0.8, 0.8, 0.2]])

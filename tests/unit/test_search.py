@@ -55,7 +55,6 @@ def direct_loop(reading, lam, eta):
     return np.array(deflection), np.abs(speeds)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("reading", READINGS)
 @pytest.mark.parametrize(("row", "column"), [(0, 14), (0, 1), (9, 20), (36, 35), (20, 3)])
 def test_grid_equals_a_direct_loop(found, reading, row, column):

@@ -141,7 +141,6 @@ def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
     assert whole.in_case(whole.from_unit(whole.to_unit(4))) == 4
 
 
-@pytest.mark.slow
 def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     """A function of a real number, a whole number and a choice, with a given least value, is minimised."""
     kinds = [

@@ -34,7 +34,6 @@ def test_transform_is_the_direct_sum_over_the_periodised_wavelet(length, kc):
     assert np.abs(transform(signal, kappa, kc, length) - expected).max() < 1e-12
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("cells", "kc", "odd"), [(90, 6.0, 0), (152, 6.0, 1), (90, 12.0, 0), (79, 12.0, 1)])
 def test_bank_is_transform_binning_and_inverse(cells, kc, odd):
     """The filters of the bank are transform, sum over the nodes of a bin, and inverse in one."""

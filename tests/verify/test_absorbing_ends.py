@@ -69,7 +69,6 @@ def source_and_sections(of):
     return source, sections_of(end, cell, lattice.ends, end.cells, end.strength)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("cell", "mass"), [(5, 2)])
 def test_what_a_drive_sends_is_its_work(cell, mass):
     """The energy of the waves that a force sends, an integral over its spectrum, is the work it does in a run.
@@ -117,7 +116,6 @@ def returning(source, section, slowest):
     return back / sent
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("strength", [230.0])
 def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
     """The energy that comes back in a run lies between two predictions, for fast waves alone and for all that return.

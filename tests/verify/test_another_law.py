@@ -11,8 +11,6 @@ import pytest
 from tests.manual_modules import write_modules
 from tests.verify.another_law import compare
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory) -> dict:

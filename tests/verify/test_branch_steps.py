@@ -105,7 +105,6 @@ def findings(problem: Shooting, points: list[Point]) -> list[str]:
 # The tip of the in-phase Hertz branch's 3:1 tongue lies on the out-of-phase branch. A step too long for the turn at the
 # tip leads onto the out-of-phase branch, and the grazing chart hides that turn. The true branch comes back from the
 # tip, where it passes c = 1, and none of its orbits repeats another one.
-@pytest.mark.slow
 def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
     """With the guard on turns the in-phase branch comes back from the tip, and no check reports anything."""
     problem, points = in_phase_hertz()

@@ -29,7 +29,7 @@ def test_the_curve_that_leaves(changes, kind, multiplier, curves, odd_one, tmp_p
 
     ``odd_one`` is the harmonic that the first curve lacks. A curve that meets the first one twice is followed once.
     """
-    case = case_of(changes, switch=[kind], harmonics=21, points=200)
+    case = case_of(changes, switch=[kind], harmonics=21, points=60)
     followed = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert len(followed) == curves
     trunk, crossing = followed

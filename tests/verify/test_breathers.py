@@ -11,7 +11,6 @@ from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting, resonance
 
 
-@pytest.mark.slow
 def test_the_tongues_of_the_in_phase_mode_are_followed():
     """Harmonic balance passes the tips of Kerschen's 3:1 and 5:1 tongues; shooting from it finds the same orbits."""
     system = kerschen_system()

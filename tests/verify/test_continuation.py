@@ -32,7 +32,6 @@ def test_degenerate_tangent_is_named():
         Continuation(problem, frame.measures(attempt), NnmTable())
 
 
-@pytest.mark.slow
 def test_kerschen_benchmark():
     """Modes of Kerschen and Peeters (2009): out of phase up to E = 1e6 J, in phase through the tongues 3:1 and 5:1."""
     system = kerschen_system()

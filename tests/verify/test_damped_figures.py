@@ -39,7 +39,6 @@ def impacts_of(sites: int, episodes: int, loss: float = 0.0) -> xr.Dataset:
     return xr.Dataset(data, attrs={"case": small_case().to_toml()})
 
 
-@pytest.mark.slow
 def test_impacts_that_markers_do_not_distinguish_are_a_map():
     few = impact_panels.impacts(impacts_of(5, 20, 1e-6), None).axes
     assert len(few[0].collections) == 2

@@ -88,7 +88,6 @@ class ForcedCell:
         return np.linalg.eigvals(np.array(columns).T) ** 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("force", "last"), [(19.5, 61)])
 def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last):
     """A steady state is unstable where a Floquet multiplier of its period map exceeds 1, and has its growth rate.

@@ -122,7 +122,6 @@ def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
     assert_same_bits(before, datasets(folder / "run.h5"))
 
 
-@pytest.mark.slow
 def test_a_sweep_is_one_table_of_members(tmp_path):
     table = {"lattice": {"preset": "four-band", "cells": 12}, "contacts": {"sites": [4], "clearance": 2e-4}}
     axes = {"drive": {"amplitude": [1.0, 30.0]}, "contacts": {"restitution": [0.5, 1.0]}}

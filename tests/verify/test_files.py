@@ -30,7 +30,6 @@ def run_folder(tmp_path_factory):
     return run
 
 
-@pytest.mark.slow
 def test_every_file_opens_in_xarray_with_units(run_folder):
     groups = {"run.h5": [None, "energy", "sites", "impacts"], "analysis.h5": [None, "bands"]}
     for name, members in groups.items():
@@ -101,7 +100,6 @@ def test_a_stalled_run_states_when_and_where_and_keeps_its_samples(folder, monke
     assert summary["status"] == result.sentence
 
 
-@pytest.mark.slow
 def test_another_analysis_of_the_same_run(run_folder, folder):
     """With other keys of [analysis] a run is measured anew, not simulated; any other key makes another case."""
     shutil.copytree(run_folder, folder / "run")
@@ -127,7 +125,6 @@ def test_another_analysis_of_the_same_run(run_folder, folder):
         simulate(small_case(drive={"amplitude": 2.0}), folder / "run")
 
 
-@pytest.mark.slow
 def test_the_default_analysis_is_near_the_full_one():
     """The default strides of the analysis change its measures little; each measure states strides and sampling error.
 

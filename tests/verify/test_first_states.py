@@ -82,7 +82,6 @@ def by_weights(monkeypatch) -> list[Any]:
     return asked
 
 
-@pytest.mark.slow
 def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
     """At 3 times the touching force a state is found by growing weights, and SciPy returns it after a period.
 
@@ -104,7 +103,6 @@ def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
     assert (change < 3e-4).all(), change
 
 
-@pytest.mark.slow
 def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by_weights):
     """Where there is only one state, growing weights find the one that growing amplitudes find.
 

@@ -91,7 +91,6 @@ def peak_time(time: np.ndarray, values: np.ndarray) -> float:
     return time[largest] + shift * (time[1] - time[0])
 
 
-@pytest.mark.slow
 def test_a_struck_chain_sends_a_solitary_wave(tmp_path):
     """The solitary wave is 1.2 % faster than Nesterenko's long wave, and five beads move in it.
 

@@ -83,7 +83,6 @@ def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> 
     return np.asarray(total)
 
 
-@pytest.mark.slow
 def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path):
     """Derivatives by parameters of every kind, through lossy contacts, are central differences of engines' runs.
 
@@ -111,7 +110,6 @@ def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path)
             assert error <= 1e-6 * scale + 1e-9, (impacts, number, error / scale)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("begin", "late"), [("burst", 0.0), ("burst", -2e-4), ("samples", 5e-5), ("step", -2e-4), ("struck", 5e-5)]
 )
@@ -148,7 +146,6 @@ def test_samples_of_a_record_need_not_be_those_of_the_engine(tmp_path, begin, la
     assert motion.onset == pytest.approx(onsets[onsets < times[-1]], abs=1e-9)
 
 
-@pytest.mark.slow
 def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     """From starts 30 % off, three sensors determine three clearances, the stiffness and the restitution to 1e-6."""
     table = lattice_table(time={"end": 0.014})
@@ -165,7 +162,6 @@ def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     assert found["windows/impacts"].values[-1] > 5
 
 
-@pytest.mark.slow
 def test_linear_parts_come_from_a_record_without_contact(tmp_path):
     """A record without contact determines a spring first; the clearances keep their starts until later windows."""
     quiet = lattice_table(drive={"amplitude": 1.0}, lattice={"cells": 6}) | {"name": "quiet"}
@@ -188,7 +184,6 @@ def test_linear_parts_come_from_a_record_without_contact(tmp_path):
     assert found["windows/value"].values[0, 1] == pytest.approx(6e-4, rel=1e-12)
 
 
-@pytest.mark.slow
 def test_a_record_that_never_touches_bounds_the_clearance(tmp_path):
     """Data without contact bound a clearance from below by the largest relative displacement, and give no estimate."""
     table = lattice_table(drive={"amplitude": 2.0}, contacts={"clearance": 5e-3}, time={"end": 0.014})
@@ -207,7 +202,6 @@ def test_a_record_that_never_touches_bounds_the_clearance(tmp_path):
     assert "at least" in found.attrs["warnings"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("truth", "start"), [(5e-3, 2e-4), (3e-4, 2.9e-3)])
 def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, start):
     """A clearance that has contacts where the record has none, or none where it has some, is moved to the other side.
@@ -230,7 +224,6 @@ def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, s
     assert value > largest if truth > largest else 0.3 * largest < value < largest
 
 
-@pytest.mark.slow
 def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
     """A bilinear model fitted to data of Hertz's law leaves residuals that are not white; Hertz's law does not."""
     table = lattice_table(time={"end": 0.014})
@@ -245,7 +238,6 @@ def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
     assert "not white" in found.attrs["warnings"]
 
 
-@pytest.mark.slow
 def test_intervals_hold_the_truth(tmp_path):
     """Intervals of 90 % contain most true values in four records with 2 % noise; deviations are as large as stated."""
     table = lattice_table(time={"end": 0.014})

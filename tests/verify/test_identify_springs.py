@@ -91,7 +91,6 @@ def record(tmp_path_factory):
     return written(tmp_path_factory.mktemp("record") / "exact.csv", measured(motion_of(TRUTH)))
 
 
-@pytest.mark.slow
 def test_derivatives_are_differences_of_scipy(record):
     """Derivatives through three impacts, by parameters of springs, mass, stop and offset, are differences of SciPy."""
     quantities = ["quadratic", "cubic", "spring", "mass", "clearance"]
@@ -124,7 +123,6 @@ def test_derivatives_are_differences_of_scipy(record):
     assert (error < 1e-3 * np.abs(expected).max(axis=0)).all(), error
 
 
-@pytest.mark.slow
 def test_derivatives_by_an_unknown_state_are_differences_of_scipy(record):
     """Derivatives by an initial displacement and velocity, through curved springs, are differences of SciPy."""
     unknowns = [{"quantity": "cubic", "bounds": [1e9, 4e9]}]
@@ -166,7 +164,6 @@ def found_in(table, folder):
         return file.load()
 
 
-@pytest.mark.slow
 def test_curved_springs_come_back_from_linear_ones(record, tmp_path):
     """From linear springs and without noise the fit finds all true parameters, and the identified case has them."""
     found = found_in(table_of(record, UNKNOWNS, **CASE), tmp_path)

@@ -52,7 +52,6 @@ def identified(tmp_path_factory):
     return plan, z, results
 
 
-@pytest.mark.slow
 def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
     """The covariance is (J^T J)^-1 with J from differences of runs, and the sensor that is named lowers an error most.
 
@@ -78,7 +77,6 @@ def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
             assert error == pytest.approx(lowest, rel=1e-4)
 
 
-@pytest.mark.slow
 def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
     """At the last value of a profile the misfit is the least one with that parameter held.
 
@@ -126,7 +124,6 @@ def test_intervals_of_few_data_are_as_wide_as_their_noise_is_uncertain(confidenc
     assert np.mean(held) == pytest.approx(confidence, abs=0.01)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_a_value_at_its_bound_has_no_interval(tmp_path, given):
     """A fit that wants a value beyond a bound says so; the interval of the others has the noise that is known."""

@@ -47,7 +47,6 @@ def test_a_run_without_a_folder_is_the_run_with_one(tmp_path):
     assert str(tmp_path / "run") in stored._repr_html_()
 
 
-@pytest.mark.slow
 def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
     """A sweep in memory has the ensemble of a sweep in a folder, and removes its temporary folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -69,7 +68,6 @@ def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
     assert "sweep of 2 members" in held._repr_html_()
 
 
-@pytest.mark.slow
 def test_a_sweep_that_is_stopped_stays_where_it_is(tmp_path, monkeypatch):
     """A stopped sweep in memory keeps its temporary folder, with the complete members, and can go on from it."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

@@ -74,7 +74,6 @@ def test_a_mode_stays_a_mode(engine, ends):
     assert np.abs(u).max() == pytest.approx(case.initial.amplitude, rel=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("direction", [-1])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction):

@@ -155,7 +155,6 @@ def refined(tmp_path_factory):
     return case, make_law(case, folder, MPI.COMM_SELF), folder
 
 
-@pytest.mark.slow
 def test_a_law_is_refined_to_its_onset(refined):
     """The points of a law are as dense as asked for where transmission drops, and the law is drawn from its file."""
     case, law, folder = refined

@@ -76,7 +76,6 @@ def test_the_wave_decays_over_the_distance_as_by_dashpots_to_ground(tmp_path):
     assert expected < 0.95
 
 
-@pytest.mark.slow
 def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
     """The energy through a spring three cells from the site is that of the waves, with their decay over three cells.
 

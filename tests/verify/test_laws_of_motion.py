@@ -98,7 +98,6 @@ def test_the_motion_is_that_of_scipy(name):
         assert run.sizes["episode"] == impacts
 
 
-@pytest.mark.slow
 def test_engines_agree_on_half_of_the_builtin_run():
     """The built-in run has 80 impacts up to 0.44 s."""
     runs = []

@@ -143,7 +143,6 @@ def test_losses_are_those_of_the_orbit_whichever_part_of_it_is_shot(name):
     assert found.force == pytest.approx(expected.force, rel=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.005])
 def test_the_force_holds_a_steady_state_in_quadrature(damping):
     """A steady state near the free motion that lags its force by a quarter of a period needs the branch's force."""

@@ -49,7 +49,6 @@ def sweep(tmp_path_factory):
     return margins, open_ensemble(folder / "sweep"), folder / "sweep"
 
 
-@pytest.mark.slow
 def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(sweep):
     margins, ensemble, _ = sweep
     assert ensemble["status"].values.tolist() == np.where(margins < 0.9, SCALED, COMPLETE).tolist()
@@ -73,7 +72,6 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
     assert not ensemble["dissipated_fraction"].values[:2].any()
 
 
-@pytest.mark.slow
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples.
 

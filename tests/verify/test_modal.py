@@ -27,7 +27,6 @@ def losses(run, analysis):
     return np.bincount(cluster, run["impacts/loss"].values, len(analysis["bands/cluster"]))
 
 
-@pytest.mark.slow
 def test_modal_energies_of_the_built_in_run(builtin):
     """Modal energies sum to the energy, change in contacts alone, and end with known shares."""
     run, analysis = builtin

@@ -68,7 +68,6 @@ def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
     assert counts == [0, 0, 1]
 
 
-@pytest.mark.slow
 def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
     """The curve folds at amplitude/clearance 1.0014 and is unstable beyond; the shares of the energy sum to one."""
     for curve in follow_all(nfrc_case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
@@ -101,7 +100,6 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
         assert sweep_down(curve) == sweep_up(curve)[::-1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("nfrc", [{"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
 def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     """The shares satisfy T + R + U + L = 1, and a wave from the other side of mirrored sites has the same curve.

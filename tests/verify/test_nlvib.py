@@ -117,7 +117,6 @@ def attractor() -> np.ndarray:
     return periodic_orbit(0.635, state)[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("omega", "steps", "stability"), [(0.635, 1, "stable"), (0.6, 5, "a pair grows"), (0.74, 15, "flips")]
 )

@@ -140,7 +140,6 @@ class Watch(Observer):
         return {"fastest": self.fastest, "watched": self.seen}
 
 
-@pytest.mark.slow
 def test_an_observer_is_given_and_goes_on_with_the_run(folder):
     case = small_case(time={"end": 0.04})
     straight = simulate(case, folder / "straight", observers=[Watch])

@@ -119,7 +119,6 @@ def test_what_is_beyond_the_last_site_is_what_came_through(driven, site, beyond)
     assert 0.3 < values["transmitted"] < 1
 
 
-@pytest.mark.slow
 def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     plan = OptimiseCase.from_table(TABLE)
     optimum_search.run_search(plan, tmp_path)

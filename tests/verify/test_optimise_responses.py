@@ -74,7 +74,6 @@ def measured(case: NfrcCase, **table: Any) -> list[float]:
     return measured_responses(case, [objective], MPI.COMM_SELF, StopRequest())["values"][objective.name]
 
 
-@pytest.mark.slow
 def test_the_peak_is_least_at_the_absorber_of_den_hartog():
     """Den Hartog's absorber has the peak (1 + 2/mu)^(1/2), and other stiffnesses and dampings have larger peaks.
 
@@ -93,7 +92,6 @@ def test_the_peak_is_least_at_the_absorber_of_den_hartog():
         assert measured(absorber(RATIO * frequency**2, factor**3 * damping))[0] > 1.005 * least
 
 
-@pytest.mark.slow
 def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
     """Peaks over the range and over a part of it, and widths below a level, are those of the exact response."""
     case = absorber(0.045, 0.01, fixed=[1.0, 2.0], largest_step=0.05)
@@ -121,7 +119,6 @@ def searched(tmp_path_factory):
     return plan, folder, run_search(plan, folder, MPI.COMM_SELF).attrs["summary"]
 
 
-@pytest.mark.slow
 def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     """The verb nfrc, run on best.toml, gives the curve whose largest value the search has found, to the bit."""
     _, folder, summary = searched
@@ -153,7 +150,6 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     assert Case.load(folder / "best.toml").lattice.cell.springs[1].damping == found["parameter"][best, 1]
 
 
-@pytest.mark.slow
 def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     """A design whose curve ends early fails, with the curve's ending as its reason; its runs are still measured."""
     # Four points reach only a part of the range.

@@ -30,7 +30,6 @@ def superposed(stiffness, masses, centre, displacement, velocity, duration):
     return later / root + centre, later_rate / root
 
 
-@pytest.mark.slow
 def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
     """A quarter period of a bilinear orbit is modal superposition with the contact closed, and then with it open.
 

@@ -16,7 +16,6 @@ from vipetsc.io.store import RunMemory
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sections", [{}, PART, {"output": {"fields": []}}])
 def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     """A run has the same bits with chunks of any length."""
@@ -30,7 +29,6 @@ def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     assert_same_bits(datasets(folder / "long" / "run.h5"), datasets(folder / "short" / "run.h5"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sections", [{}, PART, {"contacts": {"sites": []}}])
 def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     case = small_case(**sections, time={"end": 0.04})

@@ -40,8 +40,6 @@ from vipetsc.studies.backbone import relate_folders
 from vipetsc.studies.reanalysis import measure_run
 from vipetsc.studies.sweep import run_sweep
 
-pytestmark = pytest.mark.slow
-
 
 def study(name: str, *changes: str) -> Callable[[Path], list[Path]]:
     """Return a function that computes a study of ``tests/studies.py``, with changes, into a folder."""

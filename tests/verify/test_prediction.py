@@ -61,7 +61,6 @@ def prediction(tmp_path_factory) -> Prediction:
     return Prediction(folder, case, predict(case, folder))
 
 
-@pytest.mark.slow
 def test_energy_is_whole_and_no_fraction_is_negative(prediction):
     """Predicted energies of bands and the loss sum to one, and no energy of a band is negative."""
     data = prediction.data
@@ -136,7 +135,6 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
         assert outcome.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("contacts", "kinds"),
     [
@@ -183,7 +181,6 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
     np.testing.assert_allclose(release, [record["release"] for record in site_records])
 
 
-@pytest.mark.slow
 def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
     """A wall moved by U acts as a force k U on the mass next to it, and its wave is predicted as simulated."""
     moved = prediction_case(
@@ -220,7 +217,6 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
         np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
 
 
-@pytest.mark.slow
 def test_a_ring_is_predicted_as_simulated(tmp_path):
     """A ring is predicted over one passage of the wave; the linear wave is the same wherever the drive is."""
     amplitudes = {"amplitudes": [30.0, 120.0]}
@@ -242,7 +238,6 @@ def test_a_ring_is_predicted_as_simulated(tmp_path):
     assert data.attrs["worst_dissipated"] < 0.05
 
 
-@pytest.mark.slow
 def test_sites_that_are_too_close_are_told(tmp_path):
     """A prediction whose sites feel each other too strongly warns: its energies do not close, and its steps fail."""
     contacts = {"sites": list(range(40, 48)), "clearance": 1e-3, "restitution": 1.0}

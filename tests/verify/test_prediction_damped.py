@@ -105,7 +105,6 @@ def damped(request, tmp_path_factory):
     return predict(case, folder), folder, request.param != "dashpots"
 
 
-@pytest.mark.slow
 def test_dashpots_and_ends_take_what_they_take_in_the_run(damped):
     """Losses in dashpots, ends and contacts are predicted as simulated, with the bounds of undamped lattices."""
     data, folder, has_end = damped

@@ -104,7 +104,6 @@ def test_a_linear_run_is_the_modal_solution(ends, lattice, drive, time):
     assert result.statistics["ledger_error"] < 1e-12
 
 
-@pytest.mark.slow
 def test_the_builtin_run_takes_the_steps_it_needs():
     """The built-in run takes one step from each sample to the next, and few substeps."""
     _, result = simulated(with_engine(Case.load(), "propagator"))

@@ -5,7 +5,6 @@ import re
 from mpi4py import MPI
 
 import numpy as np
-import pytest
 
 from tests.conftest import small_case
 from tests.unrecorded import unrecorded_samples
@@ -61,7 +60,6 @@ def test_a_run_that_stalls_ends_with_its_last_sample_and_the_contact_of_the_stal
     assert last < run["impacts/onset"].values[0] < last + case.model().sample_interval
 
 
-@pytest.mark.slow
 def test_ten_thousand_sites_are_set_up_and_restored():
     """An engine for 10 000 sites is restored from the checkpoint of another one to the same checkpoint."""
     sites = {"first": 5, "spacing": 10, "count": 10_000}

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-import pytest
-
 import vipetsc as package
 from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.case import Sweep
@@ -36,7 +34,6 @@ def attributes(path: Path) -> dict:
         return data.attrs
 
 
-@pytest.mark.slow
 def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_process):
     # Dates are written in whole seconds.
     before = datetime.now(UTC).replace(microsecond=0)

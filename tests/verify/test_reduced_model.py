@@ -82,7 +82,6 @@ def test_hertz_folds_only_at_200_mpa(hertz):
     assert max(point.multiplier for point in stiffer.points) > 1.01
 
 
-@pytest.mark.slow
 def test_in_phase_through_the_first_tongues(in_phase):
     """The branch passes the grazing cascade and two resonances without a jump, and grazes at its own energy."""
     problem = in_phase.problem
@@ -101,7 +100,6 @@ def test_in_phase_through_the_first_tongues(in_phase):
     assert not any(monitor.check(point) for point in points)
 
 
-@pytest.mark.slow
 def test_in_phase_through_every_odd_tongue_towards_the_limit(in_phase):
     """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
     problem = in_phase.problem

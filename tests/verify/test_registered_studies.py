@@ -23,8 +23,6 @@ from vipetsc.io.export import write_curves
 from vipetsc.studies.one_site import make_law
 from vipetsc.studies.optimum_search import run_search
 
-pytestmark = pytest.mark.slow
-
 COPIES = """
 from vipetsc import register
 

@@ -57,7 +57,6 @@ def by_frequency(tmp_path_factory):
     return curve
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "low", "high"),
     [("contacts.clearance", 0.1, 0.12), ("lattice.cell.masses[1]", 0.98, 1.0), ("lattice.damping.mass", 0.05, 0.06)],
@@ -80,7 +79,6 @@ def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, b
     assert ends[0].unstable == ends[1].unstable
 
 
-@pytest.mark.slow
 def test_newtons_method_converges_quadratically():
     """Newton's method converges quadratically although the column of the key is a difference.
 
@@ -99,7 +97,6 @@ def test_newtons_method_converges_quadratically():
         assert third < 30 * second**2 + 1e-9 * second
 
 
-@pytest.mark.slow
 def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(clearances):
     """States return after a period by SciPy with their own clearance, and are stable as its multipliers say."""
     case, _, curve = clearances
@@ -128,7 +125,6 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
     assert np.sum(np.diff(np.sign(values - folds.mean())) != 0) == 3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("key", "low", "high"), [("contacts.restitution", 0.9, 1.0), ("contacts.clearance", 0.1, 0.2)])
 def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp_path):
     case = over(key, low, high, CLOSER, first_step=0.2, largest_step=1.0)

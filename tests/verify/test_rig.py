@@ -138,7 +138,6 @@ def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
         np.testing.assert_allclose(point.measured.harmonics[0, 1], u[0], rtol=1e-8)
 
 
-@pytest.mark.slow
 def test_a_lossy_run_settles_into_the_response():
     """A run from rest with restitution 0.6 settles to the amplitudes of the response at its frequency."""
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"restitution": 0.6}}

@@ -64,7 +64,6 @@ def test_without_contact_drives_are_superposed(drives):
     np.testing.assert_allclose(together * np.sign(drives[0]["amplitude"]), alone, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_two_forces_on_one_mass_are_one():
     """Two halves of a force act as the whole force, also with contact, in every unknown of the state."""
     half = FORCE | {"amplitude": 0.5}

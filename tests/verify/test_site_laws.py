@@ -11,7 +11,6 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize("damping", ["exact", "flores"])
 def test_a_law_that_no_site_has_may_have_no_limit(engine, damping):

@@ -61,7 +61,6 @@ def test_folds_of_the_duffing_oscillator(tmp_path):
     assert [point.kind for point in stored.points] == [point.kind for point in special[1].points]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes, kind",
     [(FLIP, "period-doubling"), (PAIR, "neimark-sacker"), (UNEVEN, "branch-point")],

@@ -43,7 +43,6 @@ def multipliers_at(states, point) -> np.ndarray:
     return period_map(states, point, state).multipliers
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "kind", "count"),
     [(PAIR, "neimark-sacker", 2), (FLIP, "period-doubling", 2), (UNEVEN, "branch-point", 1)],
@@ -77,7 +76,6 @@ def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tm
         assert around == [0, 2 if kind == "neimark-sacker" else 1]
 
 
-@pytest.mark.slow
 def test_folds_are_no_branch_points(tmp_path):
     """Folds are not reported as branch points, although a multiplier is 1 at them as well."""
     states, points = followed(case_of({"nfrc": {"range": [1.2, 1.45]}}, harmonics=31, special_points="all"), tmp_path)

@@ -22,8 +22,6 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import BRANCHES, KINDS
 from vipetsc.parallel import StoppedError
 
-pytestmark = pytest.mark.slow
-
 # One study of each verb: claims of folders and faults come through the frame that its studies share.
 ONE_OF_EACH = list({scenario.verb.name: name for name, scenario in reversed(STUDIES.items())}.values())
 

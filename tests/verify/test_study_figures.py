@@ -111,7 +111,6 @@ def members(ensemble):
     return [folder for _, folder in whole_members(ensemble)]
 
 
-@pytest.mark.slow
 def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
     """Panels show energies divided by the square of the amplitude, each row on one scale, with branches and sites.
 
@@ -151,7 +150,6 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
         assert list(marks.get_ydata()) == case.contacts.sites
 
 
-@pytest.mark.slow
 def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     """Panels show the transform of the host's velocity over the amplitude, at four times for three amplitudes."""
     figure = only("wavelets", [whole])
@@ -182,7 +180,6 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     np.testing.assert_allclose(panels[1, 2].images[0].get_array(), expected, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_partition_shows_seven_bins_and_all_colours(whole):
     figure = only("partition", [whole])
     with h5py.File(members(whole)[1] / "analysis.h5") as file:
@@ -210,7 +207,6 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
     assert all(axes.collections for axes in panels)
 
 
-@pytest.mark.slow
 def test_reconstruction_shows_energies_error_and_cross_terms(whole):
     figure = only("reconstruction", [whole])
     grid = np.reshape(figure.axes, (3, 3))
@@ -239,7 +235,6 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
 CALIBRATED = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("average", AVERAGES)
 @pytest.mark.parametrize(("column", "sites"), [(1, 3)])
 def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures, average, column, sites):

@@ -14,7 +14,6 @@ def relative(difference: np.ndarray, whole: np.ndarray) -> float:
     return float(np.linalg.norm(difference) / np.linalg.norm(whole))
 
 
-@pytest.mark.slow
 def test_tolerance_keeps_its_promise():
     """A hundredth of the tolerance lowers the error by ten or more; 1e-10 leaves less than 1e-6."""
     velocity = {rtol: run_of(small_case(time={"rtol": rtol}))["velocity"].values for rtol in (1e-8, 1e-10, 1e-12)}
@@ -33,7 +32,6 @@ def exact():
 
 
 # The third-order pair would need very many steps at 1e-9.
-@pytest.mark.slow
 @pytest.mark.parametrize(("method", "rtol"), [("3bs", 1e-6), ("7vr", 1e-9)])
 def test_every_method_samples_exactly(folder, exact, method, rtol):
     """Every Runge-Kutta method ends steps on samples, where its error is that of its steps alone.
@@ -53,7 +51,6 @@ def test_every_method_samples_exactly(folder, exact, method, rtol):
     assert_same_bits(straight, datasets(folder / "stopped" / "run.h5"))
 
 
-@pytest.mark.slow
 def test_fixed_steps_converge_with_the_order_of_the_method(petsc_options):
     """With fixed steps (-ts_adapt_type none -ts_dt H) halving H divides the error of the method 3bs by about 2^3.
 

@@ -98,7 +98,6 @@ def panel(figure, text):
     return found
 
 
-@pytest.mark.slow
 def test_ibtet_shows_the_ensembles_values(reduced):
     (figure,) = offered_figures("ibtet", reduced).values()
     for law in ("hertz", "bilinear"):
@@ -140,7 +139,6 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
     np.testing.assert_allclose(shown["sum"][1], 1.0, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_backbone_is_aligned_exactly(reduced):
     """Energies are aligned with the branch at grazing, and the figure shows slope over divisor and the power law."""
     figures = offered_figures("ibtet_backbone", reduced)
@@ -186,7 +184,6 @@ def test_backbone_is_aligned_exactly(reduced):
     assert abs(residual @ np.log(red[0])) < 1e-8
 
 
-@pytest.mark.slow
 def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures):
     assert list(transfer_pictures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
 
@@ -211,7 +208,6 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures)
         assert shown.get_extent()[1] == pytest.approx(file["bands/sample"][-1], rel=0.02)
 
 
-@pytest.mark.slow
 def test_band_energies_sum_to_the_total(whole):
     """Energies of the parts sum to the total over the whole record, in which parts are orthogonal.
 
@@ -243,7 +239,6 @@ def test_closing_error_is_exact_for_parts_in_quadrature():
     assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
 
 
-@pytest.mark.slow
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     """The figure has two points on the curve of transfer, and for each the phase portrait of host and resonator."""
     (figure,) = offered_figures("phase_regimes", whole, reduced).values()

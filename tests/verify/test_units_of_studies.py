@@ -21,8 +21,6 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.studies import one_site
 
-pytestmark = pytest.mark.slow
-
 SITE = {"law": "bilinear", "stiffness": 1e7, "sites": [9], "clearance": 3e-4}
 LATTICE = {"cells": 24, "cell": PAIR}
 BREATHERS = {"system": "condensed", "start_frequency": [1400.0], "points": 12, "truncation": 1e-4}

@@ -31,7 +31,6 @@ def test_sites_that_nothing_reaches(folder, engine):
     assert found == "no contact: nothing reached any of the 3 sites"
 
 
-@pytest.mark.slow
 def test_indentations_beyond_the_radius(folder):
     """A run warns of indentations beyond the radius, where Hertz's law does not hold, but not with a bilinear law."""
 
@@ -46,7 +45,6 @@ def test_indentations_beyond_the_radius(folder):
     assert warnings("bilinear", law="bilinear") == []
 
 
-@pytest.mark.slow
 def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
     """Fixed steps too long for the energy balance to close give a warning, from Python and from the command line."""
     petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)

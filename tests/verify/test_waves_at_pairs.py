@@ -93,7 +93,6 @@ def measures_of(case: NfrcCase, restitution: float) -> Measures:
     return states.measured(first_state(states).xi)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MIRRORED)
 def test_energy_and_mirror_images(name):
     """A state in contact satisfies T + R + U + L = 1, and a wave from the other side moves mirrored sites alike."""
@@ -111,7 +110,6 @@ def test_energy_and_mirror_images(name):
     assert backward.unstable == forward.unstable
 
 
-@pytest.mark.slow
 def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
     """A run under the wave of a distant force settles to the steady state of contacts with ground and next cell."""
     omega = 1000.0

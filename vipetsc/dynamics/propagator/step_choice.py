@@ -63,8 +63,12 @@ def step_series(model: Model) -> StepSeries | None:
         if cost >= least:
             break
         series = _series(model, parts)
-        too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
-        if too_long or model.chain.cells < series.width:
+        if max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H:
+            continue
+        if model.chain.cells < series.width:
+            # Forces reach least far in the shortest step: where that one does not suit, no other need be looked at.
+            if model.chain.cells < _series(model, MOST_PARTS).width:
+                return None
             continue
 
         # Every DoF of a cluster is moved by every other one: the mean size of a DoF's cluster.
