@@ -8,8 +8,7 @@ import numpy as np
 
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.case.nnm import NnmTable
-from vipetsc.lattice import Chain, four_band
-from vipetsc.lattice.compliance.moments import SeriesCompliance
+from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -46,7 +45,7 @@ def condensed_breather(
     chain = Chain(cell, cells, "fixed", sites_at([site - 1], cell.pair, clearances=CLEARANCE))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
     forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
-    problem = ConservativeMotions(SeriesCompliance(chain), forces, control)
+    problem = ConservativeMotions(WaveCompliance(chain), forces, control)
     return problem, problem.in_gap(omega, np.array([1.0]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.conftest import small_case
 from vipetsc.case import Model
-from vipetsc.contact.law import CLOSED, LANDED, PERMANENT, create_contacts
+from vipetsc.contact.law import CLOSED, LANDED, UNSWITCHED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.nodes import collocation
@@ -101,9 +101,9 @@ def mass_on_cubic_spring(cubic: float) -> Record:
 
 
 def pressed_mass(gap: float, side: int = 1) -> Record:
-    """Return the mass of ``mass_on_stop`` at a permanent contact, whose stop is at w = ``gap`` in m on one ``side``."""
+    """Return the mass of ``mass_on_stop`` at an unswitched contact; its stop is at w = ``gap`` in m on one ``side``."""
     cluster = mass_on_stop()
-    cluster.contacts["mode"] = side * PERMANENT
+    cluster.contacts["mode"] = side * UNSWITCHED
     cluster.contacts["clearance"] = gap
     cluster.contacts["clearance_minus"] = gap
     cluster.contacts["scale"] = 0.5

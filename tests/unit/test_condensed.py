@@ -187,7 +187,7 @@ def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_re
     assert series.forces[0] == pytest.approx([6.0, 3.0, 0.0], abs=1e-13)
     assert series.closed == [1.0]
 
-    # The loss depends on the approach velocity of an onset, which a permanent contact does not have.
+    # The loss depends on the approach velocity of an onset, which an unswitched contact does not have.
     with pytest.raises(NoMotionError, match="never separates"):
         SiteForces([Stops.both(DISSIPATIVE[0], 1.0)]).series(z, OMEGA)
 

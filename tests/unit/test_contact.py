@@ -12,7 +12,7 @@ from vipetsc.contact import changes, search
 from vipetsc.contact.law import (
     CLOSED,
     FREE,
-    PERMANENT,
+    UNSWITCHED,
     contact_force,
     create_contacts,
     elastic_energy,
@@ -237,17 +237,17 @@ def create_tracker() -> ImpactTracker:
 
 def pull(tracker: ImpactTracker, start: float) -> None:
     """Move the second site of a tracker from ``start`` m back to its clearance, so fast that the contact pulls."""
-    tracker.end[1] = start, 0.0, 0.0
+    tracker.after[1] = start, 0.0, 0.0
     tracker.accept_step(STEP)
     # g = 1 + 0.45 (-0.2/0.05) < 0.
-    tracker.end[1] = -CLEARANCE, 0.2, 0.0
+    tracker.after[1] = -CLEARANCE, 0.2, 0.0
     tracker.accept_step(STEP)
 
 
 def test_a_site_that_touches_and_recedes_grazes():
     """A site at its clearance that moves inwards has no onset and is counted as grazing."""
     tracker = create_tracker()
-    tracker.start[1] = -CLEARANCE, 0.01, 0.0
+    tracker.before[1] = -CLEARANCE, 0.01, 0.0
     assert tracker.switch(0.1, np.array([0.0, 0.25])) == 0
     assert tracker.counts["grazes"].tolist() == [0, 1]
 
@@ -255,7 +255,7 @@ def test_a_site_that_touches_and_recedes_grazes():
 def test_the_tracker_follows_an_impact_from_onset_to_separation():
     """An impact is one episode with onset, extremes, loss and separation, also for a tracker resumed within it."""
     tracker = create_tracker()
-    tracker.start[1] = -CLEARANCE, -0.01, 0.0
+    tracker.before[1] = -CLEARANCE, -0.01, 0.0
     assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
     site = tracker.contacts[1]
     assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
@@ -288,11 +288,11 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     assert tracker.contact_time() == np.inf
 
 
-@pytest.mark.parametrize("way", ["switch", "begin", "restore", "permanent"])
+@pytest.mark.parametrize("way", ["switch", "begin", "restore", "unswitched"])
 def test_a_contact_is_followed_from_the_beginning_or_after_steps_without_any(way):
     tracker = create_tracker()
-    if way == "permanent":
-        tracker.contacts["mode"][1] = -PERMANENT
+    if way == "unswitched":
+        tracker.contacts["mode"][1] = -UNSWITCHED
         tracker = ImpactTracker(tracker.contacts, (4, 9))
     else:
         tracker.accept_step(STEP)
@@ -302,8 +302,8 @@ def test_a_contact_is_followed_from_the_beginning_or_after_steps_without_any(way
     if way == "begin":
         motion = np.zeros((10, 2))
         motion[9] = -1.01 * CLEARANCE, -0.1
-        tracker.begin(motion)
-    elif way != "permanent":
+        tracker.close_at_start(motion)
+    elif way != "unswitched":
         closed.start[1] = -CLEARANCE, -0.1, 0.0
         assert closed.switch(0.1, np.zeros(2)) == 1
     if way == "restore":
@@ -311,8 +311,8 @@ def test_a_contact_is_followed_from_the_beginning_or_after_steps_without_any(way
         table[[4, 9]] = closed.checkpoint()
         tracker.restore(table)
 
-    tracker.start[1] = -CLEARANCE, -0.1, 0.0
-    tracker.end[1] = -1.5 * CLEARANCE, 0.0, 0.0
+    tracker.before[1] = -CLEARANCE, -0.1, 0.0
+    tracker.after[1] = -1.5 * CLEARANCE, 0.0, 0.0
     tracker.accept_step(STEP)
     (episode,) = tracker.take_episodes(np.zeros(2), unfinished=True)
     assert episode["indentation"] >= 0.5 * CLEARANCE
@@ -339,7 +339,7 @@ def test_the_contact_time_is_that_of_an_integrated_impact(law):
 def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
     """A site beyond its clearance is closed, whatever the sign of w', and does not count as grazing."""
     tracker = ImpactTracker(create_contacts(Contact("hertz", STIFFNESS), [CLEARANCE], MASS), (0,))
-    tracker.start[0] = 1.01 * CLEARANCE, -0.1, 0.0
+    tracker.before[0] = 1.01 * CLEARANCE, -0.1, 0.0
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts["mode"].tolist() == [CLOSED]
     assert tracker.counts["grazes"].sum() == 0

@@ -59,7 +59,7 @@ def test_a_kink_is_found_where_a_pressed_contact_opens_or_closes(side, gap, moti
 
     assert _first_kink(cluster, cluster.trial, length) == pytest.approx(kink, rel=1e-9)
 
-    # Contacts that are not permanent have modes, whose changes another search finds.
+    # Changes of the mode of other contacts another search finds.
     cluster.contacts["mode"] = side * CLOSED
     assert _first_kink(cluster, cluster.trial, length) == NONE
 

@@ -16,7 +16,7 @@ from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, FREE
 from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs, register
+from vipetsc.dynamics.ts.right_hand_side import find_change, register, site_motion_at, site_motion_by_rates
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
 from vipetsc.lattice.sites import Pair, sites_at
 
@@ -233,12 +233,12 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
 
         seen = np.full((len(SITES), 3), np.nan)
         if model.chain.has_own_pairs:
-            observe_pairs(found.y, found.rates, found.lattice, seen)
+            site_motion_by_rates(found.y, found.rates, found.lattice, seen)
         else:
             # As the engine calls it, by the address of what PETSc gets.
             ts = PETSc.TS().create(MPI.COMM_SELF)
             context = register(ts, found.lattice)
-            observe_at(motion.t, found.y, context.ctypes.data, seen)
+            site_motion_at(motion.t, found.y, context.ctypes.data, seen)
         np.testing.assert_allclose(seen, expected, rtol=1e-11, err_msg=name)
 
 

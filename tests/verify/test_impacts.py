@@ -53,7 +53,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     integrator.step = 1e-5
     integrator.free_step = 1e-5
     integrator._first_step = 1e-5
-    integrator.observe(integrator.tracker.start)
+    integrator.find_site_motion(integrator.tracker.before)
     # The impact is over after about 1.1 ms; after 3 ms the rebounding mass meets the stop on the other side.
     integrator.advance(0.0025)
 
@@ -137,7 +137,7 @@ def test_a_checkpoint_at_an_onset_goes_on_to_the_same_bits():
     resonator = model.chain.cell.resonator
     cells[4, resonator] = 1e-3
     cells[4, layout.dofs + resonator] = 1.0
-    whole.begin(cells, np.array([[1e-3, 1.0]]), 0.0)
+    whole.set_motion(cells, np.array([[1e-3, 1.0]]), 0.0)
 
     parts = Integrator(model, layout)
     parts.restore([whole.checkpoint()])
@@ -173,7 +173,7 @@ def test_checkpoints_under_a_drive_of_pieces_go_on_to_the_same_bits():
         for engine in (whole, parts):
             engine.advance(number * model.sample_interval)
         np.testing.assert_array_equal(parts.state.array_r, whole.state.array_r)
-        np.testing.assert_array_equal(parts.tracker.start, whole.tracker.start)
+        np.testing.assert_array_equal(parts.tracker.before, whole.tracker.before)
         parts.destroy()
 
     assert len(whole.take_episodes()) > 5

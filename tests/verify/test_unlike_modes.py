@@ -11,8 +11,7 @@ from tests.breathers import breather_chain
 from tests.models import CLEARANCE, four_band_contact
 from tests.unlike_lattices import independent_lattice, unlike_case
 from vipetsc.case.nnm import NnmTable
-from vipetsc.lattice import Chain, Contact
-from vipetsc.lattice.compliance.moments import SeriesCompliance
+from vipetsc.lattice import Chain, Contact, WaveCompliance
 from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -118,7 +117,7 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
     """The compliance by Bloch waves and the one by all modes give the same breather, which is that of shooting."""
     chain, stops, shot = one_sided
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
-    by_waves = ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), control)
+    by_waves = ConservativeMotions(WaveCompliance(chain), SiteForces(stops), control)
     by_modes = condensed_system(System.from_chain(chain, stops), control)
 
     first, second = (problem.in_gap(OMEGA, np.array([1.0])) for problem in (by_waves, by_modes))
@@ -139,7 +138,7 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
     chain = Chain(cell, 18, "fixed", sites_at([4, 13], cell.pair, clearances=[CLEARANCE, 2 * CLEARANCE]))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.sites.clearances]
     control = NnmTable(truncation=1e-7, tolerance=1e-11)
-    problem = ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), control)
+    problem = ConservativeMotions(WaveCompliance(chain), SiteForces(stops), control)
 
     near, far, opposite = (problem.in_gap(1600.0, np.array(signs)) for signs in ([1, 0], [0, 1], [0, -1]))
 

@@ -22,11 +22,11 @@ impact. The exact damping is the c that solves it for e = r. A fast separation m
 "clip"`` then takes g = 0: the contact dissipates the elastic energy that it has left. The error control of a step
 resolves the kink there. A floor of |w'_minus| bounds g at a grazing onset.
 
-**Modes.** A site is free, closed (in contact), permanent or at rest in contact. Within a time step the modes
+**Modes.** A site is free, closed (in contact), unswitched or at rest in contact. Within a time step the modes
 are frozen, and the law of a closed site is continued as an odd function through x = 0: the force is smooth, so that no
 kink spoils the order of the method. Every change of mode is a switching function that crosses zero upwards:
 sigma w - D (onset), D - sigma w (separation). A contact without loss that is
-pressed at rest, or in which the masses of two cells touch, is permanent: its force is that of max(x, 0) at all times,
+pressed at rest, or in which the masses of two cells touch, is unswitched: its force is that of max(x, 0) at all times,
 kink included, and its mode never changes.
 
 **Rest.** Motion within the tolerance of a landing is not resolved. The front of a wave grows from below it where a stop

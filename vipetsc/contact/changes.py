@@ -6,7 +6,7 @@ of one of two switching functions of the site's mode, each affine in w:
 - free: w - D and -w - D, an onset on either side;
 - closed: D - side w, the separation;
 - resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing;
-- permanent: side w - D and D - side w, where the masses meet and part. The mode stays: only a search for kinks, by an
+- unswitched: side w - D and D - side w, where the masses meet and part. The mode stays: only a search for kinks, by an
   engine whose steps end on them, asks for these.
 
 A stuck site does not move: its row of a motion is (R, R', 0), its reaction in N, positive where it pushes, and the rate
@@ -21,10 +21,10 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.law import (
     CLOSED,
     FREE,
-    PERMANENT,
     RESTING,
     SHORTEST_FLIGHT,
     STUCK,
+    UNSWITCHED,
     contact_force,
     gap_of,
     impact_time,
@@ -108,7 +108,7 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
 
     side = side_of(site.mode)
     gap = gap_of(site, side)
-    if abs(site.mode) == PERMANENT:
+    if abs(site.mode) == UNSWITCHED:
         # Its force has a kink at D, where the masses meet (function 0) or part (function 1).
         rises = 1 - 2 * function
         near = MOVED * site.tolerance
@@ -198,7 +198,7 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
 
 @kernel
 def _passes_kink(site: Any, b: np.ndarray) -> bool:
-    """Return whether a permanent ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
+    """Return whether an unswitched ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
     side = side_of(site.mode)
     gap = gap_of(site, side)
     near = MOVED * site.tolerance
@@ -214,7 +214,7 @@ def _passes_kink(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def _next_kink(site: Any, motion: np.ndarray) -> int:
-    """Return switching function of a permanent ``site`` that crosses zero next: 0, the masses meet, or 1, they part.
+    """Return switching function of an unswitched ``site`` that crosses zero next: 0, the masses meet, or 1, they part.
 
     ``motion`` (3,) are w, w', w'' at present. Where the masses just touch, w' decides.
     """
@@ -247,15 +247,15 @@ def first_change(
 ) -> ModeChange:
     """Return first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
-    With ``kinks`` a permanent contact that opens or closes counts as well, although its mode stays. ``room`` (2, 6) is
+    With ``kinks`` an unswitched contact that opens or closes counts, too, although its mode stays. ``room`` (2, 6) is
     overwritten.
     """
     first = ModeChange(position=2.0, site=-1, function=0)
     b = room[0]
     c = room[1]
     for i in range(contacts.size):
-        permanent = abs(contacts[i].mode) == PERMANENT
-        if permanent and not kinks:
+        unswitched = abs(contacts[i].mode) == UNSWITCHED
+        if unswitched and not kinks:
             continue
         if abs(contacts[i].mode) == STUCK:
             position = _first_pull(contacts[i], start[i], end[i], h, c[:4])
@@ -263,14 +263,14 @@ def first_change(
                 first = ModeChange(position=position, site=i, function=0)
             continue
         bernstein(start[i], end[i], h, b)
-        if permanent and not _passes_kink(contacts[i], b):
+        if unswitched and not _passes_kink(contacts[i], b):
             continue
         # The coefficients bound the motion: nearly all free sites are done here, without a search.
         if _stays_free(contacts[i], b):
             continue
 
         for function in range(2):
-            if permanent and function != _next_kink(contacts[i], start[i]):
+            if unswitched and function != _next_kink(contacts[i], start[i]):
                 continue
             form = _affine_form(contacts, i, function)
             if form.offset == -np.inf:
@@ -354,14 +354,14 @@ def _extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, 
 
 @kernel
 def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
-    """Return the smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
+    """Return the smallest ``impact_time`` in s of the unswitched contacts that close at this ``motion`` (sites, 3).
 
     A contact closes if |side w - D| is at most ``MOVED`` tolerances and w approaches; inf if none does.
     """
     shortest = np.inf
     for i in range(contacts.size):
         site = contacts[i]
-        if abs(site.mode) == PERMANENT:
+        if abs(site.mode) == UNSWITCHED:
             side = side_of(site.mode)
             rate = side * motion[i, 1]
             if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED * site.tolerance:

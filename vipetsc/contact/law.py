@@ -29,10 +29,10 @@ LANDED = 1e-10
 # without clearance keeps the larger tolerance, below which the front of a wave passes through w = 0 again and again.
 ROUNDINGS = 1000 * float(np.finfo(float).eps)
 # Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. The modes
-# PERMANENT and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
+# UNSWITCHED and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
 FREE = 0
 CLOSED = 1
-PERMANENT = 2
+UNSWITCHED = 2
 RESTING = 3
 STUCK = 4
 # A rigid site sticks where its next flight would take less than this fraction of the shortest period of the motion.
@@ -83,7 +83,7 @@ SITE = np.dtype(
 """A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the ``scale`` of w in
 m, the ``tolerance`` in m of a landing on a clearance, the signed ``approach`` velocity w'_minus in m/s; its elastic
 law, the damping c of the factor g, the ``floor`` of |w'_minus| in m/s, whether g is kept from becoming negative; the
-reduced mass of its two masses in kg. ``preload`` in N is the force of a permanent contact at w = 0: a static load
+reduced mass of its two masses in kg. ``preload`` in N is the force of an unswitched contact at w = 0: a static load
 balances it.
 
 A ``rigid`` site has its ``restitution`` r, the shortest ``flight`` in s after which it still is free, its ``host`` and
@@ -149,7 +149,7 @@ def create_contacts(
 
 
 def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: float) -> None:
-    """Make the sites that the mask ``which`` (site,) marks permanent (see the package's docstring).
+    """Make the sites that the mask ``which`` (site,) marks unswitched (see the package's docstring).
 
     They touch or are pressed at w = 0. ``laws`` (site,) are those of all ``sites``. ``speed`` in m/s, that of the
     relative motion to be expected, takes the place of w'_minus: errors of steps in contact are relative to it.
@@ -158,7 +158,7 @@ def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: f
     # it is the indentation at rest.
     side = np.where(sites["clearance"] < sites["clearance_minus"], 1, -1)
     pressed = np.maximum(-np.minimum(sites["clearance"], sites["clearance_minus"]), 0.0)
-    sites["mode"][which] = (side * PERMANENT)[which]
+    sites["mode"][which] = (side * UNSWITCHED)[which]
     sites["approach"][which] = side[which] * speed
 
     # Law by law, since the force of a law is computed for arrays.
@@ -292,7 +292,7 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
 
     side = side_of(site.mode)
     x = side * w - gap_of(site, side)
-    if abs(site.mode) >= PERMANENT:
+    if abs(site.mode) >= UNSWITCHED:
         if abs(site.mode) == STUCK:
             return site.reaction, 0.0
         # The mode stays while the masses part and meet: the force itself has the kink at x = 0.

@@ -19,9 +19,9 @@ from vipetsc.contact.changes import MOVED, Extremes, extremes, shortest_beginnin
 from vipetsc.contact.law import (
     CLOSED,
     FREE,
-    PERMANENT,
     RESTING,
     STUCK,
+    UNSWITCHED,
     contact_force,
     elastic_energy,
     elastic_force,
@@ -137,7 +137,7 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
         if abs(contacts[i].mode) == STUCK:
             hold_episode(tracks.sites[i].episode, start[i], end[i], h)
-        elif abs(contacts[i].mode) == PERMANENT and not turns:
+        elif abs(contacts[i].mode) == UNSWITCHED and not turns:
             # The depth is largest at an end of the step, and its start was the end of the last step. A search for
             # extremes would cost as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
@@ -184,8 +184,8 @@ def switch_sites(
         if contacts[i].rigid:
             any_rigid = True
             continue
-        # A step may end on the kink of a permanent contact, whose mode stays.
-        if abs(contacts[i].mode) == PERMANENT:
+        # A step may end on the kink of an unswitched contact, whose mode stays.
+        if abs(contacts[i].mode) == UNSWITCHED:
             continue
         for function in range(2):
             value, rate, tolerance, mode = switching(contacts, i, function, motion[i])
@@ -455,7 +455,7 @@ def rest_site(
     impulses[:] = 0.0
     site = contacts[i]
     side = landed_side(site, motion[i, 0])
-    if side == 0 or abs(site.mode) >= PERMANENT:
+    if side == 0 or abs(site.mode) >= UNSWITCHED:
         return False
     if site.rigid:
         _switch_rigid_sites(contacts, tracks, motion, energies, impulses, t, i)
@@ -545,13 +545,13 @@ def _set_mode(
 class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
-    ``start`` and ``end`` (sites, 3) hold w, w', w'' at both ends of the step at hand; the engine fills them.
+    ``before`` and ``after`` (sites, 3) hold w, w', w'' at both ends of the step at hand; the engine fills them.
     ``numbers`` (sites,) are those of the sites in the log, from 0, or -1 for none.
     """
 
     def __init__(self, contacts: np.ndarray, numbers: Sequence[int]) -> None:
         self.contacts = contacts
-        self.start, self.end = np.zeros((2, len(numbers), 3))
+        self.before, self.after = np.zeros((2, len(numbers), 3))
         sites = np.zeros(len(numbers), TRACKED)
         sites["number"] = numbers
         # Whether any episode may be open: false only after a step in which none was, until a mode may change.
@@ -560,14 +560,14 @@ class ImpactTracker:
         # What has struck the hosts of rigid sites in N s, when sites last switched or came to rest.
         self.impulses = np.zeros(len(sites))
 
-        # Permanent contacts are in an episode from the start.
-        held = np.flatnonzero(np.abs(contacts["mode"]) == PERMANENT)
+        # Unswitched contacts are in an episode from the start.
+        held = np.flatnonzero(np.abs(contacts["mode"]) == UNSWITCHED)
         episodes = sites["episode"]
         episodes["site"][held] = sites["number"][held]
         episodes["side"][held] = np.sign(contacts["mode"][held])
         episodes["separation"][held] = np.nan
 
-    def begin(self, motion: np.ndarray) -> np.ndarray:
+    def close_at_start(self, motion: np.ndarray) -> np.ndarray:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices (closed site,).
 
         ``motion`` (site, 2) has w in m and w' in m/s of all sites by their numbers in the log. The onsets of these
@@ -612,35 +612,35 @@ class ImpactTracker:
     def contact_time(self) -> float:
         """Return the shortest duration in s of a contact that is closed now, by its approach velocity; inf if none is.
 
-        Of permanent contacts those count that close at the motion in ``start``, by the velocity there.
+        Of unswitched contacts those count that close at the motion in ``before``, by the velocity there.
         """
-        return min(shortest_impact(self.contacts), shortest_beginning(self.contacts, self.start))
+        return min(shortest_impact(self.contacts), shortest_beginning(self.contacts, self.before))
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""
         if self._may_be_open:
-            self._may_be_open = update_episodes(self.contacts, self.tracks, self.start, self.end, h)
-        self.start, self.end = self.end, self.start
+            self._may_be_open = update_episodes(self.contacts, self.tracks, self.before, self.after, h)
+        self.before, self.after = self.after, self.before
 
     def switch(self, t: float, energies: np.ndarray) -> int:
-        """Switch every site that has landed at time ``t`` in s (motion in ``start``); returns how many.
+        """Switch every site that has landed at time ``t`` in s (motion in ``before``); returns how many.
 
         ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``.
         """
         self._may_be_open = True
         self.tracks = with_room(self.tracks)
-        return switch_sites(self.contacts, self.tracks, self.start, energies, self.impulses, t)
+        return switch_sites(self.contacts, self.tracks, self.before, energies, self.impulses, t)
 
     def rest(self, number: int, t: float, energies: np.ndarray) -> None:
         """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if this rank has it.
 
-        ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``; the motion is that in ``start``.
+        ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``; the motion is ``before``.
         """
         self._may_be_open = True
         self.tracks = with_room(self.tracks)
         self.impulses[:] = 0.0
         for i in np.flatnonzero(self.tracks.sites["number"] == number):
-            rest_site(self.contacts, self.tracks, i, self.start, energies, self.impulses, t)
+            rest_site(self.contacts, self.tracks, i, self.before, energies, self.impulses, t)
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
         """Return the episodes (episode,) of dtype ``EPISODE`` that ended since the last call; ``unfinished`` ones too.

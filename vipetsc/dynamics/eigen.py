@@ -73,7 +73,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     # Without a shift K - s M would be singular where the frequency is exactly that of a mode. The shift must not be too
     # small either: the iterated matrix has the eigenvalues 1/(Om^2 - s), in units of 1 / largest Om^2 up to 1 / shift
     # of a mode at the frequency and about 1 of those far from it, whose relative errors by rounding grow by as much.
-    shift = min(LARGEST_SHIFT, SHIFT_OF_SPACING / matrices.rows)
+    shift = min(LARGEST_SHIFT, SHIFT_OF_SPACING / matrices.size)
     eps.setTarget(near**2 - shift * matrices.largest)
     _solve_directly(eps.getST())
 
@@ -81,7 +81,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     wanted = count
     while wanted:
         # SLEPc wants one vector more than modes, if there is one, also where the last mode alone is left.
-        left = max(matrices.rows - len(pairs), min(wanted + 1, matrices.rows))
+        left = max(matrices.size - len(pairs), min(wanted + 1, matrices.size))
         eps.setDimensions(wanted, min(max(3 * wanted, 20), left))
         eps.setTolerances(TOLERANCE, RESTARTS)
         eps.setDeflationSpace([vector for _, vector in pairs])
@@ -100,7 +100,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
             raise CaseError([Problem("--near", near, remedy)])
         # From then on one at a time, until none is nearer than those that there are.
         found_more = len(pairs) > before
-        wanted = int(found_more and len(pairs) < matrices.rows)
+        wanted = int(found_more and len(pairs) < matrices.size)
     eps.destroy()
 
     nearest = sorted(pairs, key=lambda pair: distance(pair[0]))[:count]

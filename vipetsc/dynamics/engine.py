@@ -46,7 +46,7 @@ class Engine(ABC):
         """Create an engine for ``model`` at rest at t = 0, on all ranks; it ends early on a request to ``stop``."""
 
     @abstractmethod
-    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+    def set_motion(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         """Begin in motion, on all ranks: own ``cells`` (cell, 2 dof), displacements in m before velocities in m/s.
 
         ``motion`` (site, 2) has w and w' of all sites. The work done begins with the ``energy`` in J of that state.

@@ -43,7 +43,7 @@ def set_in_motion(setup: Setup, fields: tuple[np.ndarray, np.ndarray]) -> None:
     _check_stops(setup.model, motion)
     no_work = np.zeros((1, 1))
     energy = float(meter.total(sums[None], no_work).total[0])
-    setup.engine.begin(layout.motion(state.array_r), motion, energy)
+    setup.engine.set_motion(layout.motion(state.array_r), motion, energy)
     state.destroy()
 
 

@@ -26,7 +26,7 @@ class LatticeMatrices:
     """``stiffness`` in N/m and ``mass`` in kg of ``chain`` without contacts, on the ranks of ``comm``.
 
     ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none:
-    for small motions a contact that is pressed at rest is one. This rank has the cells ``start`` to ``stop``; ``rows``
+    for small motions a contact that is pressed at rest is one. This rank has the cells ``start`` to ``stop``; ``size``
     counts all rows, and no squared frequency in (rad/s)^2 is above ``largest`` (Gershgorin's circles of M^-1 K). All
     ranks must call it. Raises CaseError, on all ranks, where PETSc's indices do not count the rows or a rank's entries.
     """
@@ -34,7 +34,7 @@ class LatticeMatrices:
     def __init__(self, chain: Chain, comm: MPI.Comm, contact_springs: Sequence[float] = ()) -> None:
         self.chain = chain
         self.comm = comm
-        self.rows = chain.cells * chain.cell.dofs
+        self.size = chain.cells * chain.cell.dofs
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
         # Before any assembly: a count beyond the index type would become another number without an error.
         self._check_indices()
@@ -43,14 +43,14 @@ class LatticeMatrices:
         last_row = self.stop * chain.cell.dofs
         by_contacts = np.zeros(last_row - first_row)
         if contact_springs:
-            joined = joined_stiffness(contacts(chain), contact_springs, self.rows, slice(first_row, last_row))
+            joined = joined_stiffness(contacts(chain), contact_springs, self.size, slice(first_row, last_row))
             by_contacts = joined.diagonal(first_row)
             stiffness = (stiffness + joined).tocsr()
         self.stiffness = self._matrix(stiffness)
 
         coefficients = chain.coefficients(self.start - 1, self.stop)
         masses = coefficients.masses[1:]
-        self.mass = self._matrix(diags([masses.ravel()], [first_row], (masses.size, self.rows), format="csr"))
+        self.mass = self._matrix(diags([masses.ravel()], [first_row], (masses.size, self.size), format="csr"))
 
         # A row's circle reaches from 0 to twice the sum of the springs at its mass, of which negative ones only make it
         # smaller.
@@ -66,7 +66,7 @@ class LatticeMatrices:
         """Raise CaseError on all ranks where PETSc's indices do not count all rows, or not the entries of a rank."""
         cell = self.chain.cell
         entries = len(cell.couplings()) * 2 * (self.stop - self.start)
-        if self.comm.allreduce(max(self.rows, entries), MPI.MAX) > int(np.iinfo(PETSc.IntType).max):
+        if self.comm.allreduce(max(self.size, entries), MPI.MAX) > int(np.iinfo(PETSc.IntType).max):
             remedy = "more rows or entries than the indices of this PETSc count; it needs one --with-64-bit-indices"
             raise CaseError([Problem("lattice.cells", self.chain.cells, f"makes matrices of {remedy}")])
 

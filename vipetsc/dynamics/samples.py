@@ -54,10 +54,10 @@ class Samples(NamedTuple):
 
 
 @kernel
-def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
+def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, places: np.ndarray) -> bool:
     """Store the rank's part ``y`` (component,) of the state, ghosts up to date, as sample ``k``; whether it is finite.
 
-    ``contacts`` of dtype ``SITE`` have the modes of the sites; ``rows`` (site,) are those of ``Layout.acting_sites``.
+    ``contacts`` of dtype ``SITE`` have the modes of the sites; ``places`` (site,) are those of ``Layout.acting_sites``.
     """
     shape = samples.lattice.shape
     drives = samples.lattice.drives
@@ -90,9 +90,9 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
     if number % samples.stride == 0:
         _record_fields(y, number, samples)
     if samples.forces.shape[0] > 0:
-        _record_forces(y, k, samples, contacts, rows)
+        _record_forces(y, k, samples, contacts, places)
     if samples.watched.shape[0] > 0:
-        _record_points(y, k, samples, contacts, rows)
+        _record_points(y, k, samples, contacts, places)
     return _is_finite(samples, k)
 
 
@@ -121,19 +121,19 @@ def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
 
 
 @kernel
-def _record_forces(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
-    """Record the contact forces of sample ``k``; ``contacts`` and their ``rows`` are as in ``take_sample``."""
+def _record_forces(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, places: np.ndarray) -> None:
+    """Record the contact forces of sample ``k``; ``contacts`` and their ``places`` are as in ``take_sample``."""
     lattice = samples.lattice
     for i in range(lattice.site_dofs.size):
         column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
         if column >= 0:
             w, rate = relative_motion(y, lattice.site_dofs, i)
-            samples.forces[k, column] = contact_force(contacts, rows[i], w, rate)[0]
+            samples.forces[k, column] = contact_force(contacts, places[i], w, rate)[0]
 
 
 @kernel
-def _record_points(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
-    """Record the motion of the watched masses at sample ``k``; ``contacts`` and ``rows`` are as in ``take_sample``."""
+def _record_points(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, places: np.ndarray) -> None:
+    """Record the motion of the watched masses at sample ``k``, ``contacts`` and ``places`` as in ``take_sample``."""
     lattice = samples.lattice
     n = lattice.shape.cells
     t = (samples.number + k) * samples.interval
@@ -144,7 +144,7 @@ def _record_points(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray
     for j in range(samples.pushes.shape[0]):
         site = samples.pushes[j, 1]
         w, rate = relative_motion(y, lattice.site_dofs, site)
-        force = contact_force(contacts, rows[site], w, rate)[0] - contacts[rows[site]].preload
+        force = contact_force(contacts, places[site], w, rate)[0] - contacts[places[site]].preload
         samples.motion[k, 2, samples.pushes[j, 0]] += samples.pushes[j, 2] * force
 
     for i in range(samples.watched.shape[0]):

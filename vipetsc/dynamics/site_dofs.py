@@ -23,7 +23,7 @@ SITE_DOFS = np.dtype([("host", END), ("resonator", END), ("ledger", np.int64)])
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     """Return records (site,) of dtype ``SITE`` of the sites with these ``numbers`` (site,) in the lattice, from 0.
 
-    Sites are free, or of the mode ``PERMANENT`` where they touch or are pressed at rest. A number below 0 stands for a
+    Sites are free, or of the mode ``UNSWITCHED`` where they touch or are pressed at rest. A number below 0 stands for a
     site without stops.
     """
     numbers = np.asarray(numbers, np.int64)
@@ -48,8 +48,8 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     # Contacts that are pressed at rest, and beads of neighbouring cells that touch and do not dissipate, part and meet
     # all the time: no such change is landed on, and the force has a kink. With loss a contact needs an onset, at which
     # its approach velocity is taken.
-    permanent = (least < 0) | ((least == 0) & joins_cells & (sites["damping"] == 0) & ~sites["rigid"])
-    hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
+    unswitched = (least < 0) | ((least == 0) & joins_cells & (sites["damping"] == 0) & ~sites["rigid"])
+    hold(sites, laws, unswitched, speed=model.scale * model.drive.frequency)
 
     sites["rigid"] &= exists
     if sites["rigid"].any():

@@ -254,7 +254,7 @@ def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarra
 
 
 @kernel
-def observe(step: FlowStep, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
+def find_site_motion(step: FlowStep, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
     """Rates ``dy`` of the state ``y``, and w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
     rates(step.system, step.side, y, dy)
     n = step.system.inverse_mass.size
@@ -750,7 +750,7 @@ def _land(stepper: Stepper, orbit: Stepper, h: float, change: Change) -> float:
     while outcome == RETRY:
         # Each attempt is a whole step from the start: its end has the order of the pair, an interpolant has not.
         advance(orbit, landing.length)
-        observe(step, orbit.end, orbit.end_rates, step.end)
+        find_site_motion(step, orbit.end, orbit.end_rates, step.end)
         gap = change.sign * step.end[change.contact, 0] - change.offset
         rate = change.sign * step.end[change.contact, 1]
         landing, outcome = correct(landing, gap, rate, change.tolerance, EXACT * change.tolerance)
@@ -767,7 +767,7 @@ def _end_on_change(stepper: Stepper, orbit: Stepper, h: float) -> tuple[float, C
     The length is -1 where the step is too long to tell whether there is a change, or to land on it.
     """
     step = stepper.step
-    observe(step, stepper.end, stepper.end_rates, step.end)
+    find_site_motion(step, stepper.end, stepper.end_rates, step.end)
     change = first_change(step, h, _size(stepper))
     length = h
     if change.position == UNDECIDED:
@@ -812,14 +812,14 @@ def _pass(stepper: Stepper, change: Change, t: float, event: np.ndarray) -> int:
     step = stepper.step
     kind = ONSET
     if step.system.contacts[change.contact].rigid:
-        observe(step, stepper.start, stepper.stages[0], step.start)
+        find_site_motion(step, stepper.start, stepper.stages[0], step.start)
         outcome = strike(step, change, stepper.start, stepper.stages[0], NEAR * change.tolerance)
         if outcome != DONE:
             return outcome
     else:
         kind = switch(step, change)
     _fill_event(event, t, change, kind)
-    observe(step, stepper.start, stepper.stages[0], step.start)
+    find_site_motion(step, stepper.start, stepper.stages[0], step.start)
     return DONE
 
 
@@ -834,7 +834,7 @@ def _begin(stepper: Stepper, length: float, progress: Any) -> None:
 
     step = stepper.step
     close(step.system, stepper.start, step.side)
-    observe(step, stepper.start, stepper.stages[0], step.start)
+    find_site_motion(step, stepper.start, stepper.stages[0], step.start)
 
 
 @kernel

@@ -6,7 +6,7 @@ substep so that it ends there, since the force law inside a substep must be smoo
 a shorter one. ``advance_cluster`` returns at each change, where its caller ``clusters.follow_contacts`` switches the
 site, and at the end of the step. While no site is closed, no drive is on and there is no nonlinear spring, the motion
 is a polynomial and the cluster goes to its first onset at once (sec. 2). Contacts that touch or are pressed at rest,
-of mode ``PERMANENT``, change no mode; substeps end where they open or close, too, on a *kink* of
+of mode ``UNSWITCHED``, change no mode; substeps end where they open or close, too, on a *kink* of
 their force, but without a landing: a kink that lies a little inside the end hardly changes the force's integral.
 
 Positions and lengths are in units of the step H: a substep's ``length``, a cluster's ``position``. The ``position`` of
@@ -28,7 +28,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Extremes, ModeChange, extremes, first_change, stays_landed, switching
-from vipetsc.contact.law import CLOSED, PERMANENT, STUCK, begins_linearly, contact_force, gap_of, side_of
+from vipetsc.contact.law import CLOSED, STUCK, UNSWITCHED, begins_linearly, contact_force, gap_of, side_of
 from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import Tracks, in_episode, update_episode
 from vipetsc.dynamics.drives import drive_end
@@ -181,22 +181,22 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 @kernel
 def _first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
     """Return position, as a fraction of a substep tried, of the first kink; 2 if none or another change comes first."""
-    has_permanent = False
+    has_unswitched = False
     for i in trial.closed:
-        has_permanent |= abs(cluster.contacts[i].mode) == PERMANENT
-    if not has_permanent:
+        has_unswitched |= abs(cluster.contacts[i].mode) == UNSWITCHED
+    if not has_unswitched:
         return 2.0
     seconds = length * cluster.interval
     contacts = cluster.contacts
     first = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein, True)
-    if first.position <= 1.0 and abs(contacts[first.site].mode) == PERMANENT:
+    if first.position <= 1.0 and abs(contacts[first.site].mode) == UNSWITCHED:
         return first.position
     return 2.0
 
 
 @inlined
 def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
-    """Repeat a substep just tried so that it ends where a permanent contact first opens or closes inside it.
+    """Repeat a substep just tried so that it ends where an unswitched contact first opens or closes inside it.
 
     Returns the substep that is now in ``trial``; its length is negative if it could not be collocated.
     """

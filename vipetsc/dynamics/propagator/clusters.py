@@ -183,11 +183,11 @@ class SiteClusters:
         bounds["state"] = (number, number + 1)
         return PartRecords(self.record, len(first), bounds)
 
-    def begin(self, motion: np.ndarray, energy: float) -> None:
+    def set_motion(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
         clusters = self.record
         clusters.energy[self._numbers == -1] = energy
-        for i in self.tracker.begin(motion).tolist():
+        for i in self.tracker.close_at_start(motion).tolist():
             # As if the contact were old: its force is smooth.
             duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
             clusters.history["onset"][i] = -duration

@@ -203,9 +203,9 @@ class Propagator(Engine):
         """Linear steps done."""
         return int(self._record.progress["steps"][0])
 
-    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+    def set_motion(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self._layout.place(cells, energy, self._components[0])
-        self._clusters.begin(motion, energy)
+        self._clusters.set_motion(motion, energy)
 
     def fill(self, samples: Samples) -> FillResult:
         """Fill ``samples`` as ``Engine`` says; without room, go to the sample before the first. All ranks must call it.

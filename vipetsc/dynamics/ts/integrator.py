@@ -23,7 +23,7 @@ from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.options import given_first_step
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.onset import onset_fraction
-from vipetsc.dynamics.ts.right_hand_side import find_change, observe_at, observe_pairs
+from vipetsc.dynamics.ts.right_hand_side import find_change, site_motion_at, site_motion_by_rates
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.dynamics.ts.time_stepper import TimeStepper
 from vipetsc.lattice.drive import Pieces
@@ -89,7 +89,7 @@ class Integrator(Engine):
         self.tracker = ImpactTracker(self.lattice.contacts, layout.acting_sites)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "missed", "switches"), 0)
         self._logged = np.isin(layout.acting_sites, layout.sites)  # other ranks log the others
-        self._rows = np.arange(len(layout.acting_sites))
+        self._all_sites = np.arange(len(layout.acting_sites))
         self._stop = stop or StopRequest()
         self._any_open = False
         # Whether the next step begins at an onset, after which a force is not smooth in time.
@@ -104,10 +104,10 @@ class Integrator(Engine):
         register_sums(self.state)  # before it is duplicated
         with self.state.localForm() as local:  # its memory, which stays where it is: own components, then ghosts
             self._components = local.array
-        # Only contacts of other pairs of masses, and rigid ones, are observed with rates of the whole state.
+        # Only contacts of other pairs of masses, and rigid ones, need the rates of the whole state.
         self.rates = self.state
-        self._observes_rates = model.chain.has_own_pairs or model.has_rigid_sites
-        if self._observes_rates:
+        self._needs_rates = model.chain.has_own_pairs or model.has_rigid_sites
+        if self._needs_rates:
             self.rates = layout.create_vector()
         # A state a little before or after one at which reactions are asked for, and its rates.
         self._beside: list[PETSc.Vec] = []
@@ -126,24 +126,24 @@ class Integrator(Engine):
         self._has_pieces = any(isinstance(drive.waveform, Pieces) for drive in model.drives)
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         self._onset_fraction = onset_fraction(model.chain.sites.laws, model.rtol)
-        self.observe(self.tracker.start)
+        self.find_site_motion(self.tracker.before)
 
-    def observe(self, motion: np.ndarray, time: float | None = None) -> None:
+    def find_site_motion(self, motion: np.ndarray, time: float | None = None) -> None:
         """Fill ``motion`` (sites, 3) with w, w', w'' of the state at ``time`` in s, else at the present; collective."""
         if time is None:
             time = self.time
-        if not self._observes_rates:
+        if not self._needs_rates:
             if self.lattice.shape.exchange:
                 self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-            return observe_at(time, self._components, self._stepper.context_address, motion)
+            return site_motion_at(time, self._components, self._stepper.context_address, motion)
         self.ts.computeRHSFunction(time, self.state, self.rates)  # which updates the state's ghosts
         self.rates.ghostUpdate()
         with self.rates.localForm() as rates:
-            observe_pairs(self._components, rates.array, self.lattice, motion)
+            site_motion_by_rates(self._components, rates.array, self.lattice, motion)
         if self._stepper.context["stuck"][0]:
-            self._observe_reactions(motion, time)
+            self._find_reactions(motion, time)
 
-    def _observe_reactions(self, motion: np.ndarray, time: float) -> None:
+    def _find_reactions(self, motion: np.ndarray, time: float) -> None:
         """Replace the motion of stuck sites by their reaction R, its rate R', 0 at ``time`` in s; collective.
 
         The state and its ``rates`` are those of that time. The rate is a difference over a time in which the state
@@ -168,9 +168,9 @@ class Integrator(Engine):
         motion[stuck, 1] = side * (after - before)[stuck] / (2 * shift)
         motion[stuck, 2] = 0.0
 
-    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+    def set_motion(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self.layout.place(cells, energy, self.state.array)
-        self.tracker.begin(motion)
+        self.tracker.close_at_start(motion)
         self._restart(True)
 
     def fill(self, samples: Samples) -> FillResult:
@@ -184,7 +184,7 @@ class Integrator(Engine):
                 return FillResult(k, stalled=str(error))
             if not goes_on:
                 return FillResult(k, stopped=True)
-            take_sample(self._components, k, record, self.lattice.contacts, self._rows)
+            take_sample(self._components, k, record, self.lattice.contacts, self._all_sites)
         return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:
@@ -203,7 +203,7 @@ class Integrator(Engine):
         if self._has_pieces:
             select_pieces(self.lattice.drives, self.time)
             # The w'' with which the first step begins is that of the pieces that are on now.
-            self.observe(self.tracker.start)
+            self.find_site_motion(self.tracker.before)
 
         stopped = False
         while self.time < target:
@@ -239,7 +239,7 @@ class Integrator(Engine):
         end = target
         if count > 1:
             end = self.time + h
-        self.observe(self.tracker.end, end)
+        self.find_site_motion(self.tracker.after, end)
         change = NO_CHANGE
         if not self._is_blind:
             with log.SEARCH:
@@ -281,7 +281,7 @@ class Integrator(Engine):
 
     def _first_change(self, h: float) -> ModeChange:
         """Return the first change of this rank's sites in the step of ``h`` s that was just tried."""
-        position = find_change(self._stepper.context_address, self.tracker.start, self.tracker.end, h, self._place)
+        position = find_change(self._stepper.context_address, self.tracker.before, self.tracker.after, h, self._place)
         return ModeChange(position, *self._place.tolist())
 
     def _land(self, h: float, position: float, change: ModeChange) -> None:
@@ -295,7 +295,7 @@ class Integrator(Engine):
         if change.position == position:
             candidate = comm.rank
         # A site whose motion is NaN would land for ever; all ranks learn of it by the reduction that finds the owner.
-        if not np.isfinite(tracker.end).all():
+        if not np.isfinite(tracker.after).all():
             candidate = -1
         owner = comm.allreduce(candidate, MPI.MIN)
         if owner < 0:
@@ -315,7 +315,7 @@ class Integrator(Engine):
             if not trial.accepted:
                 self.step = trial.suggestion
                 return
-            self.observe(tracker.end, self.time + length)
+            self.find_site_motion(tracker.after, self.time + length)
             if comm.rank == owner:
                 attempt, outcome = self._judge(attempt, change)
             attempt, outcome = comm.bcast((attempt, outcome), owner)
@@ -337,11 +337,11 @@ class Integrator(Engine):
         """
         tracker = self.tracker
         site = change.site
-        value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
+        value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.after[site])
         attempt, outcome = correct(attempt, value, rate, tolerance, goal=tolerance)
         if outcome == LANDED:
-            start = tracker.start[site]
-            if stays_landed(tracker.contacts[site], start, tracker.end[site], attempt.length, np.empty(6)):
+            start = tracker.before[site]
+            if stays_landed(tracker.contacts[site], start, tracker.after[site], attempt.length, np.empty(6)):
                 outcome = RESTS
         if outcome != SEARCH:
             return attempt, outcome
@@ -363,7 +363,7 @@ class Integrator(Engine):
         rests = False
         is_blind = False
         if self.comm.rank == owner:
-            start = tracker.start[site]
+            start = tracker.before[site]
             value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, start)
             if rate <= 0.0:
                 rests = bool(stays_landed(tracker.contacts[site], start, start, 0.0, np.empty(6)))
@@ -434,7 +434,7 @@ class Integrator(Engine):
             self.step = min(self.step, self._onset_fraction * shortest)
         elif not was_free:
             self.step = self.free_step
-        self.observe(self.tracker.start)
+        self.find_site_motion(self.tracker.before)
         self.ts.restartStep()
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
@@ -475,7 +475,7 @@ class Integrator(Engine):
             self.counts["switches"] = int(tables["counts"][:, -1].sum())
         self._count_stuck()
         self.ts.restartStep()
-        self.observe(self.tracker.start)
+        self.find_site_motion(self.tracker.before)
 
     def destroy(self) -> None:
         self._stepper.destroy()

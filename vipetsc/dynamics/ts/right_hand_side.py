@@ -29,7 +29,7 @@ from vipetsc.records import Record, record_at
 
 
 @kernel
-def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
+def site_motion(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """Fill ``motion`` (sites, 3) with w, w', w'' of every site, all of which join masses of one owned cell."""
     for i in range(motion.shape[0]):
         w, rate = relative_motion(y, lattice.site_dofs, i)
@@ -45,7 +45,7 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
 
 
 @kernel
-def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
+def site_motion_by_rates(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """Fill ``motion`` (sites, 3) with w, w', w'' of every site, whatever masses it joins.
 
     The state ``y`` and its derivative ``f`` come with their ghosts.
@@ -183,13 +183,13 @@ CONTEXT = np.dtype(
 
 
 @kernel
-def observe_at(t: float, y: np.ndarray, address: int, motion: np.ndarray) -> None:
-    """``observe`` in the lattice of the ``CONTEXT`` at an ``address``.
+def site_motion_at(t: float, y: np.ndarray, address: int, motion: np.ndarray) -> None:
+    """``site_motion`` in the lattice of the ``CONTEXT`` at an ``address``.
 
     Python passes one number instead of a dozen arrays, which takes a fraction of the time.
     """
     context: Any = array_at(address, 1, CONTEXT)[0]
-    observe(t, y, record_at(context.lattice, LATTICE), motion)
+    site_motion(t, y, record_at(context.lattice, LATTICE), motion)
 
 
 @kernel

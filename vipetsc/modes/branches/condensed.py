@@ -12,7 +12,6 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
-from vipetsc.lattice.compliance.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
@@ -59,7 +58,7 @@ def _condensed_lattice(case: NnmCase, chain: Chain) -> ConservativeMotions:
     if needs_modes(chain):
         # Bloch waves are those of equal cells with contacts of the cell's pair: other lattices have all modes.
         return condensed_system(System.from_chain(chain, stops), case.nnm)
-    return ConservativeMotions(SeriesCompliance(chain), SiteForces(stops), case.nnm)
+    return ConservativeMotions(WaveCompliance(chain), SiteForces(stops), case.nnm)
 
 
 class CondensedMethod(NnmMethod):
@@ -207,7 +206,7 @@ def state_of(motions: ConservativeMotions, point: Point, dofs: int) -> dict[int,
 
 def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np.ndarray]]:
     """Yield displacements of the cells near the sites, for each harmonic of a motion in turn."""
-    assert isinstance(motions.compliance, SeriesCompliance)
+    assert isinstance(motions.compliance, WaveCompliance)
     omega = 2 * np.pi / point.period
     balance = motions.balance(point.order)
     forces = balance.series(point.x, omega).forces.real
