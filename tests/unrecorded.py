@@ -31,5 +31,4 @@ def unrecorded_samples(lattice: LatticeRecord, goal: int) -> Samples:
         motion=np.zeros((0, 0, 0)),
         watched=np.zeros((0, 2), np.int64),
         pushes=np.zeros((0, 3), np.int64),
-        spent=np.zeros((0, 0)),
     )

@@ -278,7 +278,7 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     table[[4, 9]] = tracker.checkpoint()
     resumed.restore(table)
     for each in (tracker, resumed):
-        each.start[1] = -CLEARANCE, 0.2, 0.0
+        each.before[1] = -CLEARANCE, 0.2, 0.0
         assert each.switch(0.3, np.array([0.0, 0.75])) == 1
         (closed,) = each.take_episodes(np.zeros(2))
         assert closed[["separation", "loss", "indentation"]].item() == (0.3, 0.5, episode["indentation"])
@@ -304,7 +304,7 @@ def test_a_contact_is_followed_from_the_beginning_or_after_steps_without_any(way
         motion[9] = -1.01 * CLEARANCE, -0.1
         tracker.close_at_start(motion)
     elif way != "unswitched":
-        closed.start[1] = -CLEARANCE, -0.1, 0.0
+        closed.before[1] = -CLEARANCE, -0.1, 0.0
         assert closed.switch(0.1, np.zeros(2)) == 1
     if way == "restore":
         table = np.zeros(10, TRACKED)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.lattice.drive import PIECE, Drive, Pieces
+from vipetsc.lattice.drive import PIECE, Drive, Pieces, burst, burst_rate, piece_rate, piece_value
 
 # Fraction of a time, and of a step, within which a piece that begins has begun.
 ROUNDED = 1e-14
@@ -27,6 +27,11 @@ waveforms have the pieces ``first`` to ``last``, half open, of which ``piece`` i
 N/m is that of the spring to a moving wall, 0 where the drive is a force, and ``damping`` in N s/m that of the dashpot
 to one: its force is the derivative of the waveform.
 """
+
+_burst = kernel(burst)
+_burst_rate = kernel(burst_rate)
+_piece_value = kernel(piece_value)
+_piece_rate = kernel(piece_rate)
 
 
 class Drives(NamedTuple):
@@ -76,14 +81,10 @@ def drive_force(drives: Drives, i: int, t: float) -> float:
     if drive.first >= drive.last:
         if t <= 0.0 or t >= drive.duration:
             return 0.0
-        phase = drive.frequency * t
-        return drive.amplitude * (1.0 - np.cos(phase / drive.cycles)) * np.sin(phase)
+        return _burst(drive.amplitude, drive.frequency, drive.cycles, t)
     if drive.piece < 0:
         return 0.0
-    piece = drives.pieces[drive.piece]
-    x = t - piece.start
-    value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
-    return value * np.sin(piece.phase + x * (piece.frequency + 0.5 * piece.rate * x))
+    return _piece_value(drives.pieces[drive.piece], t)
 
 
 @kernel
@@ -93,18 +94,10 @@ def _waveform_rate(drives: Drives, i: int, t: float) -> float:
     if drive.first >= drive.last:
         if t <= 0.0 or t >= drive.duration:
             return 0.0
-        phase = drive.frequency * t
-        slow = phase / drive.cycles
-        rate = np.sin(slow) / drive.cycles * np.sin(phase) + (1.0 - np.cos(slow)) * np.cos(phase)
-        return drive.amplitude * drive.frequency * rate
+        return _burst_rate(drive.amplitude, drive.frequency, drive.cycles, t)
     if drive.piece < 0:
         return 0.0
-    piece = drives.pieces[drive.piece]
-    x = t - piece.start
-    value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
-    slope = (((5 * piece.c5 * x + 4 * piece.c4) * x + 3 * piece.c3) * x + 2 * piece.c2) * x + piece.c1
-    phase = piece.phase + x * (piece.frequency + 0.5 * piece.rate * x)
-    return slope * np.sin(phase) + value * np.cos(phase) * (piece.frequency + piece.rate * x)
+    return _piece_rate(drives.pieces[drive.piece], t)
 
 
 @kernel
@@ -179,16 +172,26 @@ def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
 
 
 @kernel
-def dashpot_power(drives: Drives, i: int, t: float, v: float) -> float:
-    """Return the power in W of a moving wall's dashpot at t in s, its mass at v in m/s, beyond that at rest.
+def drive_power(drives: Drives, i: int, force: float, v: float) -> float:
+    """Return the power in W of drive ``i`` whose ``force`` is in N, its mass at v in m/s.
 
-    It is c (U' - v)^2 - c v^2, and 0 where drive ``i`` is no dashpot.
+    Through a dashpot a wall that moves by U does c (U' - v) U', of which c U' is the force; see ``wall_energy``.
+    """
+    damping = drives.rows[i].damping
+    if damping == 0.0:
+        return force * v
+    return force * (force / damping - v)
+
+
+@kernel
+def lost_power(drives: Drives, i: int, force: float, v: float) -> float:
+    """Return the power in W that a moving wall's dashpot dissipates beyond that of one to a wall at rest.
+
+    It is c (U' - v)^2 - c v^2, and 0 where drive ``i`` is no dashpot; arguments are those of ``drive_power``.
     """
     damping = drives.rows[i].damping
     if damping == 0.0:
         return 0.0
-    select_piece(drives, i, t)
-    force = drive_force(drives, i, t)
     return force * (force / damping - 2.0 * v)
 
 

@@ -17,10 +17,10 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import elastic_energy
-from vipetsc.dynamics.lattice_record import LatticeRecord
+from vipetsc.dynamics.lattice_record import CHUNK, LatticeRecord
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import relative_motion
-from vipetsc.dynamics.springs import CHUNK, damping_powers, is_varied, spring_energies
+from vipetsc.dynamics.springs import damping_powers, is_varied, spring_energies
 
 _FINE_BITS = 52
 _FINE = 2.0**_FINE_BITS  # multiples of the finer remainder in one unit
@@ -37,7 +37,7 @@ _FINE_PART_BITS = 26
 # Energies in J below this fraction of the scale are too small for the balance to be judged: in the first samples of a
 # burst of 30 cycles the error may be as large as the work, with either engine. From there on it is below 1e-10 of it.
 _NEGLIGIBLE = 1e-8
-_KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(5)
+KINETIC, SPRING, CONTACT, DISSIPATED, DAMPING = range(5)
 ENERGY_SUMS = 5
 
 
@@ -65,19 +65,21 @@ def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None
             whole_sum += whole
             fine_sum += fine
         # Remainders are 2^51 at most: those of a chunk cannot overflow, those of all cells of a rank could.
-        fine_sum += sums[kind, 1]
-        whole_sum += fine_sum >> _FINE_BITS
-        sums[kind, 0] = min(sums[kind, 0] + whole_sum, SATURATED)
-        sums[kind, 1] = fine_sum - ((fine_sum >> _FINE_BITS) << _FINE_BITS)
+        _carry(sums, kind, whole_sum, fine_sum)
 
 
 @kernel
-def _add_one(sums: np.ndarray, kind: int, energy: float, unit: float) -> None:
-    """Add one ``energy`` as ``_add`` does."""
+def add_one(sums: np.ndarray, kind: int, energy: float, unit: float) -> None:
+    """Add one ``energy`` in J to row ``kind`` of ``sums``, as ``measure`` does."""
     whole, fine = _multiples(energy, unit)
+    _carry(sums, kind, whole, fine)
+
+
+@kernel
+def _carry(sums: np.ndarray, kind: int, whole: int, fine: int) -> None:
+    """Add a ``whole`` multiple and a remainder ``fine`` to row ``kind`` of ``sums``; its remainder stays below 2^52."""
     fine += sums[kind, 1]
-    whole += fine >> _FINE_BITS
-    sums[kind, 0] = min(sums[kind, 0] + whole, SATURATED)
+    sums[kind, 0] = min(sums[kind, 0] + whole + (fine >> _FINE_BITS), SATURATED)
     sums[kind, 1] = fine - ((fine >> _FINE_BITS) << _FINE_BITS)
 
 
@@ -116,19 +118,19 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray
     for first in range(0, shape.cells, CHUNK):
         energies = room[: shape.cells - first]
         _kinetic_energies(y, lattice, first, energies)
-        _add(sums, _KINETIC, energies, unit)
+        _add(sums, KINETIC, energies, unit)
         spring_energies(y, lattice, first, energies)
-        _add(sums, _SPRING, energies, unit)
+        _add(sums, SPRING, energies, unit)
 
     owned = 0
     for i in range(lattice.site_dofs.size):
         if lattice.site_dofs[i].ledger >= 0:
             w, _ = relative_motion(y, lattice.site_dofs, i)
-            _add_one(sums, _CONTACT, _contact_energy(lattice.contacts[i], w), unit)
+            add_one(sums, CONTACT, _contact_energy(lattice.contacts[i], w), unit)
             owned += 1
-    _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + owned], unit)
+    _add(sums, DISSIPATED, y[shape.dissipated : shape.dissipated + owned], unit)
     if shape.damping >= 0:
-        _add(sums, _DAMPING, y[shape.damping : shape.damping + shape.cells], unit)
+        _add(sums, DAMPING, y[shape.damping : shape.damping + shape.cells], unit)
 
 
 @kernel
@@ -140,25 +142,7 @@ def add_powers(y: np.ndarray, lattice: LatticeRecord, seconds: float, unit: floa
         damping_powers(y, lattice, first, powers)
         for i in range(powers.size):
             powers[i] *= seconds
-        _add(sums, _DAMPING, powers, unit)
-
-
-@kernel
-def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
-    """Add an ``energy`` in J to that of the springs.
-
-    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
-    """
-    _add_one(sums, _SPRING, energy, unit)
-
-
-@kernel
-def add_damping(sums: np.ndarray, energy: float, unit: float) -> None:
-    """Add an ``energy`` in J to what dashpots have dissipated.
-
-    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^52, as ``measure`` fills them.
-    """
-    _add_one(sums, _DAMPING, energy, unit)
+        _add(sums, DAMPING, powers, unit)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,10 @@ from vipetsc.lattice.drive import PIECE
 from vipetsc.lattice.topology import WALL
 from vipetsc.records import Record, record_type
 
+# Cells in one pass over springs: a pass over those of a mass touches a row of each of its neighbours and one of the
+# result, 4 kB each of so many cells, which stay in a first-level cache of 32 kB. Not sharp where the second level is
+# near: 256 to 2048 take the same CPU time of ``ts`` at 20,000 cells, to the 7 % of its scatter, and give the same bits.
+CHUNK = 512
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 _INTEGERS = ("mass", "offset", "other", "spring", "law", "stride", "outside_u", "outside_v")
@@ -58,7 +62,8 @@ class LatticeRecord(NamedTuple):
     ``spring_laws`` (law,) of dtype ``SPRING_LAW`` are those that ``couplings`` refer to.
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
     ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where there are dashpots
-    ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
+    ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty. ``zeros`` (``CHUNK``,)
+    are the motion of the ground.
     """
 
     shape: Shape
@@ -73,6 +78,7 @@ class LatticeRecord(NamedTuple):
     grounding: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    zeros: np.ndarray
 
 
 def create_record(model: Model, layout: Layout) -> Record:
@@ -105,6 +111,7 @@ def create_record(model: Model, layout: Layout) -> Record:
         grounding=grounding,
         stiffness=stiffness,
         damping=damping,
+        zeros=np.zeros(CHUNK),
     )
     return Record(lattice)
 
@@ -125,6 +132,7 @@ def empty_record() -> LatticeRecord:
         grounding=none,
         stiffness=none,
         damping=none,
+        zeros=none,
     )
 
 

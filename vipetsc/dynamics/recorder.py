@@ -20,7 +20,6 @@ from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.recorded_sizes import CHUNK_SAMPLES, chunk_samples, recorded_cells
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.dynamics.wall_dashpots import WallDashpots
 from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, SAMPLED, Recording
 
 # Samples of all cells, each as large as a state, after which a checkpoint follows: it adds a quarter to the bytes.
@@ -77,10 +76,9 @@ class Recorder(Observer):
         # One more than there are samples: a chunk that is full at the end would have an empty one behind it.
         self._length = min(length, setup.model.samples + 1)
         self._stride = output.stride
-        self._shape = len(output.fields), self._length, layout.dofs, local.size
+        self._shape = self._length, len(output.fields), layout.dofs, local.size
         # 1 for each field of velocities, which engines take from the second half of the state.
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
-        self._dashpots = WallDashpots(setup.model)
         self._first = 0
         if local.size:
             self._first = int(local[0])
@@ -112,13 +110,12 @@ class Recorder(Observer):
         meter = self.setup.meter
         output = self.setup.case.output
         here = slice(self._held, self._held + most)
-        fields = self._fields[:, self._rows :][:, :most]
         return Samples(
             number=number,
             sums=self._sums[here],
             work=self._work[here],
             losses=self._losses[here],
-            fields=np.ascontiguousarray(fields),  # engines are compiled for such alone
+            fields=self._fields[self._rows : self._rows + most],
             moving=self._moving,
             first_cell=self._first,
             every=output.every,
@@ -130,7 +127,6 @@ class Recorder(Observer):
             motion=self._motion[here],
             watched=self._watched,
             pushes=self._pushes,
-            spent=self._dashpots.spent(number, len(self._work[here])),
         )
 
     def observe(self, block: Block) -> None:
@@ -139,13 +135,9 @@ class Recorder(Observer):
         for energy in self._energies:
             self._kept[ENERGIES[energy]][here] = getattr(block.energies, energy)
 
-        rows = self._rows + block.samples.recorded_rows(len(block))
-        # Where their place was not contiguous in the chunk, the engine has filled a copy.
-        if not np.may_share_memory(self._fields, block.samples.fields):
-            self._fields[:, self._rows : rows] = block.samples.fields[:, : rows - self._rows]
         self._number = block.first - self._held
         self._held = here.stop
-        self._rows = rows
+        self._rows += block.samples.recorded_rows(len(block))
 
     @property
     def due(self) -> bool:
@@ -206,16 +198,15 @@ class Recorder(Observer):
         log["site"] += 1  # counted from 1
         chunk = {"impacts": log}
         chunk |= dict(zip(self._of_sites, np.concatenate(all_of_sites, axis=2)[:, :, order], strict=True))
-        return chunk | dict(zip(recording.fields, all_cells, strict=True))
+        return chunk | dict(zip(recording.fields, all_cells.swapaxes(0, 1), strict=True))
 
     def _gather_fields(self) -> np.ndarray:
-        """Return fields (field, row, dof, cell) of the chunk of all ranks, on rank 0; the others return their own."""
+        """Return fields (row, field, dof, cell) of the chunk of all ranks, on rank 0; the others return their own."""
         comm = self.setup.layout.comm
-        part = self._fields[:, : self._rows]
+        part = self._fields[: self._rows]
         # One rank's fields may be large: they are not copied.
         if comm.size == 1:
             return part
-        part = np.ascontiguousarray(part)
         counts = comm.gather(part.shape[3])
         if counts is None:
             comm.Send(part, 0)

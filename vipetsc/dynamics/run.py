@@ -233,12 +233,9 @@ class Run:
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go on after a checkpoint, given the parts of all ranks that wrote it; their number may differ."""
-        # The engine first: observers may ask it for its time.
+        # The engine first: observers may ask it for its time. What a checkpoint has of them is the same on all ranks.
         self.setup.engine.restore(checkpoints)
-        self._go_on(checkpoints[0])
-
-    def _go_on(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore the observers from what a checkpoint has of them, the same on all ranks."""
+        state = checkpoints[0]
         self.samples = int(state["samples"])
         self.last = self.setup.engine.time
         for observer in self.observers:

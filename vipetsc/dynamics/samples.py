@@ -9,8 +9,8 @@ import numpy as np
 
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import contact_force
-from vipetsc.dynamics.drives import dashpot_power, select_piece, wall_energy
-from vipetsc.dynamics.energies import LARGEST, Energies, add_damping, add_energy, add_powers, measure
+from vipetsc.dynamics.drives import drive_force, lost_power, select_piece, wall_energy
+from vipetsc.dynamics.energies import DAMPING, LARGEST, SPRING, Energies, add_one, add_powers, measure
 from vipetsc.dynamics.equation import acceleration
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
@@ -20,13 +20,12 @@ class Samples(NamedTuple):
     """Arrays for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
 
     Energies: ``sums`` (sample, energy, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
-    ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
+    ``losses`` (sample, owned site) in J. ``fields`` (recorded sample, field, dof, cell) are those of the samples whose
     numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
     ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples. ``forces`` (sample, owned site) in N are
     those of the contacts, and ``motion`` (sample, 3, point) displacement, velocity and acceleration of the masses
     ``watched`` (point, 2), an owned cell and a mass of it, on which the contacts ``pushes`` (push, 3) act
-    (``points.PointMotion``). ``spent`` (sample, drive) in J is the time integral of c U'^2 of the dashpots to moving
-    walls.
+    (``points.PointMotion``).
     """
 
     number: int
@@ -45,7 +44,6 @@ class Samples(NamedTuple):
     motion: np.ndarray
     watched: np.ndarray
     pushes: np.ndarray
-    spent: np.ndarray
 
     def recorded_rows(self, samples: int) -> int:
         """Return how many of the first ``samples`` samples have recorded fields."""
@@ -70,19 +68,16 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, p
     for i in range(drives.rows.size):
         drive = drives.rows[i]
         samples.work[k, drive.number] = y[shape.work + i]
-        # The state's work is that of the force k U; the further work of a moving wall is stored in its spring.
         time = number * samples.interval
+        # The state's work is that of the force k U; the further work of a moving wall is stored in its spring.
         if drive.stiffness != 0.0:
             energy = wall_energy(drives, i, time, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy
-            add_energy(samples.sums[k], energy, samples.unit)
-        # That of the force c U' on the mass v; the further work is lost in the dashpot: c U'^2 - 2 c U' v.
-        if drive.damping != 0.0:
-            lost = samples.spent[k, drive.number] - 2.0 * y[shape.work + i]
-            samples.work[k, drive.number] += lost
-            if shape.damping < 0:
-                lost = samples.interval * dashpot_power(drives, i, time, y[drive.target])
-            add_damping(samples.sums[k], lost, samples.unit)
+            add_one(samples.sums[k], SPRING, energy, samples.unit)
+        if drive.damping != 0.0 and shape.damping < 0:
+            select_piece(drives, i, time)
+            lost = lost_power(drives, i, drive_force(drives, i, time), y[drive.target])
+            add_one(samples.sums[k], DAMPING, samples.interval * lost, samples.unit)
     for i in range(samples.losses.shape[1]):
         samples.losses[k, i] = y[shape.dissipated + i]
 
@@ -112,9 +107,9 @@ def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
     """Record the fields of the sample with the ``number``, which the stride divides."""
     shape = samples.lattice.shape
     row = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride
-    for i in range(samples.fields.shape[0]):
+    for i in range(samples.fields.shape[1]):
         for mass in range(shape.dofs):
-            out = samples.fields[i, row, mass]
+            out = samples.fields[row, i, mass]
             first = (mass + shape.dofs * samples.moving[i]) * shape.cells + samples.first_cell
             for c in range(out.size):
                 out[c] = y[first + c * samples.every]

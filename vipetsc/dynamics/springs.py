@@ -16,14 +16,9 @@ from typing import Any
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.dynamics.lattice_record import LatticeRecord
+from vipetsc.dynamics.lattice_record import CHUNK, LatticeRecord
 from vipetsc.dynamics.spring_law import nonlinear_energy, nonlinear_force
 from vipetsc.lattice.topology import NOTHING, WALL
-
-# Cells in one pass: a pass over the springs of a mass touches a row of each of its neighbours and one of the result,
-# 4 kB each of so many cells, which stay in a first-level cache of 32 kB. Not sharp where the second level is near: 256
-# to 2048 take the same CPU time of ``ts`` at 20,000 cells, to the 7 % of its scatter, and give the same bits.
-CHUNK = 512
 
 
 @kernel
@@ -123,17 +118,14 @@ def _add_varied_springs(forces: np.ndarray, other: np.ndarray, here: np.ndarray,
 
 
 @kernel
-def _add_equal_ground(forces: np.ndarray, here: np.ndarray, stiffness: float) -> None:
-    """Add to the ``forces`` in N those of one spring to the ground, -k u, in consecutive cells."""
-    for i in range(forces.size):
-        forces[i] -= stiffness * here[i]
+def _others(y: np.ndarray, lattice: LatticeRecord, coupling: Any, begin: int, size: int) -> np.ndarray:
+    """Return what ``y`` has of the other masses of a ``coupling`` in so many cells, all owned; zeros of the ground.
 
-
-@kernel
-def _add_varied_ground(forces: np.ndarray, here: np.ndarray, factors: np.ndarray) -> None:
-    """Add to the ``forces`` as ``_add_equal_ground``, with a factor of each cell: stiffness, or damping of rates."""
-    for i in range(forces.size):
-        forces[i] -= factors[i] * here[i]
+    ``begin`` is the first cell, for velocities behind all displacements.
+    """
+    if coupling.other < 0:
+        return lattice.zeros[:size]
+    return y[coupling.other * lattice.shape.cells + coupling.offset + begin :][:size]
 
 
 @kernel
@@ -151,18 +143,13 @@ def _add_varied_forces(forces: np.ndarray, y: np.ndarray, lattice: LatticeRecord
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
         entry = _table_entry(lattice, coupling, first)
-        if coupling.other < 0:
-            _add_varied_ground(forces, here, lattice.stiffness[entry:])
-            if is_damped:
-                _add_varied_ground(forces, rate, lattice.damping[entry:])
-            continue
-        other = coupling.other * n + coupling.offset + first
-        _add_varied_springs(forces, y[other : other + forces.size], here, lattice.stiffness[entry:])
+        others = _others(y, lattice, coupling, first, forces.size)
+        _add_varied_springs(forces, others, here, lattice.stiffness[entry:])
         if is_damped:
-            other += velocities
-            _add_varied_springs(forces, y[other : other + forces.size], rate, lattice.damping[entry:])
+            others = _others(y, lattice, coupling, velocities + first, forces.size)
+            _add_varied_springs(forces, others, rate, lattice.damping[entry:])
     if is_damped:
-        _add_varied_ground(forces, rate, lattice.grounding[begin:])
+        _add_varied_springs(forces, lattice.zeros, rate, lattice.grounding[begin:])
 
 
 @kernel
@@ -188,11 +175,8 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
         # Those of a mass are equal in all cells.
         for s in range(row.first, row.last):
             coupling = lattice.couplings[s]
-            if coupling.other < 0:
-                _add_equal_ground(out, here[first:stop], coupling.stiffness)
-                continue
-            others = coupling.other * n + coupling.offset
-            _add_equal_springs(out, y[others + first : others + stop], here[first:stop], coupling.stiffness)
+            others = _others(y, lattice, coupling, first, out.size)
+            _add_equal_springs(out, others, here[first:stop], coupling.stiffness)
         for i in range(out.size):
             out[i] *= inverse
 
@@ -245,13 +229,9 @@ def add_nonlinear_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int
             laws = lattice.spring_laws[coupling.law + coupling.stride * first :]
             stride = coupling.stride
             sign = coupling.sign
-            if coupling.other < 0:
-                for i in range(out.size):
-                    forces[i] -= nonlinear_force(laws[stride * i], here[i])
-                continue
-            other = y[coupling.other * n + coupling.offset + first :]
+            others = _others(y, lattice, coupling, first, out.size)
             for i in range(out.size):
-                forces[i] += sign * nonlinear_force(laws[stride * i], sign * (other[i] - here[i]))
+                forces[i] += sign * nonlinear_force(laws[stride * i], sign * (others[i] - here[i]))
         for i in range(out.size):
             out[i] += forces[i] * inverse_mass(lattice, first + i, mass)
 

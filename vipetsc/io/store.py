@@ -175,7 +175,7 @@ class RunFolder:
         write_text(self.folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
+        """Return array (sample, field, dof, cell) for this rank's fields of the next chunk, not initialised."""
         return np.empty(shape)
 
     def append(self, chunk: Arrays) -> None:
@@ -376,20 +376,20 @@ class RunMemory:
 
     @cached_property
     def _fields(self) -> np.ndarray:
-        """All fields (field, sample, dof, cell), allocated when they are first used."""
+        """All fields (sample, field, dof, cell), allocated when they are first used."""
         # Not in ``begin``, since the recording, which has the shape, is set after it.
         dofs = len(self.recording.given["dof"])
         cells = len(self.recording.given["cell"])
-        shape = (len(self.recording.fields), self.recording.rows, dofs, cells)
+        shape = (self.recording.rows, len(self.recording.fields), dofs, cells)
         if self._memory is None:
             return np.empty(shape)
         return self._memory.array(shape)
 
     def fields_of_chunk(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
+        """Return array (sample, field, dof, cell) for this rank's fields of the next chunk, not initialised."""
         if self.comm.size > 1:
             return np.empty(shape)
-        return self._fields[:, self._rows : self._rows + shape[1]]
+        return self._fields[self._rows : self._rows + shape[0]]
 
     def append(self, chunk: Arrays) -> None:
         """Store the next chunk, which rank 0 has, in memory."""
@@ -398,7 +398,7 @@ class RunMemory:
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
         # On one rank the engine has written the fields there already, into the array that it asked for.
         if self.comm.size > 1 and fields:
-            self._fields[:, rows] = fields
+            self._fields[rows] = np.stack(fields, axis=1)
         self._rows = rows.stop
         self._chunks.append(arrays)
         self.count += 1
@@ -421,7 +421,7 @@ class RunMemory:
         if self.comm.rank == 0:
             variables = chunks.small_variables(self)
             large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(chunks.read_log(self))}
-            recorded = self._fields[:, : self._rows].swapaxes(2, 3)
+            recorded = self._fields[: self._rows].transpose(1, 0, 3, 2)
             large |= dict(zip(self.recording.fields, recorded, strict=True))
             if self.end_motion is not None:
                 displacement, velocity = np.split(self.end_motion[self.recording.given["cell"] - 1], 2, axis=1)

@@ -8,7 +8,7 @@ negative stiffness (``vipetsc.case.cell_matrices``).
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -59,17 +59,22 @@ class Spring:
             return np.inf
         return float(real[np.abs(real).argmin()])
 
-    def nonlinear_force(self, z: np.ndarray) -> np.ndarray:
-        """Return the force's part beyond k z in N, at elongations ``z`` (...) in m."""
-        return np.asarray(self.quadratic * z**2 + self.cubic * z**3)
 
-    def nonlinear_slope(self, z: np.ndarray) -> np.ndarray:
-        """Return the derivative (...) of ``nonlinear_force`` by z in N/m, at elongations ``z`` (...) in m."""
-        return np.asarray(2 * self.quadratic * z + 3 * self.cubic * z**2)
+# The formulas of a spring's force beyond k z, as NumPy executes them for a ``Spring``, and as ``dynamics.spring_law``
+# compiles them for records with the same fields.
+def nonlinear_force(law: Any, z: Any) -> Any:
+    """Return the part of the force beyond k z in N, at elongations ``z`` (...) in m of a spring with a ``law``."""
+    return z * z * (law.quadratic + law.cubic * z)
 
-    def nonlinear_energy(self, z: np.ndarray) -> np.ndarray:
-        """Return the integral (...) of ``nonlinear_force`` from 0 to the elongations ``z`` (...) in m, in J."""
-        return np.asarray(z * z * z * (self.quadratic / 3 + self.cubic / 4 * z))
+
+def nonlinear_slope(law: Any, z: Any) -> Any:
+    """Return the derivative (...) in N/m of ``nonlinear_force`` by the elongation."""
+    return (2.0 * law.quadratic + 3.0 * law.cubic * z) * z
+
+
+def nonlinear_energy(law: Any, z: Any) -> Any:
+    """Return the integral (...) in J of ``nonlinear_force`` from 0 to the elongation."""
+    return z * z * z * (law.quadratic / 3.0 + 0.25 * law.cubic * z)
 
 
 class Coupling(NamedTuple):

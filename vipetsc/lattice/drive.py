@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from math import factorial
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -43,6 +43,37 @@ PANEL = 4.0
 PANELS_AT_ONCE = 16
 # Periods beyond which a waveform's peak is not sought period by period: twenty instants in each are 16 MB.
 MOST_PERIODS = 1e5
+
+
+# The formulas of waveforms, as NumPy executes them here, and as ``dynamics.drives`` compiles them.
+def burst(amplitude: Any, frequency: Any, cycles: Any, t: Any) -> Any:
+    """Return the force (...) in N of a burst at times ``t`` (...) in s in it; ``amplitude`` is that before 1 - cos."""
+    phase = frequency * t
+    return amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase)
+
+
+def burst_rate(amplitude: Any, frequency: Any, cycles: Any, t: Any) -> Any:
+    """Return the derivative (...) of ``burst`` by time in N/s."""
+    phase = frequency * t
+    slow = phase / cycles
+    rate = np.sin(slow) / cycles * np.sin(phase) + (1.0 - np.cos(slow)) * np.cos(phase)
+    return amplitude * frequency * rate
+
+
+def piece_value(piece: Any, t: Any) -> Any:
+    """Return the force (...) in N of a ``piece`` of dtype ``PIECE`` at times ``t`` (...) in s."""
+    x = t - piece.start
+    value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
+    return value * np.sin(piece.phase + x * (piece.frequency + 0.5 * piece.rate * x))
+
+
+def piece_rate(piece: Any, t: Any) -> Any:
+    """Return the derivative (...) of ``piece_value`` by time in N/s."""
+    x = t - piece.start
+    value = ((((piece.c5 * x + piece.c4) * x + piece.c3) * x + piece.c2) * x + piece.c1) * x + piece.c0
+    slope = (((5 * piece.c5 * x + 4 * piece.c4) * x + 3 * piece.c3) * x + 2 * piece.c2) * x + piece.c1
+    phase = piece.phase + x * (piece.frequency + 0.5 * piece.rate * x)
+    return slope * np.sin(phase) + value * np.cos(phase) * (piece.frequency + piece.rate * x)
 
 
 @dataclass(frozen=True)
@@ -100,17 +131,14 @@ class ToneBurst:
     def force(self, t: ArrayLike) -> np.ndarray:
         """Return the force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
-        phase = self.frequency * t
-        burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
-        return np.where((t > 0) & (t < self.duration), burst, 0.0)
+        value = burst(self.window_amplitude, self.frequency, self.cycles, t)
+        return np.where((t > 0) & (t < self.duration), value, 0.0)
 
     def rate(self, t: ArrayLike) -> np.ndarray:
         """Return the derivative (...) of the force in N/s at times ``t`` (...) in s."""
         t = np.asarray(t, float)
-        phase = self.frequency * t
-        slow = phase / self.cycles
-        rate = np.sin(slow) / self.cycles * np.sin(phase) + (1 - np.cos(slow)) * np.cos(phase)
-        return np.where((t > 0) & (t < self.duration), self.window_amplitude * self.frequency * rate, 0.0)
+        rate = burst_rate(self.window_amplitude, self.frequency, self.cycles, t)
+        return np.where((t > 0) & (t < self.duration), rate, 0.0)
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
         """Return Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
@@ -218,39 +246,26 @@ class Pieces:
     def force(self, t: ArrayLike) -> np.ndarray:
         """Return the force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
-        piece = self._piece(t)
-        x = t - piece["start"]
-        value = np.zeros_like(t)
-        for name in reversed(COEFFICIENTS):
-            value = value * x + piece[name]
-        value = value * np.sin(self.phase(t))
+        value = piece_value(self._piece(t), t)
         return np.where((t >= self.table["start"][0]) & (t < self.duration), value, 0.0)
 
     def rate(self, t: ArrayLike) -> np.ndarray:
         """Return the derivative (...) of the force in N/s at times ``t`` (...) in s."""
         t = np.asarray(t, float)
-        piece = self._piece(t)
-        x = t - piece["start"]
-        value = np.zeros_like(t)
-        slope = np.zeros_like(t)
-        for name in reversed(COEFFICIENTS):
-            slope = slope * x + value
-            value = value * x + piece[name]
-        phase = self.phase(t)
-        rate = slope * np.sin(phase) + value * np.cos(phase) * (piece["frequency"] + piece["rate"] * x)
+        rate = piece_rate(self._piece(t), t)
         return np.where((t >= self.table["start"][0]) & (t < self.duration), rate, 0.0)
 
     def phase(self, t: ArrayLike) -> np.ndarray:
         """Return phase (...) in rad of the sine at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
-        x = t - piece["start"]
-        return np.asarray(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
+        x = t - piece.start
+        return np.asarray(piece.phase + x * (piece.frequency + 0.5 * piece.rate * x))
 
-    def _piece(self, t: np.ndarray) -> np.ndarray:
-        """Return the piece at each time t in s; before the beginning the first one."""
+    def _piece(self, t: np.ndarray) -> Any:
+        """Return the piece at each time t in s, with its numbers as attributes; before the beginning the first one."""
         number = np.searchsorted(self.table["start"], t, side="right") - 1
-        return self.table[np.maximum(number, 0)]
+        return self.table.view(np.recarray)[np.maximum(number, 0)]
 
     @property
     def repeats(self) -> bool:

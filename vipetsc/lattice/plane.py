@@ -11,7 +11,7 @@ K n n^T of a spring is one of scalar springs, some of them negative (``vipetsc.l
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -186,15 +186,7 @@ class PlaneCell:
     @staticmethod
     def _turned(spring: PlaneSpring) -> PlaneSpring:
         """Return the numbers of a ``spring`` seen from its other end, from which its elongation has the other sign."""
-        return PlaneSpring(
-            start=spring.end,
-            end=spring.start,
-            stiffness=spring.stiffness,
-            direction=spring.direction,
-            damping=spring.damping,
-            quadratic=-spring.quadratic,
-            cubic=spring.cubic,
-        )
+        return replace(spring, start=spring.end, end=spring.start, quadratic=-spring.quadratic)
 
     def _between(self, spring: PlaneSpring, start: int, end: int, offset: int) -> list[Spring]:
         """Return the scalar springs between two masses of the wide cell, or of it and the next one (``offset`` 1)."""

@@ -10,6 +10,7 @@ from scipy.linalg import eigh
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, contacts, nonlinear_springs, spring_laws
+from vipetsc.lattice.cell import nonlinear_energy, nonlinear_force
 from vipetsc.modes.balance.stops import Stops
 
 # A contact does not move in a mode if its relative displacement is below this fraction of the mode's largest one: a
@@ -286,7 +287,7 @@ class System:
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             force = force + row * pair.stops.force(row @ u)
         for row, spring in zip(self.spring_rows, self.springs, strict=True):
-            force = force + row * spring.law.nonlinear_force(row @ u)
+            force = force + row * nonlinear_force(spring.law, row @ u)
         return force
 
     def energy(self, u: np.ndarray, v: np.ndarray) -> float:
@@ -295,7 +296,7 @@ class System:
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             total += pair.stops.energy(row @ u)
         for row, spring in zip(self.spring_rows, self.springs, strict=True):
-            total += spring.law.nonlinear_energy(row @ u)
+            total += nonlinear_energy(spring.law, row @ u)
         return float(total)
 
     def grazing_energy(self, mode: int) -> float:

@@ -57,7 +57,7 @@ from scipy.special import binom
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import STUCK, contact_force, side_of
 from vipetsc.contact.together import entry, join, solve
-from vipetsc.dynamics.drives import drive_force
+from vipetsc.dynamics.drives import drive_force, drive_power
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, has_stuck_sites
@@ -618,7 +618,7 @@ def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None
             elif i < first_drive(cluster):
                 power = 0.0  # all of a spring's work comes back
             else:
-                power = trial.force[i, node] * trial.v[i, node]
+                power = drive_power(cluster.drives, i, trial.force[i, node], trial.v[i, node])
             cluster.energy[i] += duration * power
 
             # Integrals over the step of F (1 - s)^k: k = 0 first, then times what remains of the step.

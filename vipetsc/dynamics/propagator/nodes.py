@@ -41,13 +41,6 @@ def _lay_out(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return position, slope
 
 
-@lru_cache
-def at_end() -> np.ndarray:
-    """Return weights (node,) that extrapolate what is smooth in z from the nodes to a substep's end, z = 1."""
-    z, _ = gauss(NODES)
-    return np.array([np.prod([(1 - a) / (b - a) for a in z if a != b]) for b in z])
-
-
 def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss's nodes (node,) and weights (node,) on [0, 1]; ``count`` is their number."""
     nodes, weights = leggauss(count)

@@ -39,7 +39,7 @@ MOST_TERMS = 24
 # the same time in a lattice in which no two cells are alike; with dashpots 256 take 0.1 GB more.
 BATCH = 64
 # Cells whose rows are kept: members of a sweep ask again for those near the same few contacts and ends.
-KEPT = 16
+KEPT = 32
 # Entries of P below this fraction of the tolerance are dropped; ``truncation`` counts them.
 SMALL_ENTRY = 1e-3
 

@@ -9,7 +9,6 @@ that results have the same bits on any partition.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 from petsc4py import PETSc
@@ -136,66 +135,42 @@ class Stencil(NamedTuple):
 
 
 def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Record:
-    """Create P(H) on the cells of ``layout``; adds to ``halo`` the cells that rows of borders, ends and others read."""
+    """Create P(H) on the cells of ``layout``; adds to ``halo`` the cells that dense rows read."""
     reach = series.reach
 
-    # Cells that no end is within reach of, and among them those whose stencil stays among the rank's own.
-    first = layout.start
-    last = layout.stop
-    if not layout.topology.is_ring:
-        first = max(first, reach)
-        last = min(last, layout.cells - reach)
-    inner = np.arange(first, max(first, last))
-    is_own = (inner >= layout.start + reach) & (inner < layout.stop - reach)
-    interior = ranges_of(series.is_interior(inner) & is_own, first)
+    # Cells whose stencil stays among the rank's own.
+    cells = np.arange(layout.start, layout.stop)
+    is_own = (cells >= layout.start + reach) & (cells < layout.stop - reach)
+    interior = ranges_of(series.is_interior(cells) & is_own, layout.start)
     # Shorter ranges are left to the dense rows, which take less time for them.
     interior = interior[interior @ [-1, 1] >= SHORTEST]
 
     # Consecutive dense cells have one part of the halo in common.
-    is_dense = np.ones(len(inner), bool)
-    for start, stop in interior - first:
+    is_dense = np.ones(len(cells), bool)
+    for start, stop in interior - layout.start:
         is_dense[start:stop] = False
     columns = [np.zeros(0, np.int64)]
-    for start, stop in ranges_of(is_dense, first).tolist():
+    for start, stop in ranges_of(is_dense, layout.start).tolist():
         columns.append(int(halo.add(start - reach, stop - start + 2 * reach)) + np.arange(stop - start))
 
-    # Cells near an end all read the same columns, from the end on: (first column's cell, first of the cells, last).
-    left_end = (0, layout.start, min(layout.stop, first))
-    right_end = (layout.cells - 2 * reach, max(layout.start, last), layout.stop)
-    ends: list[tuple[int, int]] = []
-    for begin, start, stop in (left_end, right_end):
-        if start < stop:
-            columns.append(np.repeat(halo.add(begin, 2 * reach + 1), stop - start))
-        ends += [(begin, cell) for cell in range(start, stop)]
-
-    borders, table = _dense_rows(series, inner[is_dense], tuple(ends))
-    cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
-    sparse = sparse_rows(series.interior(), layout, reach)
+    dense = cells[is_dense]
+    borders, table = _dense_rows(series, dense)
     stencil = Stencil(
         interior=interior - layout.start,
-        blocks=sparse.blocks,
-        starts=sparse.starts,
-        places=sparse.places,
-        values=sparse.values,
+        **_sparse_rows(series.interior(), layout, reach),
         spare=np.empty((4, CHUNK)),
         borders=borders,
-        border_cells=np.column_stack([np.concatenate(columns), cells - layout.start, table]),
+        border_cells=np.column_stack([np.concatenate(columns), dense - layout.start, table]),
         total=np.zeros(borders.shape[3]),
     )
     return Record(stencil)
 
 
-class SparseRows(NamedTuple):
-    """Rows of an interior cell without zeros, as ``Stencil`` has them."""
+def _sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> dict[str, np.ndarray]:
+    """Return ``blocks``, ``starts``, ``places`` and ``values`` of a ``Stencil``.
 
-    blocks: np.ndarray
-    starts: np.ndarray
-    places: np.ndarray
-    values: np.ndarray
-
-
-def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
-    """Return rows in blocks of four, of ``entries`` (2 dof, 2 dof, cell) of an interior cell, from ``-reach`` on."""
+    ``entries`` (2 dof, 2 dof, cell) are rows of an interior cell, from ``-reach`` on.
+    """
     # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Where the
     # number of masses is odd, the last one is there twice, and its second copy has no place.
     dofs = layout.dofs
@@ -215,7 +190,12 @@ def sparse_rows(entries: np.ndarray, layout: Layout, reach: int) -> SparseRows:
     to = blocks * layout.owned
     if dofs % 2:
         to[-1, 2:] = -1
-    return SparseRows(blocks=to, starts=np.array(starts), places=np.concatenate(places), values=np.concatenate(values))
+    return {
+        "blocks": to,
+        "starts": np.array(starts),
+        "places": np.concatenate(places),
+        "values": np.concatenate(values),
+    }
 
 
 def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
@@ -223,45 +203,20 @@ def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
     return np.flatnonzero(np.diff(np.concatenate([[False], is_in, [False]]))).reshape(-1, 2) + first
 
 
-def _dense_rows(
-    series: StepSeries, cells: np.ndarray, ends: tuple[tuple[int, int], ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
-
-    ``cells`` read as many cells on either side, ``ends`` are (first cell that is read, cell) near the lattice's ends.
-    """
+def _dense_rows(series: StepSeries, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return tables of P's rows, as ``Stencil.borders`` are, and which of them is that of each of ``cells`` (cell,)."""
     reach = series.reach
-    dofs = series.chain.cell.dofs
+    outputs = 2 * series.chain.cell.dofs
     band = 2 * reach + 1
     examples, table = np.unique(series.representatives(cells), return_inverse=True)
-    tables = np.zeros((len(examples), 2 * dofs, band, 2 * dofs))
+    tables = np.zeros((len(examples), outputs, band, outputs + -outputs % 4))
 
     # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
     is_shared = series.is_interior(examples)
-    tables[is_shared] = series.interior().transpose(1, 2, 0)
+    tables[is_shared, :, :, :outputs] = series.interior().transpose(1, 2, 0)
     for i, rows in zip(np.flatnonzero(~is_shared), series.power_rows(examples[~is_shared]), strict=True):
-        tables[i] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
-    numbers = np.append(table, len(examples) + np.arange(len(ends)))
-    return in_fours(np.concatenate([tables, _end_rows(series, ends)])), numbers
-
-
-def in_fours(tables: np.ndarray) -> np.ndarray:
-    """Return the ``tables`` (..., output) with outputs of zeros behind the others, up to a multiple of four."""
-    extra = -tables.shape[-1] % 4
-    return np.pad(tables, [(0, 0)] * (tables.ndim - 1) + [(0, extra)])
-
-
-@lru_cache(maxsize=4)  # members of a sweep have the same ends
-def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """Return the tables of ``_dense_rows`` of the ``ends``, in their order."""
-    reach = series.reach
-    dofs = series.chain.cell.dofs
-    tables = np.zeros((len(ends), 2 * dofs, 2 * reach + 1, 2 * dofs))
-    for i, rows in enumerate(series.power_rows([cell for _, cell in ends])):
-        begin, cell = ends[i]
-        part = series.cut(rows, begin - cell, 2 * reach)
-        tables[i, :, : 2 * reach] = series.stencil(part).transpose(1, 2, 0)
-    return tables
+        tables[i, :, :, :outputs] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
+    return tables, table
 
 
 @kernel

@@ -18,7 +18,7 @@ from vipetsc.contact.changes import first_change
 from vipetsc.contact.law import FREE, STUCK, contact_force
 from vipetsc.contact.together import join, solve
 from vipetsc.dynamics import native
-from vipetsc.dynamics.drives import drive_force
+from vipetsc.dynamics.drives import drive_force, drive_power, lost_power
 from vipetsc.dynamics.equation import acceleration
 from vipetsc.dynamics.lattice_record import LATTICE, LatticeRecord
 from vipetsc.dynamics.native import array_at
@@ -98,14 +98,16 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
 
     _add_contacts(y, f, lattice)
 
+    if shape.damping >= 0:
+        damping_powers(y, lattice, 0, f[shape.damping : shape.damping + n])
+
     for i in range(lattice.drives.rows.size):
         drive = lattice.drives.rows[i]
         force = drive_force(lattice.drives, i, t)
         f[drive.target] += force * drive.inverse
-        f[shape.work + i] = force * y[drive.target]
-
-    if shape.damping >= 0:
-        damping_powers(y, lattice, 0, f[shape.damping : shape.damping + n])
+        f[shape.work + i] = drive_power(lattice.drives, i, force, y[drive.target])
+        if shape.damping >= 0:
+            f[shape.damping + drive.target % n] += lost_power(lattice.drives, i, force, y[drive.target])
 
 
 @kernel

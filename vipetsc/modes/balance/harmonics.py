@@ -41,6 +41,7 @@ import numpy as np
 from vipetsc.compiled import kernel
 from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
 from vipetsc.lattice import Spring
+from vipetsc.lattice.cell import nonlinear_energy, nonlinear_force, nonlinear_slope
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import NoMotionError
 
@@ -472,7 +473,7 @@ class SiteForces:
         # Uniform samples are exact for springs: f exp(-i k theta) has orders up to 3K + 2K, the energy up to 4K.
         for pair, spring in enumerate(self.springs, len(self.contacts)):
             x = _sampled(z[pair], derivatives=0)[0]
-            values = [spring.nonlinear_force(x), spring.nonlinear_slope(x), spring.nonlinear_energy(x)]
+            values = [part(spring, x) for part in (nonlinear_force, nonlinear_slope, nonlinear_energy)]
             series.add_spring(pair, np.array(values))
 
         series.episodes.sort(key=lambda e: (e.pair, e.onset))
