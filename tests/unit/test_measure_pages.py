@@ -123,7 +123,6 @@ def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
     np.testing.assert_allclose(high.get_ydata(), 0.01 * np.arange(7, 13))
     assert to_hex(low.get_color()) != to_hex(high.get_color())
     assert legend(figure) == ["contact restitution 0.3", "contact restitution 0.9"]
-    assert "for each contact restitution" in title(figure)
     assert "largest (ring): 0.12 at contact restitution 0.9, drive amplitude 32 N" in title(figure)
 
 

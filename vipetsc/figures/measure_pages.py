@@ -27,10 +27,10 @@ from vipetsc.figures.measure_panels import (
 from vipetsc.figures.measure_roles import MOST_CURVES, PART, Roles
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import in_file_name, table
-from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
+from vipetsc.figures.swept_axes import SweptAxis, SweptKey
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
-from vipetsc.wording import capitalised, key_words, with_unit
+from vipetsc.wording import capitalised, with_unit
 
 MOST_PAGES = 12  # of a measure, as many as a reader turns over; of more only the one with the largest value is drawn
 BAND = "band"  # the first word in the names of those parts of the frequency axis that are pass bands
@@ -370,14 +370,8 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
 
 
 def _lines_of(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]:
-    """Return the lines of a page: the ``title``, what is compared on the page, and what values are left out."""
-    heading, *further = title
-    lines = [heading]
-    compared = [key for axis in (*roles.panels, *roles.curves) for key in axis.keys]
-    if compared:
-        lines.append(f"for each {joined([with_unit(key_words(key.path), key.unit) for key in compared])}")
-    lines += further
-
+    """Return the lines of a page: the ``title``, and what values are left out."""
+    lines = [*title]
     if measure.samples:
         means = f"means over {measure.sample_text}"
         if roles.y is None:
