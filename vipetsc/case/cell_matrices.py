@@ -36,6 +36,10 @@ class MatrixError(ValueError):
     """Matrices that make no cell; the message says why, and what to do."""
 
 
+class BoundaryError(MatrixError):
+    """Rows on boundaries that are none of the matrices'."""
+
+
 class _Assembled(NamedTuple):
     """A matrix ``inside`` the cell (dof, dof), what its neighbours add included, and its coupling to the ``next`` one.
 
@@ -76,7 +80,11 @@ def with_matrices(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]
         digests = [file_hash(file) for file in files]
     except FileNotFoundError as error:
         return table, [Problem(KEY, error.filename or cell["matrices"], MISSING)]
-    # ValueError: also of NumPy and SciPy, for files that are none of theirs.
+    except BoundaryError as error:
+        return table, [Problem("lattice.cell.boundary", cell["boundary"], str(error))]
+    except MatrixError as error:
+        return table, [Problem(KEY, cell["matrices"], str(error))]
+    # ValueError: of NumPy and SciPy, for files that are none of theirs.
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         return table, [Problem(KEY, cell["matrices"], f"{error}; give an NPZ file, or a list of MatrixMarket files")]
 
@@ -150,6 +158,8 @@ def _translated(matrices: dict[str, np.ndarray], boundary: Any) -> dict[str, Any
     mass = _assembled(matrices["M"], none, left, right)
     stiffness = _assembled(matrices["K"], matrices.get("K_next", none), left, right)
     damping = _assembled(matrices.get("C", none), matrices.get("C_next", none), left, right)
+    if _is_diagonal(stiffness) and not _is_diagonal(mass):
+        raise MatrixError("K is diagonal, and M is not: name the files of M, K and C in this order")
     masses = _masses(mass)
 
     # Within the cell each pair once, to the next cell all.
@@ -185,14 +195,14 @@ def _boundaries(boundary: Any, size: int) -> tuple[list[int], list[int]]:
     """Return rows (from 0) of matrices of that ``size`` on the left and the right boundary; [] if none are given."""
     if boundary is None:
         return [], []
-    remedy = f"lattice.cell.boundary = {boundary}: give two lists of as many rows from 1 to {size}, each row once"
+    remedy = f"give two lists of equal length, of rows from 1 to {size}, each row once"
     if not (isinstance(boundary, list) and len(boundary) == 2 and all(isinstance(side, list) for side in boundary)):
-        raise MatrixError(remedy)
+        raise BoundaryError(remedy)
     rows = [row for side in boundary for row in side]
     if not all(type(row) is int and 1 <= row <= size for row in rows):
-        raise MatrixError(remedy)
+        raise BoundaryError(remedy)
     if not boundary[0] or len(boundary[0]) != len(boundary[1]) or len({*rows}) != len(rows):
-        raise MatrixError(remedy)
+        raise BoundaryError(remedy)
     left, right = ([row - 1 for row in side] for side in boundary)
     return left, right
 
@@ -218,13 +228,23 @@ def _masses(mass: _Assembled) -> list[float]:
         raise MatrixError(
             f"M has {masses.min():.6g} for degree of freedom {at}: give it a mass, or remove it by condensation"
         )
-    others = _significant(mass.inside - np.diag(masses), mass) | _significant(mass.next, mass)
-    if others.any():
-        i, j = np.argwhere(others)[0] + 1
+    if not _is_diagonal(mass):
+        i, j = np.argwhere(_couplings(mass))[0] + 1
         reason = "contacts, drives and points act on single masses"
         remedy = "have the program write lumped masses, rotary inertia included"
         raise MatrixError(f"M couples degrees of freedom {i} and {j}, but {reason}: {remedy}")
     return masses.tolist()
+
+
+def _couplings(matrix: _Assembled) -> np.ndarray:
+    """Return whether each entry (dof, dof) of a ``matrix`` couples two degrees of freedom, or a cell to the next."""
+    beside = matrix.inside - np.diag(np.diag(matrix.inside))
+    return np.asarray(_significant(beside, matrix) | _significant(matrix.next, matrix))
+
+
+def _is_diagonal(matrix: _Assembled) -> bool:
+    """Return whether a ``matrix`` couples nothing."""
+    return not _couplings(matrix).any()
 
 
 def _significant(values: np.ndarray, matrix: _Assembled) -> np.ndarray:
