@@ -53,9 +53,14 @@ def counted(number: int | str, noun: str) -> str:
     return f"{text} {noun}s"
 
 
-def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
+def nearest(name: str, valid: Iterable[str]) -> str:
     """Return the one of the ``valid`` names that a misspelt ``name`` is nearest to; empty if none is near."""
-    near = difflib.get_close_matches(name, list(valid), n=1, cutoff=cutoff)
+    names = list(valid)
+    # Words of one length with half of their letters in common, "tone" and "step", are not near.
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    longer = [other for other in names if name and other.startswith(name)]
+    if not near and len(longer) == 1:
+        near = longer
     return near[0] if near else ""
 
 

@@ -78,7 +78,10 @@ def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_pa
         ("--fig ledger", "one run"),
         ("--style none.mplstyle", "--style"),
         ("--movie --width 86mm", "pixels"),
+        ("--width 86", "as in 86mm"),
     ):
         ended = typed(f"plot a b {wrong}")
         assert ended.returncode == 2, wrong
         assert telling in ended.stderr
+    gone = typed("plot a elsewhere --fig points")
+    assert gone.returncode == 2 and "elsewhere: no such folder" in gone.stderr

@@ -294,7 +294,7 @@ def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
         ("contacts.parameters.b=", r'contacts.parameters.b: missing; needed for the law "hardening" \(1/m\^2\)'),
         ("contacts.parameters.b=-1.0", r"parameters.b = -1.0: must be from 0 to 1e\+50 \(1/m\^2\)"),
         ("contacts.law=bilinear", 'contacts.parameters.b = 400000.0: the law "bilinear" takes no parameters'),
-        ("nfrc.range=[0.5,2.0]", "a steady state repeats itself under a sine"),
+        ("nfrc.range=[0.5,2.0]", "a steady state needs a sine"),
     ],
 )
 def test_keys_of_parts_are_checked(folder, change, sentence):

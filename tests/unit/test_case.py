@@ -142,6 +142,9 @@ def test_a_misspelt_choice_and_an_unknown_section_name_the_nearest():
     found = problems({"contacts": {"law": "hertzz"}}, "desing.wavenumbers=5")
     assert "did you mean 'hertz'?" in found["contacts.law"]
     assert "did you mean design?" in found["desing"]
+    # Of a word that is near to none, none is named.
+    assert "did you mean" not in problems({"drive": {"waveform": "tone"}})["drive.waveform"]
+    assert "did you mean 'harmonic'?" in problems({"drive": {"waveform": "harm"}})["drive.waveform"]
 
 
 def test_a_check_that_rests_on_an_invalid_key_is_left_out():

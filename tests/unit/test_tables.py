@@ -28,6 +28,8 @@ TABLES = {
     "Fortran": ["t F", *FORTRAN],
     "trailing separators": [row + "," for row in ["t,F", *POINTS]],
     "percent": ["% exported by a logger", "t F", *(row.replace(",", " ") for row in POINTS)],
+    "names in a comment": ["# of 3 May, by hand", "# t,F", *POINTS],
+    "names in a comment, blanks": ["% t F", *(row.replace(",", " ") for row in POINTS)],
     "blank lines": ["# a comment", "t, F", "", *(row.replace(",", " ,  ") for row in POINTS), ""],
     "title": ["Oscilloscope", "t;F", *(row.replace(",", ";") for row in POINTS)],
 }

@@ -367,7 +367,7 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         message += _list_remedy(kind, item["loc"], path)
     choices = details.get("expected")
     if isinstance(value, str) and choices:
-        near = nearest(value, re.findall(r"'([^']+)'", choices), cutoff=0.4)
+        near = nearest(value, re.findall(r"'([^']+)'", choices))
         if near:
             message += f"; did you mean {near!r}?"
     if isinstance(value, str) and (unit := unit_at({name: kind}, path, {})):

@@ -2,7 +2,8 @@
 
 Columns are separated by semicolons, tabs, commas or blanks; fields may be quoted, and rows may end with a separator.
 Decimals have points, or commas where no field has a point; exponents are written with E or, as in Fortran, with D.
-Lines that begin with # or % are comments. Before the numbers there may be lines of text, such as names and units.
+Lines that begin with # or % are comments. Before the numbers there may be lines of text, such as names and units; names
+may also stand in the last comment above the numbers.
 ``read_columns`` takes single columns from such a table, or from datasets of an HDF5 file.
 """
 
@@ -17,7 +18,8 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-COMMENTS = ("#", "%")
+MARKS = "#%"
+COMMENTS = (*MARKS,)
 NUMBER_BEGINS = re.compile(r"""["']?([-+.\d]|nan|inf)""", re.IGNORECASE)
 WITH_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eEdD][-+]?\d+)?")
 
@@ -51,7 +53,8 @@ def read_table(path: Path, most_rows: int) -> TextTable:
 
     Raises OSError for a file that cannot be read, and TableError for one that holds something else.
     """
-    lines = _lines(path, most_rows)
+    read = _lines(path, most_rows)
+    lines = [(line, text) for line, text in read if not text.startswith(COMMENTS)]
     first = next((text for _, text in lines if NUMBER_BEGINS.match(text)), "")
     separator = _separator(first)
     rows = [Row(line, _fields(text, separator)) for line, text in lines]
@@ -71,7 +74,19 @@ def read_table(path: Path, most_rows: int) -> TextTable:
             expected = f"line {rows[0].line} has {width}"
             raise TableError(f"line {row.line} has another number of fields, {len(row.fields)}; {expected}")
     names = next((row.fields for row in above if len(row.fields) == width), [])
+    if not names:
+        comments = [text.lstrip(MARKS).strip() for line, text in read if line < rows[0].line]
+        names = _commented_names([_fields(text, separator) for text in comments], width)
     return TextTable(names, _numbers(rows))
+
+
+def _commented_names(comments: list[list[str]], width: int) -> list[str]:
+    """Return the last of the ``comments``, as fields, that is text in ``width`` fields, as NumPy writes names."""
+    names: list[str] = []
+    for fields in comments:
+        if len(fields) == width and not any(map(is_number, _with_points(fields))):
+            names = fields
+    return names
 
 
 def is_number(field: str) -> bool:
@@ -93,7 +108,7 @@ def number_of(field: str) -> float | None:
 
 
 def _lines(path: Path, most_rows: int) -> list[tuple[int, str]]:
-    """Return the lines of a file that are neither empty nor comments, each with its number; of a long file the first.
+    """Return the lines of a file that are not empty, each with its number; of a long file the first.
 
     As many as tell that there are more than ``most_rows`` rows of numbers.
     """
@@ -120,7 +135,7 @@ def _read_lines(path: Path, most_rows: int, encoding: str) -> Iterator[tuple[int
         for number, line in enumerate(file, 1):
             # Blanks alone at the end: an empty field behind a tab is a field.
             text = line.strip(" \r\n")
-            if not text.strip() or text.startswith(COMMENTS):
+            if not text.strip():
                 continue
             yield number, text
             count += bool(NUMBER_BEGINS.match(text))
@@ -253,7 +268,7 @@ def _index_of(place: int | str, table: TextTable, key: str) -> int:
         return table.names.index(place)
     remedy = f"there are {', '.join(table.names)}"
     if not table.names:
-        remedy = "the table has no line of names; give a number from 1"
+        remedy = f"the table has no line of {table.values.shape[1]} names; give a number from 1"
     raise ColumnError(f"no column of that name; {remedy}", key, place)
 
 

@@ -144,6 +144,8 @@ def plot(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> in
             echo(comm, f"vipetsc: {missing}", sys.stderr)
         return DONE
 
+    if size.pixels is not None:
+        raise FolderError("--width: pixels are for movies (--movie); give a picture's width a unit, as in 86mm")
     misplaced = [MOVIE_ARGUMENTS[name].flag for name in movie_options]
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
@@ -199,6 +201,8 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
         if pictures.are_of(folders):
             return pictures, folders
 
+    if missing := [str(path) for path in paths if not path.exists()]:
+        raise FolderError(f"{', '.join(missing)}: no such folder")
     if len(folders) > 1:
         raise FolderError(
             f"{' '.join(map(str, paths))}: only runs, or sweeps and folders of branches, can be drawn on one page"
