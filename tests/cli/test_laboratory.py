@@ -44,14 +44,14 @@ def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_pa
         assert typed(f"run x.toml --out {name} --set drive.amplitude={amplitude}").returncode == 0
     assert typed("export a").returncode == 0
     (tmp_path / "x.mplstyle").write_text("svg.fonttype: none\naxes.linewidth: 2.5\n", encoding="utf-8")
-    look = '--format svg --width 86mm --unit Hz --no-title --style x.mplstyle --label "Time (s)=t (s)"'
+    look = '--format svg --width 86mm --db --unit Hz --no-title --style x.mplstyle --label "Time (s)=t (s)"'
     ended = typed(f"plot b a --fig points --record a/curves/run-points.csv {look}")
     assert ended.returncode == 0, ended.stderr
 
     picture = (tmp_path / "b/figures/points-a.svg").read_text(encoding="utf-8")
     assert 'width="243' in picture  # 86 mm in pt
     words = re.findall(r">([^<>\n]+)</text>", picture)
-    assert {"t (s)", "Frequency f (Hz)", "run-points.csv", "(a.i)"} <= set(words)
+    assert {"t (s)", "Frequency f (Hz)", "run-points.csv", "(a.i)", "(dB re 1 m/s)"} <= set(words)
     assert not any("rad/s" in word or "History" in word for word in words)
     assert "stroke-width: 2.5" in picture
 
@@ -66,6 +66,10 @@ def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_pa
     assert ended.returncode == 0, ended.stderr
     assert "--label Tpi" in ended.stderr
     assert (tmp_path / "b/figures/points.svg").exists()
+
+    # A record of the second point alone is in the legend too.
+    assert typed("plot b --fig points --record laser.h5:tip=tip --format svg --style x.mplstyle").returncode == 0
+    assert ">laser.h5</text>" in (tmp_path / "b/figures/points.svg").read_text(encoding="utf-8")
 
     for name, line in (("key", "axes.linewidht: 2"), ("value", "axes.linewidth: wide"), ("latex", "text.usetex: true")):
         (tmp_path / f"{name}.mplstyle").write_text(f'# a style\naxes.edgecolor: "#112233"\n{line}\n')

@@ -108,7 +108,11 @@ class Look:
             return
         for units, factor in ((AMPLITUDES, 20), (POWERS, 10)):
             if of_level[2] in units:
-                axis.set_label_text(f"{of_level[1]}(dB re 1 {of_level[2]})")
+                text = of_level[1]
+                # Along a vertical axis there is less room.
+                if axis.axis_name == "y" and "\n" not in text:
+                    text = text.rstrip() + "\n"
+                axis.set_label_text(f"{text}(dB re 1 {of_level[2]})")
                 _show_levels(axis, factor)
 
 

@@ -70,10 +70,14 @@ def points(runs: Sequence[Shown], records: Sequence[str] = (), quantity: str = "
     for axes, title in zip(grid[0], ("History", "Spectrum", "Spectrogram"), strict=False):
         axes.set_title(title)
     panels.label_panels(grid)
-    handles = grid[0, 0].get_legend_handles_labels()[0]
-    if len(handles) > 1:
+    # A record may be of one point alone.
+    entries: dict[Any, Any] = {}
+    for axes in grid[:, 0]:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    if len(entries) > 1:
         # The spectrum leaves more room than the history.
-        grid[0, 1].legend(loc="best")
+        grid[0, 1].legend(list(entries.values()), list(entries), loc="best")
     if len(names) > MOST_POINTS:
         style.add_note(figure, f"the first {MOST_POINTS} of {len(names)} points; the files have all")
     return figure

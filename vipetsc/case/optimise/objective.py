@@ -220,8 +220,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
 def _nearest(name: str, valid: Sequence[str]) -> str:
     """Return a remedy for an invalid ``name``: the nearest of the ``valid`` names, if near, and all of them."""
-    # 0.6 is difflib's own bound: below it proposals are guesses.
-    near = nearest(name, valid, cutoff=0.6)
+    near = nearest(name, valid)
     hint = ""
     if near:
         hint = f"did you mean {near!r}? "

@@ -87,7 +87,7 @@ def _chosen(shipped: dict[str, Example], names: list[str]) -> list[Example]:
             chosen.append(shipped[stem])
             continue
         remedy = "`vipetsc examples` lists them"
-        near = difflib.get_close_matches(stem, shipped, n=3, cutoff=0.5)
+        near = difflib.get_close_matches(stem, shipped, n=3, cutoff=0.6)
         if near:
             remedy = f"did you mean {' or '.join(near)}?"
         problems.append(Problem("NAME", name, f"no such case file; {remedy}"))
