@@ -238,8 +238,8 @@ def _masses(mass: _Assembled) -> list[float]:
 
 def _couplings(matrix: _Assembled) -> np.ndarray:
     """Return whether each entry (dof, dof) of a ``matrix`` couples two degrees of freedom, or a cell to the next."""
-    beside = matrix.inside - np.diag(np.diag(matrix.inside))
-    return np.asarray(_significant(beside, matrix) | _significant(matrix.next, matrix))
+    off_diagonal = matrix.inside - np.diag(np.diag(matrix.inside))
+    return np.asarray(_significant(off_diagonal, matrix) | _significant(matrix.next, matrix))
 
 
 def _is_diagonal(matrix: _Assembled) -> bool:
