@@ -12,10 +12,10 @@ from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.branches.balance import condensed_system, state_of
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.point import Point
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import System
 
 

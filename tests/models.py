@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vipetsc.lattice import Contact, contact_stiffness, four_band
-from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import SmoothSpring, System
 
 # The clearance of the paper's reduced model (Sec. IV), and the radius and Poisson's ratio of the contacts (Sec. III).

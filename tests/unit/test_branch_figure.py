@@ -187,10 +187,10 @@ def put_condensed_branch(path: Path, points: int, places: int = 1) -> None:
     case = NnmCase.load(EXAMPLES / "breather.toml")
     branch = branch_of(energy=[1.0, 2.0, 3.0], frequency=[1.0, 2.0, 3.0], multiplier_max=[1.0, 2.0, 3.0])
     branch["kind"] = xr.Variable("point", np.zeros(3, np.int8), {"flag_meanings": "regular fold-energy"})
-    branch["elongation"] = (("point", "place"), np.ones((3, places)))
-    branch["harmonics"] = (("point", "place"), np.ones((3, places)))
-    branch = branch.assign_coords(point=[0, 1, 2], place=np.arange(places) + 1)
-    branch.attrs = {"branch_kind": branch_kinds.CONDENSED, "case": case.to_toml(), "name": "breather"}
+    branch["elongation"] = (("point", "pair"), np.ones((3, places)))
+    branch["harmonics"] = (("point", "pair"), np.ones((3, places)))
+    branch = branch.assign_coords(point=[0, 1, 2], pair=np.arange(places) + 1)
+    branch.attrs = {"branch_kind": branch_kinds.BALANCE, "case": case.to_toml(), "name": "breather"}
     write_netcdf(path, branch.isel(point=slice(points)))
 
 

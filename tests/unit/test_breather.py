@@ -21,10 +21,10 @@ from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band
 from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import claim_branches, follow_all
 from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 

@@ -13,9 +13,9 @@ from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance, ShiftedCompliance
 from vipetsc.modes.balance.harmonics import SiteForces, intervals_above
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError, NoMotionError
+from vipetsc.modes.stops import Stops
 
 Symmetry = Literal["at rest", "odd", "any"]
 

@@ -8,9 +8,9 @@ from scipy.linalg import expm
 
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import NoMotionError
 from vipetsc.modes.stability import ContourLine, Hill
+from vipetsc.modes.stops import Stops
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_waves_around_a_ring_are_refused_before_anything_is_written(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("method", ["shooting", "condensed"])
+@pytest.mark.parametrize("method", ["shooting", "balance"])
 def test_a_branch_in_memory_ends_with_the_same_reason(method):
     """A branch that is followed in memory ends with the reason for which a folder would be refused."""
     alone, shared = follow_all(ring(modes=[4, 3], method=method), None, MPI.COMM_SELF)

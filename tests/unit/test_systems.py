@@ -10,7 +10,7 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell
 from vipetsc.lattice.sites import Pair, sites_at
-from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 LINEAR_STOP = four_band_contact("bilinear")

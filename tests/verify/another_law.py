@@ -180,7 +180,7 @@ springs = [{{ start = 0, end = 1, stiffness = {SPRING} }}]
 contacts = [{{ host = 0, resonator = 1, clearance = {D} }}]
 """
     found: dict = {"periods": {}, "reached": {}}
-    for method in ("shooting", "condensed"):
+    for method in ("shooting", "balance"):
         Path(f"{method}.toml").write_text(case.replace("METHOD", method))
         assert main(["nnm", f"{method}.toml", "--out", method, "--force"], {}) == 0
         (path,) = Path(method).glob("branch-*.csv")

@@ -38,7 +38,7 @@ def test_both_engines_follow_the_same_trajectory(found):
 
 
 # The condensed method may leave out harmonics of 1e-4 of the motion: its error is larger than that of shooting.
-@pytest.mark.parametrize(("method", "error"), [("shooting", 1e-8), ("condensed", 1e-5)])
+@pytest.mark.parametrize(("method", "error"), [("shooting", 1e-8), ("balance", 1e-5)])
 def test_normal_modes_have_the_period_of_the_energy_integral(found, method, error):
     """A mass between hardening stops has the period 4 int dx/sqrt(2 (E - V(x))/m), by shooting and condensed."""
     assert found["reached"][method] > 0.5

@@ -22,7 +22,7 @@ FOLDS = {1: [], 2: [0.0293435546934, 0.0223715911605]}
 
 
 def condensed(mode: int, top: float, modulus: float = 1e8, **options: Any) -> Branch[Any]:
-    nnm = {"modes": [mode], "energy": [0.0, top], "method": "condensed", "points": 300} | options
+    nnm = {"modes": [mode], "energy": [0.0, top], "method": "balance", "points": 300} | options
     table = {
         "lattice": {"preset": "four-band", "reading": "printed"},
         "contacts": {"law": "bilinear", "modulus": modulus},

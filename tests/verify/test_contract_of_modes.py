@@ -20,8 +20,8 @@ from scipy.integrate import solve_ivp
 
 from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
+from vipetsc.modes.branches.balance import BalanceMethod, state_of
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 
@@ -83,10 +83,10 @@ ZOO = {
         2e-3,
     ),
 }
-EVERY = [(name, method) for name in ZOO for method in ("shooting", "condensed")]
+EVERY = [(name, method) for name in ZOO for method in ("shooting", "balance")]
 every_branch = pytest.mark.parametrize(("name", "method"), EVERY)
 # Harmonics are left out where they are smaller than ``truncation``; kinks have many.
-ERRORS = {"shooting": 1e-7, "condensed": 2e-4}
+ERRORS = {"shooting": 1e-7, "balance": 2e-4}
 
 
 @cache
@@ -172,7 +172,7 @@ def rest_of(name: str, method: str, point: Any) -> np.ndarray:
     """Return displacements (mass,) in m of a motion where it rests."""
     if method == "shooting":
         return np.array(point.x)
-    motions = CondensedMethod(ZOO[name].case(method)).motions
+    motions = BalanceMethod(ZOO[name].case(method)).motions
     return np.concatenate(list(state_of(motions, point, len(ZOO[name].own["masses"])).values()))
 
 
@@ -259,7 +259,7 @@ def test_stops_on_the_other_sides_have_the_same_branch(name):
 
     Steps by harmonics are the same; orbits that are shot begin at their other rest, where steps are others.
     """
-    method = "condensed"
+    method = "balance"
     kind = ZOO[name]
     contacts = dict(kind.contacts)
     if "side" in contacts:
@@ -277,7 +277,7 @@ def test_stops_on_the_other_sides_have_the_same_branch(name):
 def test_both_methods_follow_one_branch(name):
     """Frequencies by harmonics lie on the branch of orbits, between whose points they are interpolated."""
     orbits, _ = followed(name, "shooting")
-    motions, _ = followed(name, "condensed")
+    motions, _ = followed(name, "balance")
     energies = np.array([point.energy for point in orbits.regular()])
     frequencies = np.array([point.frequency for point in orbits.regular()])
     if np.any(np.diff(energies) < 0):

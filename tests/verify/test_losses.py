@@ -16,7 +16,7 @@ from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.modes.branches.condensed import CondensedMethod, state_of
+from vipetsc.modes.branches.balance import BalanceMethod, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.losses import with_orbits_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
@@ -91,12 +91,12 @@ def test_free_decay_takes_the_loss(shot):
 def test_harmonics_of_all_orders_count_in_the_loss():
     """At large indentation the loss in dashpots between masses, by harmonics of all orders, is that along an orbit."""
     lattice = TWO_MASSES["lattice"] | {"damping": {"stiffness": 0.01}}
-    nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
+    nnm = {"system": "chain", "method": "balance", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
     nnm |= {"points": 60, "largest_step": 0.3, "first_step": 0.1, "tolerance": 1e-11, "start_energy": 0.9}
     nnm |= {"energy": [0.0, 5.0]}
     table = {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"]}
     case = NnmCase.from_table(table | {"nnm": nnm})
-    method = CondensedMethod(case)
+    method = BalanceMethod(case)
     motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
     motion = method.assess(method.motions, motion)
 
@@ -147,12 +147,12 @@ def test_losses_are_those_of_the_orbit_whichever_part_of_it_is_shot(name):
 def test_the_force_holds_a_steady_state_in_quadrature(damping):
     """A steady state near the free motion that lags its force by a quarter of a period needs the branch's force."""
     lattice = TWO_MASSES["lattice"] | {"damping": {"mass": damping}}
-    nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
+    nnm = {"system": "chain", "method": "balance", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
     nnm |= {"points": 14, "largest_step": 0.2, "first_step": 0.05, "tolerance": 1e-11, "harmonics": 63}
     case = NnmCase.from_table(
         {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"], "nnm": nnm | {"start_energy": 0.9}}
     )
-    method = CondensedMethod(case)
+    method = BalanceMethod(case)
     motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
     motion = method.assess(method.motions, motion)
     assert motion.episodes

@@ -133,7 +133,7 @@ def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map
 
 def test_so_do_those_of_condensed_motions():
     """Contacts of a mirrored lattice begin in pairs in condensed motions too, with the exact period."""
-    found = branches(own_case(["plus", "plus"], method="condensed", truncation=1e-4, first_step=0.05, largest_step=0.2))
+    found = branches(own_case(["plus", "plus"], method="balance", truncation=1e-4, first_step=0.05, largest_step=0.2))
     for branch in found.values():
         assert "energy range" in branch.ended.sentence, branch.ended.sentence
         assert branch.regular()[-1].episodes == 2

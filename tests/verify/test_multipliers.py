@@ -8,11 +8,11 @@ import pytest
 from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.case import NnmCase
-from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.branches import condensed
-from vipetsc.modes.branches.condensed import CondensedMethod, state_of
+from vipetsc.modes.branches import balance
+from vipetsc.modes.branches.balance import BalanceMethod, state_of
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import System
 
 STOPS = [Stops.both(four_band_contact(), CLEARANCE)]
@@ -23,7 +23,7 @@ def test_a_breather_and_its_multiplier_are_those_of_shooting():
 
     Amplitude and energy are those of an earlier computation with 8 to 16 harmonics.
     """
-    method = CondensedMethod(breather_case())
+    method = BalanceMethod(breather_case())
     point = method.assess(method.motions, method.start(method.motions, 0))
     assert abs(point.elongations[0]) / CLEARANCE == pytest.approx(1.286, abs=5e-4)
     assert point.energy == pytest.approx(0.0203, abs=5e-5)
@@ -58,11 +58,11 @@ def test_sensitivities_of_all_masses_and_hills_determinant_agree(monkeypatch, si
         "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [1, 2], "clearance": 1e-4},
         "nnm": {"system": "condensed", "start_frequency": [6000.0], "start_sites": sites, "truncation": 1e-5},
     }
-    method = CondensedMethod(NnmCase.from_table(table))
+    method = BalanceMethod(NnmCase.from_table(table))
     point = method.start(method.motions, 0)
-    assert method.motions.forces.pairs > condensed.MOST_OF_HILL
+    assert method.motions.forces.pairs > balance.MOST_OF_HILL
     by_orbit = method.assess(method.motions, point).multiplier
-    monkeypatch.setattr(condensed, "MOST_OF_HILL", method.motions.forces.pairs)
+    monkeypatch.setattr(balance, "MOST_OF_HILL", method.motions.forces.pairs)
     by_hill = method.assess(method.motions, point).multiplier
 
     assert (by_orbit > 1.5) == (len(sites) == 2)
@@ -77,8 +77,8 @@ def test_a_slow_motion_with_few_harmonics_has_the_multiplier_of_its_orbit():
     masses = 25
     springs = [{"start": i, "end": i + 1, "stiffness": 1.0} for i in range(masses)]
     system = {"masses": [1.0] * masses, "springs": springs, "smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}
-    options = {"system": "own", "method": "condensed", "start_energy": 1e-3, "own": system}
-    method = CondensedMethod(NnmCase.from_table({"nnm": options}))
+    options = {"system": "own", "method": "balance", "start_energy": 1e-3, "own": system}
+    method = BalanceMethod(NnmCase.from_table({"nnm": options}))
     point = method.start(method.motions, 0)
     assert point.order * 2 * np.pi / point.period < method.motions.compliance.highest
     assert method.assess(method.motions, point).multiplier == pytest.approx(1.0, abs=1e-6)

@@ -58,7 +58,7 @@ def test_a_response_at_values_of_three_quantities(tmp_path):
     assert [point.kind for point in stored.points] == [point.kind for point in curve.points]
 
 
-@pytest.mark.parametrize("method", ["shooting", "condensed"])
+@pytest.mark.parametrize("method", ["shooting", "balance"])
 def test_a_mode_at_an_energy_and_a_frequency(method):
     """The mode of u'' + u + u^3 = 0 has the period of the elliptic integral at both points."""
     spring = {"start": 0, "end": 1}

@@ -17,7 +17,7 @@ from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact
 from vipetsc.lattice.elements import contacts, joined_stiffness
-from vipetsc.modes.branches.condensed import CondensedMethod, state_of
+from vipetsc.modes.branches.balance import BalanceMethod, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation, locate
@@ -163,11 +163,11 @@ def test_free_grains_condensed_onto_their_contacts_return(resonators):
     table = {
         "lattice": {"cells": BEADS, "ends": "free", "cell": cell},
         "contacts": contacts | {"pair": [1, 1], "next_cell": True, "side": "minus"},
-        "nnm": {"system": "chain", "method": "condensed", "modes": [2], "truncation": 1e-6},
+        "nnm": {"system": "chain", "method": "balance", "modes": [2], "truncation": 1e-6},
     }
     case = NnmCase.from_table(table)
     system = System.from_case(case)
-    motions = CondensedMethod(case).motions
+    motions = BalanceMethod(case).motions
     omega, shapes = system.linear_modes()
     # A third of the energy at which a contact opens: the mean elongation is a hundredth of the amplitude.
     amplitude = np.sqrt(2 * system.grazing_energy(1) / 3) / omega[1]

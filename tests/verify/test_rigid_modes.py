@@ -213,7 +213,7 @@ def test_the_cell_of_the_built_in_lattice_has_rigid_modes():
     ("changes", "key"),
     [
         ({"contacts": {"restitution": 0.9}}, "contacts.restitution"),
-        ({"nnm": {"method": "condensed"}}, "nnm.method"),
+        ({"nnm": {"method": "balance"}}, "nnm.method"),
         ({"nnm": {"method": "damped"}}, "nnm.method"),
         ({"nnm": {"chart": "auto"}}, "nnm.chart"),
         ({"contacts": {"each": {"law": ["rigid"], "restitution": [0.5]}}}, "contacts.each.restitution"),

@@ -8,11 +8,11 @@ import pytest
 from tests.models import CLEARANCE, OUT_OF_PHASE, four_band_contact, reduced_model
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import four_band
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
 from vipetsc.modes.stability import half_traces, multipliers
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import SmoothSpring, System
 
 

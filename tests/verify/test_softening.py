@@ -43,7 +43,7 @@ def cubic_period(x: float) -> float:
     return 4 * np.sqrt(2 / (2 - x**2)) * ellipk(x**2 / (2 - x**2))
 
 
-@pytest.mark.parametrize("method", ["shooting", "condensed"])
+@pytest.mark.parametrize("method", ["shooting", "balance"])
 @pytest.mark.parametrize(
     ("law", "last", "period"), [("quadratic", 1 / 6, quadratic_period), ("cubic", 1 / 4, cubic_period)]
 )
@@ -57,7 +57,7 @@ def test_a_branch_ends_at_the_saddle(method, law, last, period):
 
     assert max(p.residual for p in branch.points) < 1e-8
     for point in branch.points:
-        start = float(np.ravel(point.elongations if method == "condensed" else point.x)[0])
+        start = float(np.ravel(point.elongations if method == "balance" else point.x)[0])
         # Near the saddle the period depends on the last digits of the start.
         if abs(start - 1) > 1e-4:
             assert point.period == pytest.approx(period(start), rel=1e-9 + 1e-7 / abs(start - 1))

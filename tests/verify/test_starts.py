@@ -28,7 +28,7 @@ def duffing_pair(mass: float, stiffness: float, cubic: float, method: str) -> Br
     return branch
 
 
-@pytest.mark.parametrize("method", ["shooting", "condensed"])
+@pytest.mark.parametrize("method", ["shooting", "balance"])
 @pytest.mark.parametrize(("mass", "stiffness", "cubic"), [(1e-12, 1e-3, 1e9), (1e6, 1e9, 1e-4)])
 def test_a_branch_is_the_same_in_any_units(method, mass, stiffness, cubic):
     """With energies over k^2/c and frequencies over (k/m)^1/2 a branch is that of numbers of order one."""
@@ -60,7 +60,7 @@ def test_a_mode_with_a_node_where_it_could_touch_begins_no_condensed_branch(own)
     """The second mode of three masses has a node in the middle; its branch is refused, not that of another mode."""
     table = {
         "contacts": {"law": "bilinear", "stiffness": 10.0},
-        "nnm": {"system": "own", "own": THREE | own, "modes": [2], "points": 3, "method": "condensed"},
+        "nnm": {"system": "own", "own": THREE | own, "modes": [2], "points": 3, "method": "balance"},
     }
     if "contacts" not in own:
         del table["contacts"]

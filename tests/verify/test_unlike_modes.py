@@ -15,12 +15,12 @@ from vipetsc.lattice import Chain, Contact, WaveCompliance
 from vipetsc.lattice.sites import sites_at
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.branches.balance import condensed_system, state_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.flow import MAPS, Dop853Flow
 from vipetsc.modes.shooting import Shooting, linear_start, sample_orbit
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import ContactPair, System
 
 MASS = 2.0

@@ -104,11 +104,11 @@ def _shade_pass_bands(axes: Axes, case: NnmCase) -> None:
 def _draw_elongation(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the elongation in mm of every contact or spring at phase 0, where all masses are at rest, over energy."""
     energy = branch["energy"].values
-    places = zip(branch["place"].values, branch["elongation"].values.T, strict=True)
-    for number, (place, values) in enumerate(places):
-        axes.plot(energy, 1e3 * values, lw=1.0, label=f"place {place}", **style.numbered_look(number))
+    pairs = zip(branch["pair"].values, branch["elongation"].values.T, strict=True)
+    for number, (pair, values) in enumerate(pairs):
+        axes.plot(energy, 1e3 * values, lw=1.0, label=f"pair {pair}", **style.numbered_look(number))
     axes.set_ylabel("elongation at rest (mm)")
-    if branch.sizes["place"] > 1:
+    if branch.sizes["pair"] > 1:
         axes.legend(fontsize=5.5)
 
 

@@ -94,7 +94,7 @@ def branch(paths: Sequence[Path]) -> Figure:
 
 BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
     branch_kinds.ORBITS: frequency_energy.backbone,
-    branch_kinds.CONDENSED: condensed_branches.condensed_branches,
+    branch_kinds.BALANCE: condensed_branches.condensed_branches,
     branch_kinds.RESPONSES: nfrc.frequency_response,
     branch_kinds.DAMPED: damped_modes.damped_modes,
 }

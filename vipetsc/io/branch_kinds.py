@@ -1,4 +1,4 @@
-"""The kinds of branch files: orbits, condensed motions, responses; the attribute ``branch_kind`` of a file names it.
+"""The kinds of branch files: orbits, motions by harmonic balance, responses; their attribute ``branch_kind`` names it.
 
 All readers use `branch_kind`; ``vipetsc.modes.branches``, which has the format of the files, writes the attribute. The
 readers are in this room because figures, which read branches, do not load PETSc.
@@ -15,7 +15,7 @@ from vipetsc.io.netcdf import root_attributes
 ORBITS = "orbits"
 """Periodic orbits by shooting: of a reduced system, or of a whole lattice."""
 
-CONDENSED = "condensed"
+BALANCE = "balance"
 """Periodic motions by harmonic balance, the lattice condensed onto its contacts."""
 
 RESPONSES = "responses"
@@ -30,7 +30,7 @@ DAMPED = "damped"
 DOWN = "-down"
 """Ending of the name of a branch that is followed towards smaller energies, beside the one towards larger ones."""
 
-BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES, DAMPED)
+BRANCH_KINDS = (ORBITS, BALANCE, RESPONSES, DAMPED)
 
 
 def kind_of_file(path: Path, needs: Sequence[str] = ()) -> str:

@@ -3,9 +3,10 @@ r"""Nonlinear normal modes of conservative systems with contacts: their branches
 The system is M u'' + K u + f(u) = 0 with masses in contact pairs and smooth springs (``system``); a nonlinear normal
 mode is a family of periodic orbits that begins at a linear mode (Kerschen et al. 2009; Rosenberg's in the odd case).
 
-**Modules.** ``problem`` is the interface between continuation and a method; ``system`` is the system, ``point`` an
-orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns. ``shooting`` finds periodic orbits by
-integrating them with ``flow``, ``stability`` has their multipliers. Each of these begins with its equations.
+**Modules.** ``problem`` is the interface between continuation and a method; ``system`` is the system, ``stops`` a
+contact of it, ``point`` an orbit of a branch, ``newton`` Newton's method for n equations in n + 1 unknowns.
+``shooting`` finds periodic orbits by integrating them with ``flow``, ``stability`` has their multipliers. Each of these
+begins with its equations.
 
 **Subpackages**, whose docstrings derive the methods. ``balance`` finds periodic motions by their harmonics;
 ``continuation`` follows branches of either method, ``branches`` follows and stores the branches of a case. ``response``

@@ -39,7 +39,7 @@ class Point(Solution):
 
     ``x`` are initial displacements (n,) in m (velocities in m/s for maps from the centre), or the unknowns of harmonic
     balance in m; ``tangent`` is d(x, period). Orbits that are shot have ``half_traces`` (n - 1,). Harmonic balance
-    gives the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at
+    gives the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (pairs,) in m at
     phase 0. ``POINT_VARIABLES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something
     dissipates.
     """

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, contacts, nonlinear_springs, spring_laws
 from vipetsc.lattice.cell import nonlinear_energy, nonlinear_force
-from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.stops import Stops
 
 # A contact does not move in a mode if its relative displacement is below this fraction of the mode's largest one: a
 # symmetry that keeps it at rest holds to rounding only.

@@ -186,9 +186,9 @@ class NnmCase(CaseFile):
         return self.lattice, self.contacts, nnm.system, nnm.custom, begun
 
     @property
-    def condensed(self) -> bool:
-        """Whether branches are those of motions condensed onto contacts and springs."""
-        return self.nnm.system == "condensed" or self.nnm.method == "condensed"
+    def by_balance(self) -> bool:
+        """Whether motions are found by harmonic balance between contacts and springs."""
+        return self.nnm.system == "condensed" or self.nnm.method == "balance"
 
     def chain(self) -> Chain:
         """Return the lattice with its sites, without dashpots."""

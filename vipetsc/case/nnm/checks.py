@@ -239,16 +239,16 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
             if getattr(nnm, key):
                 yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; remove it")
         return
-    if nnm.system == "condensed" or nnm.method == "condensed":
-        method = "shot"
+    if nnm.system == "condensed" or nnm.method == "balance":
+        method = "shooting"
         foreign = ("switch",)
     else:
-        method = "condensed"
+        method = "harmonic balance"
         foreign = ("start_frequency", "start_sites")
     for key in foreign:
         given = getattr(nnm, key)
         if given:
-            yield Problem(f"nnm.{key}", given, f"applies to motions that are {method}")
+            yield Problem(f"nnm.{key}", given, f"applies to motions by {method}; remove it")
 
 
 def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid: Valid) -> Iterator[Problem]:

@@ -93,7 +93,7 @@ class Guards(Section):
 class NnmTable(Section):
     """Nonlinear normal modes.
 
-    The ``method`` condensed treats the systems ``reduced``, ``chain`` and ``own`` by harmonics, too. Where dashpots or
+    The ``method`` balance treats the systems ``reduced``, ``chain`` and ``own`` by harmonics, too. Where dashpots or
     contacts dissipate, points have the loss along the motion without loss, and the force on the mass ``forced`` that
     makes up for it.
     """
@@ -103,8 +103,8 @@ class NnmTable(Section):
         " user-defined system (own)",
         "reduced",
     )
-    method: Literal["shooting", "condensed", "damped"] = described(
-        "shooting; harmonic balance condensed onto contacts and nonlinear springs; damped: modes with dashpots and"
+    method: Literal["shooting", "balance", "damped"] = described(
+        "shooting; balance: harmonic balance at contacts and nonlinear springs; damped: modes with dashpots and"
         " contacts that dissipate (frequency and damping ratio over the energy)",
         "shooting",
     )

@@ -1,7 +1,7 @@
 """Branches of conservative motions by harmonic balance: their equations, special points, and starts.
 
 *Conservative* means that no force depends on a velocity and that nothing drives the system. A *pair* is a contact or a
-smooth spring, contacts first (files of branches call it a place); z (pairs,) are the elongations of all pairs. In a
+smooth spring, contacts first; z (pairs,) are the elongations of all pairs. In a
 motion of frequency Om that is at rest at phase 0 each elongation is a sum of cosines,
 
     z(theta) = sum_k Z_k cos(k theta),    theta = Om t,    k = 0..K,

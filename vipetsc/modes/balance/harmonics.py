@@ -42,8 +42,8 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
 from vipetsc.lattice import Spring
 from vipetsc.lattice.cell import nonlinear_energy, nonlinear_force, nonlinear_slope
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import NoMotionError
+from vipetsc.modes.stops import Stops
 
 # With K harmonics, and 24 K samples or more, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range at
 # most, since |z''| <= K^2 range/2 by Bernstein's inequality. No root need be sought where the offset is above the

@@ -20,7 +20,7 @@ RESPONSE_KINDS = ("regular", "fold", "neimark-sacker", "period-doubling", "branc
 class Branch(Generic[S]):
     """Points of a branch of one ``kind`` (``io.branch_kinds``); with ``next_step`` and ``case`` it can go on later.
 
-    ``dofs`` counts the displacements (or places) for which a point has unknowns. ``next_step`` is the arclength of the
+    ``dofs`` counts the displacements (or pairs) for which a point has unknowns. ``next_step`` is the arclength of the
     step after the last point, 0 without points. ``about`` are further attributes of its file, ``extra`` further
     variables: orbits.
 

@@ -2,7 +2,7 @@
 
 All kinds of branches have the number and the kind of every point, and how the branch ended. A ``Format`` has what else
 a kind has: normal modes the ``POINT_VARIABLES`` of their orbits with the initial values (shooting) or the harmonics
-(condensed motions), curves of steady states the measures of ``spectra.responses``. Fields of different lengths are
+(harmonic balance), curves of steady states the measures of ``spectra.responses``. Fields of different lengths are
 padded. The table of a branch (CSV) has columns of the same variables (``TABLES``).
 """
 
@@ -18,7 +18,7 @@ import xarray as xr
 
 from vipetsc.endings import Ended, Ending
 from vipetsc.io.atomic import write_text
-from vipetsc.io.branch_kinds import CONDENSED, DAMPED, ORBITS, RESPONSES, kind_of_file
+from vipetsc.io.branch_kinds import BALANCE, DAMPED, ORBITS, RESPONSES, kind_of_file
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch, kinds_in, stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
@@ -40,7 +40,7 @@ OF_ALL = ("multiplier_max", "slope", *OF_LOSSES, "contacts", "region")
 TABLES = {
     ORBITS: {"x": "initial", "half_trace": "half_trace", "half_trace_imaginary": "half_trace_imaginary"},
     DAMPED: {"w": "elongation"},
-    CONDENSED: {"w": "elongation", "harmonics": "harmonics_kept", "truncation": "truncation"},
+    BALANCE: {"w": "elongation", "harmonics": "harmonics_kept", "truncation": "truncation"},
 }
 
 
@@ -234,21 +234,21 @@ def _orbits(data: xr.Dataset) -> list[Point]:
     return points
 
 
-def _condensed_variables(branch: Branch[Point]) -> Variables:
-    """Return harmonics of the elongations at contacts and springs, the *places*, and their tangents."""
+def _elongation_variables(branch: Branch[Point]) -> Variables:
+    """Return harmonics of the elongations at contacts and springs, the pairs, and their tangents."""
     points = branch.points
-    places = branch.dofs
-    harmonics = _padded([p.x.reshape(places, -1) for p in points], fill=0.0)
-    harmonics = harmonics.reshape(len(points), places, harmonics.shape[-1])
+    pairs = branch.dofs
+    harmonics = _padded([p.x.reshape(pairs, -1) for p in points], fill=0.0)
+    harmonics = harmonics.reshape(len(points), pairs, harmonics.shape[-1])
     # The first point of a branch that has gone no further has no tangent.
     directions = [p.tangent[:-1] if p.tangent.size else 0 * p.x for p in points]
-    tangent = _padded([d.reshape(places, -1) for d in directions], fill=0.0).reshape(harmonics.shape)
+    tangent = _padded([d.reshape(pairs, -1) for d in directions], fill=0.0).reshape(harmonics.shape)
 
     # Points of one branch differ in their number of harmonics, but all have odd ones alone or none does.
     orders = np.arange(harmonics.shape[-1])
-    if all(p.order % 2 and len(p.x) <= p.order // 2 * places + places for p in points):
+    if all(p.order % 2 and len(p.x) <= p.order // 2 * pairs + pairs for p in points):
         orders = 2 * orders + 1
-    axes = "point", "place", "order"
+    axes = "point", "pair", "order"
     return _nnm_variables(branch) | {
         "order": variable("order", orders, "1", "harmonic of the frequency"),
         "harmonics": variable(axes, harmonics, "m", "cosine of the elongation (of a contact, w)"),
@@ -262,8 +262,8 @@ def _balance_variables(branch: Branch[Point]) -> Variables:
     elongations = branch.column("elongations").astype(float).reshape(len(branch.points), branch.dofs)
     left_out = "estimated size of the neglected harmonics over that of the motion"
     return {
-        "place": variable("place", np.arange(1, branch.dofs + 1), "1", "contact, then smooth spring"),
-        "elongation": variable(("point", "place"), elongations, "m", "elongation at phase 0"),
+        "pair": variable("pair", np.arange(1, branch.dofs + 1), "1", "contact, then smooth spring"),
+        "elongation": variable(("point", "pair"), elongations, "m", "elongation at phase 0"),
         "harmonics_kept": variable("point", branch.column("order").astype(int), "1", "number of the last harmonic"),
         "truncation": variable("point", branch.column("truncation").astype(float), "1", left_out),
     }
@@ -306,8 +306,8 @@ def _damped_modes(data: xr.Dataset) -> list[Point]:
     return points
 
 
-def _condensed_motions(data: xr.Dataset) -> list[Point]:
-    """Return the condensed motions of a file."""
+def _elongation_motions(data: xr.Dataset) -> list[Point]:
+    """Return the motions by harmonic balance of a file."""
     points = []
     for i, fields in enumerate(_balance_fields(data)):
         count = int(np.count_nonzero(data["order"].values <= fields["order"]))
@@ -390,9 +390,7 @@ def stored_states(points: list[Point], cells: Sequence[int], u: np.ndarray) -> V
 
 FORMATS = {
     ORBITS: Format(("point", "tangent", "half_trace", "next_step"), "dof", _orbit_variables, _orbits),
-    CONDENSED: Format(
-        ("point", "harmonics", "tangent", "next_step"), "place", _condensed_variables, _condensed_motions
-    ),
-    DAMPED: Format(("point", "x", "tangent", "next_step"), "place", _damped_variables, _damped_modes),
+    BALANCE: Format(("point", "harmonics", "tangent", "next_step"), "pair", _elongation_variables, _elongation_motions),
+    DAMPED: Format(("point", "x", "tangent", "next_step"), "pair", _damped_variables, _damped_modes),
     RESPONSES: Format(("xi", "tangent", "next_step"), "site", _response_variables, _responses),
 }

@@ -45,8 +45,8 @@ from vipetsc.io.branch_kinds import DOWN
 from vipetsc.io.folder import Claim, claimed, provenance
 from vipetsc.io.kinds import BRANCHES
 from vipetsc.io.netcdf import root_attributes
+from vipetsc.modes.branches.balance import BalanceMethod
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.damped import DampedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
 from vipetsc.modes.branches.growth import Growth, Listener
@@ -67,8 +67,8 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
         return ResponseMethod
     if case.nnm.method == "damped":
         return DampedMethod
-    if case.condensed:
-        return CondensedMethod
+    if case.by_balance:
+        return BalanceMethod
     return ShootingMethod
 
 

@@ -25,10 +25,10 @@ from scipy.sparse import csr_matrix
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Contact
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import NoMotionError
 from vipetsc.modes.shooting import Shooting, sample_orbit
+from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import elongation_rows
 
 # Samples of an orbit's period are doubled between these numbers until the loss is that of half as many, to the fraction

@@ -30,7 +30,7 @@ from vipetsc.case.nfrc import NfrcCase, needs_modes
 from vipetsc.case.resolve import build_chain
 from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, spring_laws
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.stops import Stops
 
 
 class DrivenPoints(NamedTuple):

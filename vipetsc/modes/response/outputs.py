@@ -19,7 +19,7 @@ import numpy as np
 from vipetsc.case.nfrc import WALLS, NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonics import Episode
-from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.stops import Stops
 from vipetsc.spectra.measures import MOTIONS
 
 # Samples of the period, per harmonic, near the largest of which the largest value is looked for. A sample misses the

@@ -9,7 +9,7 @@ import numpy as np
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import needs_modes
 from vipetsc.case.nnm import NnmTable
-from vipetsc.io.branch_kinds import CONDENSED
+from vipetsc.io.branch_kinds import BALANCE
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
 from vipetsc.modes.balance.conservative import ConservativeMotions
@@ -61,10 +61,10 @@ def _condensed_lattice(case: NnmCase, chain: Chain) -> ConservativeMotions:
     return ConservativeMotions(WaveCompliance(chain), SiteForces(stops), case.nnm)
 
 
-class CondensedMethod(NnmMethod):
+class BalanceMethod(NnmMethod):
     """Branches of ``ConservativeMotions``."""
 
-    kind = CONDENSED
+    kind = BALANCE
 
     def __init__(self, case: NnmCase) -> None:
         super().__init__(case)
