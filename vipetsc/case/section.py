@@ -65,7 +65,7 @@ def is_within(key: str, paths: Iterable[str]) -> bool:
 class Section(BaseModel):
     """A table of a case file: strict types, no unknown keys, immutable; a number may be a text with a unit."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, defer_build=True)
 
     @classmethod
     def unit_of(cls, key: str, table: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from scipy.sparse import csc_matrix, diags
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Drive
+from vipetsc.lattice.inertia import count_below
 from vipetsc.lattice.sites import NO_SITES
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size has 128 MB
@@ -239,8 +240,6 @@ class _SpectrumCounter(NamedTuple):
 @lru_cache(maxsize=1)
 def _spectrum_counter(chain: Chain) -> _SpectrumCounter:
     """Return counter of a chain with ends, by the inertia of its band matrix; the bound is of Gershgorin's circles."""
-    from vipetsc.lattice.inertia import count_below  # numba, which takes long to import
-
     matrix = _scaled(chain)
     top = float(abs(matrix).sum(axis=0).max())
     with_room = _band(matrix)
