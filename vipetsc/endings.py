@@ -17,7 +17,7 @@ class Ending(Enum):
     BROKEN_OFF = "{reason}, at t = {time:.6g} s ({place}); last good sample: {good}"
     # Of branches that can go on, with more points or a change of the case.
     FAILED = "failed: {reason}"
-    POINTS_USED = "{points} points reached: increase {key} and resume to continue"
+    POINTS_USED = "{points} points reached: increase {key} and continue with --resume"
     # Of branches that have left their range.
     END_OF_RANGE = "reached the end of nfrc.range, {end:g}"
     END_OF_AMPLITUDES = "left the range of amplitudes by nfrc.isola_reach, at {end:g}"

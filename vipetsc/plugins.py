@@ -142,16 +142,39 @@ def is_file(name: str) -> bool:
 def located(name: str, folder: Path) -> str:
     """Return the ``name`` of a module, which for a file is its absolute path; a relative one begins at ``folder``.
 
-    If the file is not there, for instance since results have been moved, a file of that name in the working directory
-    takes its place.
+    If the file is not there, for instance since results have been moved, another file of that name takes its place: in
+    ``folder``, in the working directory, or the only one that this process has imported.
     """
     if not is_file(name):
         return name
     path = (folder / name).resolve()
-    here = Path(path.name).resolve()
-    if here.is_file() and not path.is_file():
-        return str(here)
+    if path.is_file():
+        return str(path)
+
+    for place in (folder, Path()):
+        moved = (place / path.name).resolve()
+        if moved.is_file():
+            return str(moved)
+    imported = [other for other in _PLUGINS if is_file(other) and Path(other).name == path.name]
+    if len(imported) == 1:
+        return imported[0]
     return str(path)
+
+
+def without_folders(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the ``table`` of a valid case in which files of modules have no folders: results are moved with them.
+
+    Files of one name in two folders keep their paths.
+    """
+    section = table.get("plugins")
+    if not isinstance(section, dict):
+        return table
+
+    modules = section.get("modules", [])
+    files = [Path(name).name for name in modules if is_file(name)]
+    short = {name: Path(name).name for name in modules if is_file(name) and files.count(Path(name).name) == 1}
+    sources = {short.get(name, name): source for name, source in section.get("sources", {}).items()}
+    return table | {"plugins": section | {"modules": [short.get(name, name) for name in modules], "sources": sources}}
 
 
 def load(name: str) -> Plugin:

@@ -15,6 +15,7 @@ import pytest
 
 from tests.manual_modules import CHAPTER, write_modules
 from vipetsc import Case, CaseError, Sweep, open, plugins, sweep
+from vipetsc.case import case_id
 from vipetsc.case.keys import json_schema
 from vipetsc.io.export import write_curves
 from vipetsc.lattice import Contact
@@ -216,13 +217,57 @@ def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
             assert Case.of(run.assign_attrs(case=text)).contacts.law == "hardening"
 
 
-def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkeypatch):
-    """If the recorded path of a module does not exist, a file of that name in the current folder is used."""
-    text = (out / "case.toml").read_text().replace(str(folder), "/elsewhere")
-    with pytest.raises(CaseError, match="there is no file /elsewhere/stops"):
-        Case.from_toml(text)
-    monkeypatch.chdir(folder)
-    assert Case.from_toml(text).plugins.modules[0] == str(folder / "stops.py")
+def test_a_module_that_was_moved_is_found(tmp_path, monkeypatch):
+    """A module whose file is gone is one beside the case file, in the current folder, or imported, in this order."""
+    beside, here, imported = places = [tmp_path / name for name in ("beside", "here", "imported")]
+    for place in places:
+        place.mkdir()
+        (place / "moved.py").write_text(
+            "from vipetsc import register\n"
+            "register.measure('of_moved', unit='1', text='one', power=0.0)(lambda record: 1.0)\n"
+        )
+    monkeypatch.chdir(here)
+    plugins.load(str(imported / "moved.py"))
+    for place in places:
+        assert plugins.located("/elsewhere/moved.py", beside) == str(place / "moved.py")
+        (place / "moved.py").unlink()
+    assert plugins.located("/elsewhere/never.py", beside) == "/elsewhere/never.py"
+
+
+def test_moved_results_are_continued(folder, out, tmp_path, in_process):
+    """A run that was moved with its case and modules is that of its case; names of members and runs do not change."""
+    old = edited_copy(out, tmp_path / "old", str(folder), "/elsewhere")
+    ended = in_process("run", folder / "case.toml", "--out", old, "--resume")
+    assert ended.returncode == 0, ended.stderr
+
+    case = Case.load(folder / "case.toml")
+    table = json.loads(json.dumps(case.model_dump(by_alias=True, exclude_none=True)).replace(str(folder), "/elsewhere"))
+    moved = case.model_copy(update={"plugins": type(case.plugins)(**table["plugins"])})
+    assert case_id(moved) == case_id(case)
+
+    plan = Sweep.from_table({**table, "plugins": case.plugins.model_dump(), "sweep": {"drive": {"amplitude": [1.0]}}})
+    assert plan.model_copy(update={"table": plan.table | {"plugins": table["plugins"]}}).ids() == plan.ids()
+
+
+def test_results_whose_law_is_gone_name_its_module(out, tmp_path, in_process, caplog):
+    """Verbs that read results name the module, and not the file of results; a measure's module is named once."""
+    gone = edited_copy(out, tmp_path / "gone", "/stops.py", "/gone.py")
+    for verb in ("plot", "analyse"):
+        ended = in_process(verb, gone)
+        assert ended.returncode == 2
+        assert "plugins.modules[1]" in ended.stderr and "/gone.py" in ended.stderr
+        assert "is not a run" not in ended.stderr
+
+    text = (out / "case.toml").read_text()
+    for folder in ("there", "elsewhere"):
+        Case.from_toml(re.sub(r"[^\"]*/durations.py", f"/{folder}/unheard.py", text))
+    assert len([line for line in caplog.messages if "unheard.py" in line]) == 1
+
+
+@pytest.mark.parametrize("key", ["plugins.sources={}", "plugins.sources.other=1"])
+def test_what_is_filled_in_cannot_be_set(folder, key):
+    with pytest.raises(CaseError, match=r"--set plugins\.sources.*filled in"):
+        Case.load(folder / "case.toml", [key])
 
 
 def test_names_are_those_of_the_modules_that_a_case_names(folder):

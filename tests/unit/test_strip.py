@@ -191,6 +191,13 @@ def run_table(places=(), **keys):
     return table
 
 
+def test_a_point_without_a_place_is_asked_for_cell_or_place():
+    table = run_table()
+    table["output"]["points"] = [{"name": "far"}]
+    with pytest.raises(CaseError, match=r"output.points\[1\].cell: missing; .*place"):
+        Case.from_table(table)
+
+
 def test_places_are_cells_and_masses():
     table = run_table(places=[[4, 1], [4, 5], [9, 3]], drive={})
     table["output"]["points"] = [{"name": "far", "place": [12, 5]}]

@@ -89,5 +89,6 @@ def test_a_closed_curve_that_is_resumed_ends_where_it_began(tmp_path):
 
     used_up, closed = curves
     assert used_up.ended.ending is Ending.POINTS_USED
+    assert "increase nfrc.points" in used_up.ended.sentence and "--resume" in used_up.ended.sentence
     assert closed.ended.ending is Ending.CLOSED
     assert closed.points[-1].xi.tolist() == closed.points[0].xi.tolist()

@@ -4,11 +4,13 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 """
 
 import hashlib
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+import tomli_w
 
 from vipetsc.case.case_file import CaseFile, Valid
 from vipetsc.case.contacts import check_joined, check_pairs, check_touching
@@ -40,6 +42,7 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
+from vipetsc.plugins import without_folders
 
 # The absolute tolerances are this fraction of the relative one times the drive's wave, so that waves weaker by this
 # factor are followed to the relative tolerance too: contacts that graze magnify their errors.
@@ -409,4 +412,7 @@ def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[P
 def case_id(case: Case) -> str:
     """Return the first 16 digits of the SHA-256 of the resolved case."""
     # 64 bits: among a million cases two have one id with a probability of 3e-8.
-    return hashlib.sha256(case.to_toml().encode()).hexdigest()[:16]
+    text = case.to_toml()
+    if case.plugins is not None:
+        text = tomli_w.dumps(without_folders(tomllib.loads(text)))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -161,6 +161,7 @@ class CaseFile(Section):
 
         if overrides:
             table, problems = with_overrides(table, overrides)
+            problems += _filled_in(overrides)
         # One file may have sections of several verbs. A dictionary keeps their order, which a message shows.
         valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}
         problems += [unknown_key(key, table[key], valid) for key in table if key not in valid]
@@ -195,7 +196,9 @@ class CaseFile(Section):
         if problems + wrong:
             raise CaseError(missing + problems + wrong, source)
         for problem in missing:
-            warn_once(f"{problem.value}: {problem.remedy}; its parts are left out")
+            # Without the folder: two files of moved results may name the module by its old and its new path.
+            file = Path(str(problem.value)).name
+            warn_once(f"{file}: {problem.remedy}; its parts are left out".replace(str(problem.value), file))
         return {"name": name, "plugins": plugins, **fields}
 
     @classmethod
@@ -278,6 +281,14 @@ def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
     # ``__subclasses__`` lists direct subclasses only; the case of ``predict`` derives from that of ``law``.
     for subclass in kind.__subclasses__():
         yield from _declared_sections(subclass)
+
+
+def _filled_in(overrides: Iterable[str]) -> Iterator[Problem]:
+    """Yield problems with ``overrides`` of what a resolved case records about its modules."""
+    for override in overrides:
+        key = override.partition("=")[0].strip()
+        if f"{key}.".startswith("plugins.sources."):
+            yield Problem(f"--set {key}", None, "is filled in from the modules; remove it")
 
 
 def _check_name(name: Any) -> Iterator[Problem]:

@@ -356,7 +356,10 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     if item["type"] == "missing":
         # pydantic reports the whole section as the input of a missing key.
-        return Problem(path, None, "missing; this key is needed here")
+        remedy = "missing; this key is needed here"
+        if item["loc"][-1] == "cell" and "place" in _section_at(kind, item["loc"][:-1]).model_fields:
+            remedy = "missing; give the cell, or on a strip the place"
+        return Problem(path, None, remedy)
     value = item["input"]
     details = item.get("ctx", {})
     for limit in ("ge", "gt", "le", "lt"):

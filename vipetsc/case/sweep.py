@@ -25,6 +25,7 @@ from vipetsc.case.section import CaseError, Problem, Section, described, unit_at
 from vipetsc.case.study import StudyCase
 from vipetsc.case.units import in_unit
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
+from vipetsc.plugins import without_folders
 from vipetsc.wording import counted, shortened
 
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together, at most. Each
@@ -147,7 +148,8 @@ class Sweep(StudyCase):
 
     def ids(self) -> list[str]:
         """Return a name for every member: a hash of the table and of its keys' values; equal members have one name."""
-        whole = hashlib.sha256(json.dumps(self.table, sort_keys=True, default=str).encode())
+        table = without_folders(self.table)
+        whole = hashlib.sha256(json.dumps(table, sort_keys=True, default=str).encode())
 
         def name(texts: Iterable[str]) -> str:
             digest = whole.copy()

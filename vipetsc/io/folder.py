@@ -26,6 +26,7 @@ from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.kinds import KINDS, ResultKind
 from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.parallel import on_root
+from vipetsc.plugins import without_folders
 from vipetsc.process import say
 from vipetsc.sources import source_key
 
@@ -212,8 +213,8 @@ def _problem(
     remedy = "replace it with --force, or choose another folder with --out"
     try:
         # Key by key: a reader cannot see in two files of a hundred lines which one has changed.
-        then = dict(_keys(tomllib.loads(earlier)))
-        now = dict(_keys(tomllib.loads(text)))
+        then = dict(_keys(without_folders(tomllib.loads(earlier))))
+        now = dict(_keys(without_folders(tomllib.loads(text))))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         return f"its {kind.marker} cannot be read ({error}); {remedy}"
 

@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-from vipetsc.case import Case, Sweep
+from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
@@ -111,8 +111,8 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
             with open_run(file) as run:
                 if not sweep or keeps_all(Case.of(run)):
                     yield MeasurableRun(file.parent, _containing_folder(file.parent), measures)
-        except FolderError:
-            # The message says which file, and why.
+        except (FolderError, CaseError):
+            # The message says which file or key, and why.
             raise
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None

@@ -337,8 +337,8 @@ def _measure_where_missing(folder: Path) -> None:
         raise FolderError(f"{folder}: contains no run.h5; give the folder of a finished run")
     try:
         measured = is_measured(folder)
-    except FolderError:
-        # The message says which file, and why.
+    except (FolderError, CaseError):
+        # The message says which file or key, and why.
         raise
     # OSError: no HDF5 file. ValueError or KeyError: a file of another program.
     except (OSError, ValueError, KeyError) as error:
