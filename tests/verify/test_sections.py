@@ -64,13 +64,14 @@ def test_the_impact_oscillator_has_its_motion_of_one_impact_a_period():
 
 
 @pytest.mark.parametrize("follow", ["up", "down"])
-def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, follow):
+def test_members_follow_one_another_in_the_order_of_their_values(tmp_path, capfd, follow):
     """The first run begins at rest, and each later one with the last state of the one before."""
     table = IMPACT | {"sweep": {"fields": True, "measures": ["motion"], "follow": follow, "drive": {
         "frequency": [2.4, 2.2, 2.3]}}}  # fmt: skip
     table["time"] = table["time"] | {"end": 20.0}
-    result = run_sweep(Sweep.from_table(table), tmp_path, MPI.COMM_SELF)
+    result = run_sweep(Sweep.from_table(table), tmp_path, MPI.COMM_SELF, progress=True)
     assert result.complete
+    assert "3 of 3 runs" in capfd.readouterr().err
 
     ends = {}
     for member, folder in whole_members(open_ensemble(tmp_path)):

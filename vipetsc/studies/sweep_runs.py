@@ -20,6 +20,7 @@ from vipetsc.io.read import open_run
 from vipetsc.io.records import Record
 from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
 from vipetsc.parallel import StopRequest, on_root
+from vipetsc.progress import Progress
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.linear_run import (
@@ -127,6 +128,10 @@ class SweepRuns:
             if missing:
                 left[self.ids[missing[-1]]] = missing
 
+        # One chain would be reported at its end alone: its runs are counted in its place.
+        is_one = len(left) == 1
+        runs = Progress(self.recorded.comm, len(wanted), "runs", show=progress and is_one)
+
         def make(key: Key) -> Record:
             members = left[key]
             while len(members) > 1:
@@ -134,6 +139,8 @@ class SweepRuns:
                 record = self._following_record(members[0])
                 record["cpu_seconds"] = round(time.process_time() - began, 4)
                 self.recorded.keep_part(self.ids[members.pop(0)], record, kind=MEMBER)
+                if is_one:
+                    runs.update(len(wanted) - len(members))
             return self._following_record(members[0])
 
         def fail(key: Key, reason: str) -> None:
@@ -141,8 +148,12 @@ class SweepRuns:
             for number in left[key]:
                 self.recorded.append(self.ids[number], {"reason": reason}, MEMBER)
 
+        shows_chains = progress and not is_one
         what = "chains of runs"
-        self.recorded.compute(left, make, kind=MEMBER, what=what, progress=progress, keep=False, fail=fail)
+        self.recorded.compute(left, make, kind=MEMBER, what=what, progress=shows_chains, keep=False, fail=fail)
+        if is_one:
+            runs.update(len(wanted))
+            runs.close()
         return len(wanted)
 
     def _following_record(self, number: int) -> Record:
