@@ -156,6 +156,10 @@ def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
     assert completed("vipetsc") >= set(VERBS)
     assert "case.toml" in completed("vipetsc", "run")
     assert completed("vipetsc", "completion") == {"bash", "zsh"}
+    assert {"drives", "gallery/chain"} <= completed("vipetsc", "manual")
+    assert {"three-mass", "gallery/strip"} <= completed("vipetsc", "examples")
+    assert {"spacetime", "poincare"} <= completed("vipetsc", "plot", "runs/x", "--fig")
+    assert {"drive.amplitude", "lattice.damping.mass", "nfrc.points"} <= completed("vipetsc", "run", "--set")
 
 
 def test_zsh_reads_its_completion(in_process):

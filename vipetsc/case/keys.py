@@ -109,6 +109,22 @@ def _schema_with_units(modules: Sequence[str] = ()) -> Schema:
     return about | {"properties": {"name": named} | sections, "$defs": classes}
 
 
+def key_paths() -> list[str]:
+    """Return the paths of all keys, such as "lattice.cells"; keys of tables in lists, which have numbers, left out."""
+    schema = _schema_with_units()
+    paths = []
+    # A class may contain itself: `above` are those around a key.
+    waiting = [("", schema, frozenset[str]())]
+    while waiting:
+        path, table, above = waiting.pop(0)
+        for key, item in table.get("properties", {}).items():
+            inner = {*_references(item, in_lists=False)} - above
+            if not inner:
+                paths.append(f"{path}{key}")
+            waiting += [(f"{path}{key}.", schema["$defs"][name], above | {name}) for name in sorted(inner)]
+    return list(dict.fromkeys(paths))
+
+
 def chapter() -> str:
     """Return the manual's chapter with a table of the keys of every section, those of tables within it below it."""
     schema = _schema_with_units()
@@ -155,16 +171,17 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
         yield from _section(where, reference, classes, shown)
 
 
-def _references(item: Any) -> Iterator[str]:
-    """Yield names of the classes that the schema of a key refers to."""
+def _references(item: Any, in_lists: bool = True) -> Iterator[str]:
+    """Yield names of the classes that the schema of a key refers to, those of items of lists among them if wanted."""
     if isinstance(item, dict):
         if "$ref" in item:
             yield item["$ref"].rpartition("/")[2]
-        for value in item.values():
-            yield from _references(value)
+        for key, value in item.items():
+            if in_lists or key != "items":
+                yield from _references(value, in_lists)
     elif isinstance(item, list):
         for value in item:
-            yield from _references(value)
+            yield from _references(value, in_lists)
 
 
 def _toml(value: Any) -> str:

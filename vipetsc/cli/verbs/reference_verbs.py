@@ -58,14 +58,36 @@ def schema_of(path: str | None) -> dict[str, Any]:
 
 
 def completion(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest) -> int:
-    """Print a script by which the shell completes verbs, options and files."""
+    """Print a script by which the shell completes verbs, options, files, topics, examples, figures and keys."""
     require("shtab", "completion")
+    echo(comm, on_root(comm, lambda: _completion_script(options)))
+    return DONE
+
+
+def _completion_script(options: argparse.Namespace) -> str:
+    """Return the script of ``options.shell``; its lists of words are those of this version."""
     import shtab
 
+    from vipetsc.case.keys import key_paths
+    from vipetsc.cli.verbs.examples_verb import shipped_examples
+    from vipetsc.figures.registry import FIGURES
+
     # Kinds of completion by the names and flags of arguments, the same for all verbs.
-    kinds = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
-    echo(comm, on_root(comm, lambda: shtab.complete(options.parser(kinds), options.shell)))
-    return DONE
+    kinds: dict[str, Any] = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
+    words = {
+        "topic": [*itertools.chain(*parts().values()), *studies()],
+        "name": [*shipped_examples()],
+        "--fig": [*FIGURES],
+        "--set": key_paths(),
+    }
+    functions: dict[str, list[str]] = {"bash": [], "zsh": []}
+    for argument_name, listed in words.items():
+        function = f"_vipetsc_{argument_name.strip('-')}_words"
+        kinds[argument_name] = dict.fromkeys(functions, function)
+        functions["bash"].append(f"{function}() {{ compgen -W '{' '.join(listed)}' -- \"$1\"; }}")
+        functions["zsh"].append(f"{function}() {{ compadd -- {' '.join(listed)}; }}")
+    preamble = {shell: "\n".join(lines) for shell, lines in functions.items()}
+    return str(shtab.complete(options.parser(kinds), options.shell, preamble=preamble))
 
 
 MANUAL = PlainVerb(
@@ -90,7 +112,7 @@ SCHEMA = PlainVerb(
 
 COMPLETION = PlainVerb(
     name="completion",
-    text="print a script with which a shell completes verbs, options and files",
+    text="print a script with which a shell completes verbs, options, files and names",
     example="completion bash > ~/.local/share/bash-completion/completions/vipetsc",
     arguments=(argument("shell", choices=("bash", "zsh"), help="the shell"),),
     function=completion,
