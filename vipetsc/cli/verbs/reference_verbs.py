@@ -86,7 +86,7 @@ def _completion_script(options: argparse.Namespace) -> str:
         kinds[argument_name] = dict.fromkeys(functions, function)
         functions["bash"].append(f"{function}() {{ compgen -W '{' '.join(listed)}' -- \"$1\"; }}")
         functions["zsh"].append(f"{function}() {{ compadd -- {' '.join(listed)}; }}")
-    preamble = {shell: "\n".join(lines) for shell, lines in functions.items()}
+    preamble = "\n".join(functions[options.shell])
     return str(shtab.complete(options.parser(kinds), options.shell, preamble=preamble))
 
 
