@@ -149,8 +149,8 @@ class Placing:
                 )
             rows = places.cells(self.shape, self.plane).tolist()
             if not rows:
-                cells = " x ".join(map(str, self.shape))
-                self.problems.append(Problem(key, None, f"no cell of the strip of {cells} cells has this pattern"))
+                size = " x ".join(map(str, self.shape))
+                self.problems.append(Problem(key, None, f"no cell of the strip of {size} cells has this pattern"))
         cells = [(i, j) for i, j in rows]
         if rows is places and len(set(cells)) < len(cells):
             twice = next(cell for cell in cells if cells.count(cell) > 1)
