@@ -109,7 +109,7 @@ POINTS_KEPT = "one swept number, members with their fields ([sweep] fields = tru
 BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
 # Words of warnings about histories and their amplitudes, which a picture of states once a period does not show.
-HISTORIES = "sample_interval", "steady amplitude"
+HISTORIES = "sample_interval", "steady amplitude", "of steady_"
 
 _SPECS = (
     # The figures of a run are listed by falling duration, so that ranks which share them end at about the same time.

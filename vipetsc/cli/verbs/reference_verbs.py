@@ -65,7 +65,7 @@ def completion(options: argparse.Namespace, comm: "MPI.Comm", stop: StopRequest)
 
 
 def _completion_script(options: argparse.Namespace) -> str:
-    """Return the script of ``options.shell``; its lists of words are those of this version."""
+    """Return the script of ``options.shell``; its lists of proposals are those of this version."""
     import shtab
 
     from vipetsc.case.keys import key_paths
@@ -74,14 +74,14 @@ def _completion_script(options: argparse.Namespace) -> str:
 
     # Kinds of completion by the names and flags of arguments, the same for all verbs.
     kinds: dict[str, Any] = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
-    words = {
+    proposals = {
         "topic": [*itertools.chain(*parts().values()), *studies()],
         "name": [*shipped_examples()],
         "--fig": [*FIGURES],
         "--set": key_paths(),
     }
     functions: dict[str, list[str]] = {"bash": [], "zsh": []}
-    for argument_name, listed in words.items():
+    for argument_name, listed in proposals.items():
         function = f"_vipetsc_{argument_name.strip('-')}_words"
         kinds[argument_name] = dict.fromkeys(functions, function)
         functions["bash"].append(f"{function}() {{ compgen -W '{' '.join(listed)}' -- \"$1\"; }}")
