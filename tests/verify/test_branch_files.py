@@ -56,7 +56,7 @@ def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False
     case = NnmCase.from_table(table)
     with pytest.MonkeyPatch.context() as patch:
         if saves_all:
-            patch.setattr("vipetsc.modes.branches.growth.SAVE_EVERY", 0.0)
+            patch.setattr("vipetsc.modes.branches.follow.SAVE_EVERY", 0.0)
         return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
 
 

@@ -25,7 +25,7 @@ from hypothesis.stateful import RuleBasedStateMachine, rule
 from tests.faults.scenarios import difference
 from tests.models import KERSCHEN
 from vipetsc.case import NnmCase
-from vipetsc.modes.branches import growth
+from vipetsc.modes.branches import follow as following
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.problem import FlowError
@@ -62,8 +62,8 @@ def miss(problem: Any, left: Any, right: Any, missed: list[str], **options: Any)
 def follow(points: int, folder: Path, listener: Any = None, stop: StopRequest | None = None) -> None:
     """Follow the branches of at most so many ``points``, whose files are written after every point."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(growth, "SAVE_EVERY", 0.0)
-        patch.setattr(growth, "locate", miss)
+        patch.setattr(following, "SAVE_EVERY", 0.0)
+        patch.setattr(following, "locate", miss)
         follow_all(case_of(points), folder, MPI.COMM_SELF, resume=True, listener=listener, stop=stop)
 
 

@@ -17,8 +17,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.endings import Ending
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
-from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.growth import Listener
+from vipetsc.modes.branches.follow import Listener, follow_all
 from vipetsc.parallel import StopRequest
 
 

@@ -5,10 +5,11 @@ and frequency change, or a nonlinear frequency response curve (NFRC), whose para
 another key of the case. Its *points* are single motions. Those of the continuation are regular, and their ``index``
 counts the steps from the start, which has 0; *special* points lie between them, where something changes: a fold of the
 energy or of the frequency, a change of stability, a contact that grazes. A ``Method`` gives the equations of a case's
-branches and their starts, and ``Growth`` continues a branch from one motion to its end. This module says from which
-motions, and keeps the files. A step of the length s solves H(xi) = 0 with t . (xi - xi_0) = s for the unknowns xi of
-the next point, with those of the last one, xi_0, and the unit tangent t of the branch there; charts, which scale the
-unknowns, are explained with it in ``vipetsc.modes.continuation.arclength``.
+branches and their starts, ``Continuation`` makes the steps. Around it each regular point is *assessed*
+(``Method.assess`` adds the quantities of its file that continuation does not need), compared with all earlier ones by
+the method's *monitor*, shown to a listener, and written from time to time. A step of the length s solves H(xi) = 0 with
+t . (xi - xi_0) = s for the unknowns xi of the next point, with those of the last one, xi_0, and the unit tangent t of
+the branch there; charts, which scale the unknowns, are explained with it in ``vipetsc.modes.continuation.arclength``.
 
 **Directions.** An NNM that is followed both ways from its start makes two branches: ``<name>`` towards larger energies
 and ``<name>-down`` towards smaller ones. Both begin with the start.
@@ -29,6 +30,7 @@ raise errors and signals there (chapter `trust` of the manual).
 
 import logging
 import sys
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -49,16 +51,22 @@ from vipetsc.modes.branches.balance import BalanceMethod
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.damped import DampedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
-from vipetsc.modes.branches.growth import Growth, Listener
-from vipetsc.modes.branches.method import CrossingBranch, Method
+from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.continuation.arclength import Continuation, StepRule, locate
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.shared_frequencies import check_modes_alone
 from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.sources import source_key
 
 logger = logging.getLogger(__name__)
+# Seconds between two writings of a growing branch: what a kill may lose.
+SAVE_EVERY = 10.0
+
 BranchCase = NnmCase | NfrcCase
+Listener = Callable[[Branch[Any], Any], None]
+RuleOf = Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]]
 
 
 def method_of(case: BranchCase) -> type[Method[Any]]:
@@ -94,7 +102,7 @@ class Follower:
         self.stop = stop or StopRequest()
         self.resume = resume
         self.method: Method[Any] = method_of(case)(case)
-        self.growth = Growth(self.method, self.write, listener, self.stop)
+        self.listener = listener
 
     def follow(self, job: int) -> list[Branch[Any]]:
         """Return the branches of a ``job``, one for each direction, each with those that cross it, if asked for.
@@ -147,11 +155,124 @@ class Follower:
             else:
                 with problem.stopped_by(self.stop):
                     start = method.start(problem, job, self.stop)
-            self.growth.run(branch, problem, start, method.rule, direction)
+            self._grow(branch, problem, start, method.rule, direction)
         finally:
             # Runs may begin with the states in the file: a branch that was stopped or failed has them, too.
             if branch.points and (self.folder or not method.finishes_files_alone):
                 method.finish(problem, branch)
+
+    def _grow(
+        self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any, rule_of: RuleOf, direction: int = 1
+    ) -> None:
+        """Continue ``branch`` from the motion ``start`` until it ends, and set how it ``ended``.
+
+        Special points are located between the regular ones.
+
+        ``rule_of(problem, start, done)`` gives the steps and the end of a branch that has ``done`` regular points after
+        its start. A ``start`` with a tangent is continued along it. From one without, a branch goes towards growing
+        energy (of an NFRC, its parameter) if the ``direction`` is 1, towards falling energy if it is -1.
+
+        Raises ContinuationError, FlowError or another of the method's ``failures`` if it cannot go on, StoppedError
+        on request; the branch holds the points so far.
+        """
+        regular = branch.regular()
+        # Points of an earlier run count against the number that a branch may have; its start does not.
+        done = max(len(regular) - 1, 0)
+        # A closed curve ends where it began, also if it is resumed elsewhere.
+        first = start
+        if regular:
+            first = regular[0]
+        rule = rule_of(problem, first, done)
+        # The ending of a branch that has used up its points tells their number as its case counts them.
+        counted = done + int(self.method.counts_start)
+        # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
+        continuation = Continuation(
+            problem, start, rule, direction, step=branch.next_step or None, points_before=counted
+        )
+        monitor = self.method.monitor(problem)
+        # The monitor compares each point with all earlier ones, to see whether the branch retraces itself or returns to
+        # the linear mode. A resumed branch must be judged as one that was not interrupted: that one began without
+        # points, so that its monitor has not seen the start.
+        for point in regular[1:]:
+            monitor(point)
+        if not branch.points:
+            branch.points = [self.method.assess(problem, continuation.point)]
+
+        try:
+            with problem.stopped_by(self.stop):
+                seen = self._steps(branch, problem, continuation, rule.chart, monitor)
+        except StoppedError:
+            # A step in which the branch was stopped is left out, and repeated by a resumed branch.
+            self.write(branch)
+            last = branch.regular()[-1]
+            stopped = Ending.STOPPED.with_numbers(where=f"after point {last.index}; continue with --resume")
+            raise StoppedError(stopped.sentence) from None
+        branch.ended = seen or continuation.ended
+
+    def _steps(
+        self,
+        branch: Branch[Any],
+        problem: PeriodicProblem[Any],
+        continuation: Continuation[Any],
+        chart: str,
+        monitor: Monitor[Any],
+    ) -> Ended | None:
+        """Add all points to the ``branch``; returns its ending if the ``monitor`` has ended it, else None.
+
+        ``chart`` is the name of the unknowns in which steps are taken (``Continuation``).
+        """
+        last = continuation.point
+        chosen = self.method.chosen(problem)
+        # A special point between the newest two points may need the direction of the one before them.
+        one_before_last = None
+        regular = branch.regular()
+        if len(regular) > 1:
+            one_before_last = regular[-2]
+
+        saved = time.monotonic()
+        for point in continuation:
+            sys.audit("vipetsc.step")
+            special: list[Any] = []
+            missed: list[str] = []
+            if self.method.locates:
+                special = locate(
+                    problem,
+                    left=last,
+                    # The end of the step itself. It is ``point``, unless the rule has moved that back to the end of a
+                    # range: special points of the whole step are wanted.
+                    right=continuation.passed,
+                    chart=chart,
+                    grazing=self.method.locates_grazing,
+                    before=one_before_last,
+                    missed=missed,
+                    chosen=chosen,
+                )
+
+            # As in regular points, ``next_step`` is that of the step after the one that found them.
+            special = [replace(p, next_step=point.next_step) for p in special]
+            new_points = [self.method.assess(problem, p) for p in [*special, point]]
+            # A step is taken as a whole, or not at all where an assessment fails: a resumed branch repeats the step.
+            branch.findings += missed
+            branch.points += new_points
+            assessed = new_points[-1]
+            branch.next_step = continuation.step
+            if self.listener is not None:
+                self.listener(branch, assessed)
+            ended = monitor(assessed)
+            if ended is not None:
+                branch.findings.append(ended.sentence)
+                return ended
+
+            if self.stop.requested and not continuation.finished:
+                raise StoppedError
+            is_due = time.monotonic() - saved > SAVE_EVERY
+            # A branch that has ended is written later, as complete: after a kill it would go on beyond its end.
+            if is_due and not continuation.finished:
+                self.write(branch)
+                saved = time.monotonic()
+            one_before_last = last
+            last = point
+        return None
 
     def _stored_or_new(self, name: str) -> Branch[Any]:
         """Return the branch of that ``name`` as it is in its file when results are resumed, else one without points.
@@ -201,7 +322,7 @@ class Follower:
         problem, start = crossing.start()
         if branch.points:
             start = branch.regular()[-1]
-        self.growth.run(branch, problem, start, crossing.rule)
+        self._grow(branch, problem, start, crossing.rule)
 
 
 def claim_branches(
