@@ -1,4 +1,4 @@
-"""Faults of a figure's text: outside the page, over other text, too few labels on an axis, panels without a letter."""
+"""Faults of a figure's text: outside the page, over other text, too few labels, panels without letters, legends."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 OVERLAP = 2  # pixels that boxes of text may have in common: a box is higher than the letters in it
@@ -17,7 +18,7 @@ FEWEST = 3  # labels of a logarithmic axis: with fewer the values between them c
 
 def complaints(figure: Figure) -> list[str]:
     """Return a sentence for each fault of the text in a laid-out figure."""
-    return [*_texts(figure), *_logarithmic_axes(figure), *_letters(figure)]
+    return [*_texts(figure), *_logarithmic_axes(figure), *_letters(figure), *_legends(figure)]
 
 
 def _texts(figure: Figure) -> Iterator[str]:
@@ -75,6 +76,13 @@ def _letters(figure: Figure) -> Iterator[str]:
     for axes in shown:
         if len(shown) > 1 and axes.figure not in together and not axes.get_title("left").startswith("("):
             yield f"no letter: {axes.get_title('left')!r}, {axes.get_ylabel()!r}"
+
+
+def _legends(figure: Figure) -> Iterator[str]:
+    """Yield a sentence for each entry that a legend has twice."""
+    for legend in figure.findobj(Legend):
+        entries = [text.get_text() for text in legend.get_texts()]
+        yield from (f"twice in a legend: {entry!r}" for entry in set(entries) if entries.count(entry) > 1)
 
 
 def _on_one_place(axes: Axes, other: Axes) -> bool:

@@ -1,4 +1,4 @@
-"""The curve of a branch as it is drawn: smooth through its points, coloured by stability; its lowest states.
+"""The curve of a branch as it is drawn: smooth through its points, coloured by stability; lowest states, losses.
 
 A branch is a curve of periodic motions over their energy E (J) and frequency f (Hz), in the order in which it was
 followed: several points may have one energy. The file has its tangent as dT/ds, of the period T, and the slope df/dE.
@@ -11,10 +11,15 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from vipetsc.figures import style
+from vipetsc.figures.panels import annotate_empty
 
 # Points of the curve drawn for each step of a branch. A step turns by about 0.2 rad at most (``nnm.guards``): the
 # corners between its eight chords are 0.025 rad, which no eye sees.
 FINE = 8
+# Room above and below the curve of the damping ratio: this fraction of its range, and at least this fraction of its
+# largest value, since without contact the ratio is constant but for rounding.
+ROOM = 0.1
+LEAST_ROOM = 0.1
 
 
 def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -126,3 +131,32 @@ def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
         if is_part.any():
             look = {"lw": 1.3 * width, "zorder": 3, "label": label, **style.CURVES[label]}
             axes.plot(energy, np.where(is_part, frequency, np.nan), **look)
+
+
+def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
+    """Draw the damping ratio of a ``branch`` over the energy (J), and the force in resonance (N) on an axis of its own.
+
+    The force is that of the drive that makes up for the losses, if the file has it.
+    """
+    if "damping_ratio" not in branch:
+        annotate_empty(axes, "nothing dissipates")
+        return
+    energy = branch["energy"].values
+    # A curve of one point is no line.
+    marker = "." if len(energy) == 1 else ""
+
+    ratio = branch["damping_ratio"].values
+    axes.plot(energy, ratio, lw=1.0, marker=marker, label="damping ratio", **style.CURVES["damping_ratio"])
+    axes.set(xscale="log", ylabel="damping ratio")
+    room = max(ROOM * float(np.ptp(ratio)), LEAST_ROOM * float(ratio.max()))
+    if np.isfinite(room) and room > 0:
+        axes.set_ylim(ratio.min() - room, ratio.max() + room)
+    if "force" not in branch or not np.isfinite(branch["force"].values).any():
+        return
+
+    force_axes = axes.twinx()
+    force_axes.plot(energy, branch["force"].values, lw=1.0, marker=marker, **style.CURVES["force"])
+    force_axes.set(yscale="log", ylabel="force in resonance (N)")
+    # An empty curve for the legend, which is one for both axes.
+    axes.plot([], [], lw=1.0, label="force", **style.CURVES["force"])
+    axes.legend(fontsize=5.5)

@@ -11,10 +11,10 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
-from vipetsc.figures.branch_curves import draw_branch
-from vipetsc.figures.branch_losses import draw_losses
+from vipetsc.figures.branch_curves import draw_branch, draw_losses
 from vipetsc.figures.frequency_energy import MARKS
-from vipetsc.figures.panels import annotate_empty, label_panels
+from vipetsc.figures.page import Page
+from vipetsc.figures.panels import annotate_empty
 from vipetsc.io.branch_kinds import kind_names
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import wave_bands
@@ -42,9 +42,8 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     columns = 3
     if any("damping_ratio" in branch for branch in branches):
         columns = 4
-    figure = style.new_figure(style.PAGE, 2.5 * len(branches))
-    grid = figure.subplots(len(branches), columns, squeeze=False)
-    for (frequency, elongation, *losses, motions), branch in zip(grid, branches, strict=True):
+    page = Page.of(len(branches), columns, height=2.5 * len(branches))
+    for (frequency, elongation, *losses, motions), branch in zip(page.grid, branches, strict=True):
         case = NnmCase.from_toml(branch.attrs["case"])
         # A user-defined system has neither cells nor pass bands.
         is_lattice = case.nnm.system == "condensed"
@@ -67,8 +66,7 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
             _draw_over_cells(motions, branch)
         else:
             _draw_over_masses(motions, branch)
-    label_panels(grid)
-    return figure
+    return page.lettered()
 
 
 def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:

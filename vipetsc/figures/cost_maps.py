@@ -14,7 +14,8 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import KAPPA, colour_bar, draw_map, label_panels
+from vipetsc.figures.page import Page
+from vipetsc.figures.panels import KAPPA, colour_bar, draw_map
 
 WEIGHTED = 2  # index of the weighted cost along the dimension ``cost``
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -31,8 +32,8 @@ def deflections(search: xr.Dataset) -> Figure:
     """Draw Bloch displacements of the masses and the resonator's deflection on each band at the weighted optimum."""
     optimum = search.isel(cost=WEIGHTED)
     kappa = search["wavenumber"].values / np.pi
-    figure, grid = _grid(search, columns=search.sizes["band"], margin=1.1, height=1.55, xlabel=KAPPA)
-    for (i, j), axes in np.ndenumerate(grid):
+    page = _page(search, columns=search.sizes["band"], margin=0.9, height=1.55, xlabel=KAPPA, legend=1)
+    for (i, j), axes in np.ndenumerate(page.grid):
         cell = optimum.isel(reading=i, band=j)
         deflection = cell["optimum_deflection"].values
         amplitude = cell["optimum_amplitude"].values.copy()
@@ -50,12 +51,10 @@ def deflections(search: xr.Dataset) -> Figure:
             best = f"λ = {cell['optimum_lambda'].item():.3g}, η = {cell['optimum_eta'].item():.3g}"
             axes.set_ylabel(f"{cell['reading'].item().capitalize()}\n{best}\n|u| (unit norm)")
 
-    label_panels(grid)
-    grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
-    # Room above the panels for the legend, which constrained layout does not place outside the grid.
-    figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.22 / figure.get_figheight()))
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper center", ncols=5)
-    return figure
+    page.panels[0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
+    handles, labels = page.panels[0].get_legend_handles_labels()
+    page.write_legend(handles, labels, columns=5)
+    return page.lettered()
 
 
 def cost_maps(search: xr.Dataset) -> Figure:
@@ -64,8 +63,8 @@ def cost_maps(search: xr.Dataset) -> Figure:
     Cells whose host and resonator are not out of phase all along the second band are veiled.
     """
     xlabel = "λ  (pale: $u_2$ and $u_3$ are not out of phase throughout band 2)"
-    figure, grid = _grid(search, columns=search.sizes["cost"], margin=0.6, height=2.1, xlabel=xlabel)
-    for (i, j), axes in np.ndenumerate(grid):
+    page = _page(search, columns=search.sizes["cost"], margin=0.6, height=2.1, xlabel=xlabel)
+    for (i, j), axes in np.ndenumerate(page.grid):
         result = search.isel(reading=i, cost=j)
         cost = str(result["cost"].item())
         _draw_cost(axes, result, cost)
@@ -79,8 +78,7 @@ def cost_maps(search: xr.Dataset) -> Figure:
 
         if j == 0:
             axes.set_ylabel(f"{result['reading'].item().capitalize()}\nη")
-    label_panels(grid)
-    return figure
+    return page.lettered()
 
 
 def _draw_cost(axes: Axes, result: xr.Dataset, cost: str) -> None:
@@ -123,8 +121,8 @@ def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
     shades = ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.93, 256)))
     colours = mpl.cm.ScalarMappable(Normalize(values[0], values[-1]), shades)
     # Each row has limits of its own, those for the best cell of its reading.
-    figure, grid = _grid(search, columns=3, margin=0.6, height=2.0, xlabel=KAPPA, sharey="row")
-    for i, row in enumerate(grid):
+    page = _page(search, columns=3, margin=0.6, height=2.0, xlabel=KAPPA, sharey="row")
+    for i, row in enumerate(page.grid):
         result = search.isel(reading=i)
         best = _best_cell(result)
         last = search.sizes[other] - 1
@@ -144,10 +142,9 @@ def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
                 axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", fontsize=6.5)
         row[0].set(ylabel=f"{result['reading'].item().capitalize()}\nω (krad/s)", ylim=(0, top))
 
-    label_panels(grid)
-    grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
-    colour_bar(colours, grid, SYMBOLS[along], extend="neither")
-    return figure
+    page.panels[0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
+    colour_bar(colours, page.grid, SYMBOLS[along], extend="neither")
+    return page.lettered()
 
 
 def _best_cell(result: xr.Dataset) -> dict[str, int]:
@@ -158,15 +155,21 @@ def _best_cell(result: xr.Dataset) -> dict[str, int]:
     return {name: int(np.abs(result[name].values - value).argmin()) for name, value in optimum.items()}
 
 
-def _grid(
-    search: xr.Dataset, columns: int, margin: float, height: float, xlabel: str, sharey: bool | str = True
-) -> tuple[Figure, np.ndarray]:
-    """Return a page with a row of panels (row, column), ``height`` inches high, for every reading.
+def _page(
+    search: xr.Dataset,
+    columns: int,
+    margin: float,
+    height: float,
+    xlabel: str,
+    sharey: bool | str = True,
+    legend: int = 0,
+) -> Page:
+    """Return a page with a row of panels, ``height`` inches high, for every reading.
 
     ``margin`` in inches is room for what stands above and below all, such as ``xlabel``; ``sharey`` is that of
-    ``Figure.subplots``.
+    ``Figure.subplots``, ``legend`` the number of its lines.
     """
     rows = search.sizes["reading"]
-    figure = style.new_figure(style.PAGE, margin + height * rows)
-    figure.supxlabel(xlabel)
-    return figure, figure.subplots(rows, columns, sharex=True, sharey=sharey, squeeze=False)
+    page = Page.of(rows, columns, height=margin + height * rows, legend=legend, sharex=True, sharey=sharey)
+    page.body.supxlabel(xlabel)
+    return page

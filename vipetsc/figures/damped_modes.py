@@ -5,8 +5,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from vipetsc.figures import panels, style
+from vipetsc.figures import style
 from vipetsc.figures.frequency_energy import HOLLOW, MARKS
+from vipetsc.figures.page import Page
 from vipetsc.io.branch_kinds import kind_names
 from vipetsc.io.netcdf import open_netcdf
 
@@ -18,9 +19,8 @@ def damped_modes(paths: Sequence[Path]) -> Figure:
         with open_netcdf(path, "branch", ("energy", "frequency", "damping_ratio", "kind")) as file:
             branches.append(file.load())
 
-    figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 3.6)
-    columns = figure.subplots(2, len(branches), sharex="col", squeeze=False).T
-    for column, branch in zip(columns, branches, strict=True):
+    page = Page.of(2, len(branches), height=3.6, sharex="col")
+    for column, branch in zip(page.grid.T, branches, strict=True):
         energy = branch["energy"].values
         kinds = kind_names(branch)
         for axes, name in zip(column, ("frequency", "damping_ratio"), strict=True):
@@ -38,5 +38,4 @@ def damped_modes(paths: Sequence[Path]) -> Figure:
         column[1].set(xlabel="mean energy (J)", ylabel="damping ratio")
         if column[0].get_legend_handles_labels()[0]:
             column[0].legend(fontsize=6, loc="best")
-    panels.label_panels(columns.T)
-    return figure
+    return page.lettered()

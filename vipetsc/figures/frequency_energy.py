@@ -26,9 +26,9 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from vipetsc.figures import style
-from vipetsc.figures.branch_curves import draw_branch, lowest, smooth
-from vipetsc.figures.branch_losses import draw_losses
-from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
+from vipetsc.figures.branch_curves import draw_branch, draw_losses, lowest, smooth
+from vipetsc.figures.page import ROMAN
+from vipetsc.figures.panels import REGIONS, annotate_empty, note, shade_regions
 from vipetsc.io.branch_kinds import CHOSEN, DOWN, kind_names
 from vipetsc.io.netcdf import open_netcdf
 

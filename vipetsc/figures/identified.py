@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page
 from vipetsc.figures.series import Series
 from vipetsc.figures.style import NoPicture
 
@@ -28,9 +29,8 @@ def record_and_model(identified: xr.Dataset) -> Figure:
     Grey is one standard deviation of the noise; p is the probability that white noise is that much correlated.
     """
     count = min(identified.sizes["channel"], MOST_CHANNELS)
-    figure = style.new_figure(style.PAGE, 1.9 * count)
-    rows = figure.subplots(count, 2, squeeze=False, width_ratios=(3, 2))
-    for number, (motion, residual) in enumerate(rows):
+    page = Page.of(count, 2, height=1.9 * count, width_ratios=(3, 2))
+    for number, (motion, residual) in enumerate(page.grid):
         channel = identified.isel(channel=number)
         chosen = identified["data/channel"].values == number
         time = 1e3 * identified["data/time"].values[chosen]
@@ -47,10 +47,9 @@ def record_and_model(identified: xr.Dataset) -> Figure:
         residual.plot(time, measured - model, ".", ms=2, **style.CURVES["residual"])
         probability = float(channel["channels/probability"])
         residual.set(xlabel="Time (ms)", ylabel=f"({unit})", title=f"Measured - model; white: p = {probability:.2g}")
-    rows[0, 0].legend(loc="best", fontsize=6)
-    panels.label_panels(rows)
-    _note_channels(figure, identified)
-    return figure
+    page.panels[0].legend(loc="best", fontsize=6)
+    _note_channels(page.figure, identified)
+    return page.lettered()
 
 
 def _note_channels(figure: Figure, identified: xr.Dataset) -> None:
@@ -63,9 +62,8 @@ def _note_channels(figure: Figure, identified: xr.Dataset) -> None:
 def residual_correlations(identified: xr.Dataset) -> Figure:
     """Draw the autocorrelation of every channel's residuals with the bounds of white noise."""
     count = min(identified.sizes["channel"], MOST_CHANNELS)
-    figure = style.new_figure(style.PAGE, 2.4)
-    axes = figure.subplots(1, count, squeeze=False, sharey=True)[0]
-    for number, panel in enumerate(axes):
+    page = Page.of(columns=count, width=style.PAGE, height=2.4, sharey=True)
+    for number, panel in enumerate(page.panels):
         chosen = identified["data/channel"].values == number
         residuals = identified["data/measured"].values[chosen] - identified["data/model"].values[chosen]
         # Without their mean, which would make the values at all lags alike and hide what varies.
@@ -82,10 +80,9 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
         panel.vlines(lags, 0, values, color=style.BLUE, lw=0.8)
         panel.set(xlabel="lag (samples)", title=str(identified["channel"].values[number]))
 
-    axes[0].set_ylabel("autocorrelation of residuals")
-    panels.label_panels(axes)
-    _note_channels(figure, identified)
-    return figure
+    page.panels[0].set_ylabel("autocorrelation of residuals")
+    _note_channels(page.figure, identified)
+    return page.lettered()
 
 
 def misfit_profiles(identified: xr.Dataset) -> Figure:
@@ -99,15 +96,10 @@ def misfit_profiles(identified: xr.Dataset) -> Figure:
     count = identified.sizes["parameter"]
     columns = min(count, 4)
     rows = -(-count // columns)
-    figure = style.new_figure(style.PAGE, 1.7 * rows + 0.4)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for number, axes in enumerate(grid):
-        if number >= count:
-            axes.set_axis_off()
-            continue
+    page = Page.of(rows, columns, width=style.PAGE, height=1.7 * rows + 0.4, count=count)
+    for number, axes in enumerate(page.panels):
         _draw_profile(axes, identified.isel(parameter=number))
-    panels.label_panels(grid[:count])
-    return figure
+    return page.lettered()
 
 
 def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
@@ -141,8 +133,8 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
     """
     names = identified["parameter"].values
     count = len(names)
-    figure = style.new_figure(style.PAGE, 3.2)
-    matrix, directions = figure.subplots(1, 2)
+    page = Page.of(columns=2, height=3.2)
+    matrix, directions = page.panels
     shown = matrix.imshow(identified["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
     size = 6
     if count > MOST_NAMES:
@@ -150,7 +142,7 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
     matrix.set_xticks(np.arange(count), names, rotation=90, fontsize=size)
     matrix.set_yticks(np.arange(count), names, fontsize=size)
     matrix.set_title("Correlation of the errors")
-    figure.colorbar(shown, ax=matrix, shrink=0.8)
+    page.figure.colorbar(shown, ax=matrix, shrink=0.8)
     if count <= MOST_NAMES:
         for row, column in np.ndindex(count, count):
             value = float(identified["correlation"].values[row, column])
@@ -163,8 +155,7 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
     directions.axhline(DETERMINED, color=style.GREY, lw=0.7, ls=style.DASHED)
     directions.xaxis.set_major_locator(MaxNLocator(integer=True))
     directions.set(xlabel="direction", ylabel="relative error along it", title="Dashed: no longer determined")
-    panels.label_panels([matrix, directions])
-    return figure
+    return page.lettered()
 
 
 def growing_windows(identified: xr.Dataset) -> Figure:
@@ -176,11 +167,8 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     """
     plan = IdentifyCase.of(identified)
     valley = identified["starts/valley"].values
-    columns = 2
-    if len(valley) > 1:
-        columns = 3
-    figure = style.new_figure(style.PAGE, 2.6)
-    misfit, course, *starts = figure.subplots(1, columns)
+    page = Page.of(columns=2 + (len(valley) > 1), height=2.6)
+    misfit, course, *starts = page.panels
     windows = identified["window"].values
     misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     # Room for these numbers.
@@ -213,8 +201,7 @@ def growing_windows(identified: xr.Dataset) -> Figure:
             title += f", {failed} failed"
         axes.set(xlabel="valley", ylabel="deviance - least", title=title)
         _count_along(axes, valley)
-    panels.label_panels([misfit, course, *starts])
-    return figure
+    return page.lettered()
 
 
 def _count_along(axes: Axes, numbers: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page
 from vipetsc.figures.style import NoPicture
 from vipetsc.io.read import field_time
 
@@ -90,8 +91,9 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if not has_rows:
         every = -(-len(episodes.cells) // MOST_LABELS)
 
-    figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(episodes.cells), 4.5))
-    raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
+    height = min(1.3 + 0.24 * len(episodes.cells), 4.5)
+    page = Page.of(columns=2, height=height, sharey=True, width_ratios=(4, 1))
+    raster, bars = page.panels
     if has_indentation:
         _draw_indentation(raster, run, model)
     elif has_rows:
@@ -105,7 +107,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     raster.set_ylabel(f"Contact site ({panels.sites_title(run)})")
     force = np.abs(run["impacts/force"].values) if are_pressed else None
     _draw_bars(bars, episodes, has_rows, force)
-    return figure
+    return page.lettered()
 
 
 def _draw_indentation(axes: Axes, run: xr.Dataset, model: Model) -> None:
@@ -113,7 +115,7 @@ def _draw_indentation(axes: Axes, run: xr.Dataset, model: Model) -> None:
     depth = panels.indentations(run, model)
     rows = np.arange(1, len(depth) + 1)
     image = panels.draw_map(axes, field_time(run), rows, depth, panels.log_norm(depth, decades=3))
-    axes.set_title("(a) Indentation")
+    axes.set_title("Indentation")
     panels.colour_bar(image, axes, "Indentation (m)")
 
 
@@ -128,7 +130,7 @@ def _draw_markers(axes: Axes, episodes: Episodes) -> None:
         image = axes.scatter(episodes.onset[at], heights, 14, episodes.speed[at], **look)
     axes.grid(axis="y", color=style.PALE, lw=0.5)
     axes.set_axisbelow(True)
-    axes.set_title(f"(a) {len(episodes.site)} contact episodes (▲ positive side, ▼ negative side)")
+    axes.set_title(f"{len(episodes.site)} contact episodes (▲ positive side, ▼ negative side)")
     panels.colour_bar(image, axes, "Approach speed (m/s)")
 
 
@@ -148,7 +150,7 @@ def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
     extent = (begin, end, 0.5, 0.5 + sites_per_row * rows)
     norm = panels.log_norm(episodes.speed, decades=2)
     image = axes.imshow(largest, extent=extent, norm=norm, cmap=SPEEDS)
-    axes.set_title(f"(a) {len(episodes.site)} contact episodes")
+    axes.set_title(f"{len(episodes.site)} contact episodes")
     panels.colour_bar(image, axes, "Largest approach speed (m/s)")
 
 
@@ -161,13 +163,13 @@ def _draw_bars(axes: Axes, episodes: Episodes, has_rows: bool, force: np.ndarray
     if force is not None:
         length = np.zeros(sites)
         np.fmax.at(length, episodes.site_index, force)
-        axes.set(title="(b) Largest force", xlabel="Force (N)")
+        axes.set(title="Largest force", xlabel="Force (N)")
     elif loss.any():
         length = loss
-        axes.set(title="(b) Loss, episodes" if has_rows else "(b) Loss", xlabel="Energy lost (J)")
+        axes.set(title="Loss, episodes" if has_rows else "Loss", xlabel="Energy lost (J)")
     else:
         length = count
-        axes.set(title="(b) Episodes", xlabel="Episodes")
+        axes.set(title="Episodes", xlabel="Episodes")
 
     colour = style.VERMILION if loss.any() else style.BLUE
     # Bars of many sites touch each other, so that they form a profile.

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from vipetsc.figures import panels, style
+from vipetsc.figures import style
+from vipetsc.figures.page import Page
 from vipetsc.figures.series import Series
 
 LABELS = {
@@ -35,8 +36,8 @@ def law(data: xr.Dataset) -> Figure:
     with the largest T.
     """
     z = data["z"].values
-    figure = style.new_figure(style.PAGE, 2.9)
-    all_energies, by_band, onset = figure.subplots(1, 3)
+    page = Page.of(columns=3, height=2.9)
+    all_energies, by_band, onset = page.panels
     for name in LABELS:
         if name in data:
             _draw_energy(all_energies, z, data, name)
@@ -69,11 +70,10 @@ def law(data: xr.Dataset) -> Figure:
         transmitted = float(data.attrs["matched_transmitted"])
         onset.set_title(f"z* = {matched:.3g}, T = {transmitted:.3g}", fontsize=8)
 
-    panels.label_panels([all_energies, by_band, onset])
     all_energies.legend(fontsize=6, loc="center right", handlelength=style.DASHES_SEEN)
     by_band.legend(fontsize=6, loc="lower left", ncols=2, handlelength=style.DASHES_SEEN)
     onset.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45), handlelength=style.DASHES_SEEN)
-    return figure
+    return page.lettered()
 
 
 def _draw_energy(axes: Axes, x: np.ndarray, data: xr.Dataset, name: str) -> None:

@@ -2,9 +2,10 @@
 
 A measure is any variable of ``ensemble.h5`` over all axes of its sweep, perhaps over parts of the frequency axis (pass
 bands and gaps) too. Keys with numbers are the axes of panels; keys with words or lists, or with two numbers, are
-curves, panels or pages (see ``measure_roles``). Samples of disorder become a mean and a band.
+curves, panels or pages (see ``Roles``). Samples of disorder become a mean and a band.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -24,7 +25,6 @@ from vipetsc.figures.measure_panels import (
     draw_maps,
     draw_samples,
 )
-from vipetsc.figures.measure_roles import MOST_CURVES, PART, Roles
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey
@@ -54,6 +54,75 @@ ON_REQUEST = {
     "steady_drift",
     "lyapunov_error",
 }
+MOST_CURVES = 6  # of a panel: as many as there are markers
+MOST_PANELS = 16  # of a page: four by four are an inch and a half wide each
+LEAST_ON_A_MAP = 3  # values of a key that is an axis of a map; two values are better compared as curves
+PART = "part"  # the dimension of parts of the frequency axis
+
+
+class Roles(NamedTuple):
+    """Roles of the axes of a measure: ``x`` (and ``y`` of a map) become axes of the panels, the others are compared.
+
+    Each combination of the values of ``curves`` is a curve in a panel, of ``panels`` a panel, and of ``pages`` a page.
+    """
+
+    x: SweptAxis
+    y: SweptAxis | None
+    curves: tuple[SweptAxis, ...]
+    panels: tuple[SweptAxis, ...]
+    pages: tuple[SweptAxis, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """The labels of the axes of numbers: pages with the same ones can have common axes."""
+        labels = []
+        for axis in (self.x, self.y):
+            if axis is not None and axis.is_number:
+                labels.append(axis.label)
+            elif axis is not None:
+                labels.append("")
+        return labels
+
+    @classmethod
+    def of(cls, axes: Sequence[SweptAxis]) -> Self:
+        """Return the roles of ``axes``, of which there is at least one; ``y`` is None for curves.
+
+        The longest axis with numbers, or of all axes if none has, is ``x``; the next one with numbers is ``y`` if both
+        have ``LEAST_ON_A_MAP`` values. The last of the other axes become curves, unless there is a map, those before
+        them panels, and the first ones pages.
+        """
+        # Axes of equal length stay in the order of the case: the sort is stable.
+        longest_first = sorted(axes, key=lambda axis: -axis.size)
+        numbers = [axis for axis in longest_first if axis.is_number]
+        map_axes = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
+        x = (numbers or longest_first)[0]
+        y = None
+        taken = {x.dimension}
+        if len(map_axes) > 1:
+            y = map_axes[1]
+            taken.add(y.dimension)
+
+        # The last axes of a case vary fastest: what they compare stands closest together. Pass bands are no curves if
+        # there is anything else to compare: they differ by orders of magnitude, and members are compared band by band.
+        others = [axis for axis in axes if axis.dimension not in taken]
+        keys = [axis for axis in others if axis.dimension != PART]
+        curves: tuple[SweptAxis, ...] = ()
+        if y is None:
+            curves = _last_of(keys or others, MOST_CURVES)
+        taken |= {axis.dimension for axis in curves}
+
+        others = [axis for axis in others if axis.dimension not in taken]
+        panels = _last_of(others, MOST_PANELS)
+        pages = tuple(others[: len(others) - len(panels)])
+        return cls(x=x, y=y, curves=curves, panels=panels, pages=pages)
+
+
+def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
+    """Return as many of the last ``axes`` as together have at most ``most`` combinations of values."""
+    count = 0
+    while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
+        count += 1
+    return tuple(axes[len(axes) - count :])
 
 
 class Measure(NamedTuple):
@@ -320,8 +389,7 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
         low, high = np.nanquantile(samples, (0.05, 0.95))
         labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
     lines = filter(None, [heading, f"of {measure.sample_text}", measure.failures])
-    page = MeasurePage(measure.label, list(lines), labels)
-    page.lay_out([""])
+    page = MeasurePage.of(measure.label, list(lines), [""], labels)
     drawn = []
     for number, (samples, colour) in enumerate(zip(series, colours, strict=True)):
         curve = Curve(label=f"samples {number}", number=number, values=samples, band=None, colour=colour)
@@ -348,8 +416,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
     columns = 0
     if len(roles.panels) > 1:
         columns = roles.panels[-1].size
-    page = MeasurePage(measure.label, lines, legend)
-    page.lay_out(list(panels), columns=columns)
+    page = MeasurePage.of(measure.label, lines, list(panels), legend, columns)
 
     marked = None
     if marks_largest:
@@ -361,7 +428,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
             ring = LargestOnMap(x=best[roles.x.dimension], y=best[roles.y.dimension], panel=list(panels).index(marked))
         return draw_maps(page, roles.x, roles.y, fields, ring, common)
 
-    for axes, (text, panel) in zip(page.panels, panels.items(), strict=True):
+    for axes, (text, panel) in zip(page.page.panels, panels.items(), strict=True):
         largest_point = None
         if text == marked:
             largest_point = (best[roles.x.dimension], float(measure.values.isel(best)))

@@ -1,20 +1,19 @@
 """Panels of a sweep's measures: curves with bands, maps with contours, samples; their titles, legends and ticks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from string import ascii_lowercase
 from textwrap import wrap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 
 from vipetsc.figures import style
 from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
+from vipetsc.figures.page import Page, letter
 from vipetsc.figures.panels import colour_bar
 from vipetsc.figures.series import Series
 from vipetsc.figures.swept_axes import SweptAxis
@@ -72,87 +71,78 @@ class CommonAxes(NamedTuple):
     y: np.ndarray
 
 
-@dataclass
-class MeasurePage:
-    """A page of panels of a measure with its ``label``, over a legend; the first of its ``lines`` is the title.
+class MeasurePage(NamedTuple):
+    """A ``page`` of panels of a measure with its ``label``.
 
-    The other lines are notes below the picture.
-
-    ``legend_labels`` are the texts of the legend, empty for none. ``lay_out`` makes the ``figure`` and its ``panels``,
-    which stand in ``body``, the figure without the strip of the legend; ``width`` and ``label_height``, the length of a
-    label along y, are in inches.
+    ``legend_labels`` are the texts of its legend, in ``legend_columns``. ``label_height``, the length of a label along
+    y, is in inches.
     """
 
+    page: Page
     label: str
-    lines: Sequence[str]
-    legend_labels: Sequence[str] = ()
-    figure: Figure = field(init=False)
-    body: Figure | SubFigure = field(init=False)
-    _legend_figure: SubFigure = field(init=False)
-    panels: list[Axes] = field(init=False)
-    width: float = field(init=False)
-    label_height: float = field(init=False)
+    label_height: float
+    legend_labels: Sequence[str]
+    legend_columns: int
 
-    def lay_out(self, titles: Sequence[str], columns: int = 0) -> None:
-        """Make the page with a panel for each of ``titles``, in so many ``columns`` unless they are 0 or too many."""
+    @classmethod
+    def of(
+        cls, label: str, lines: Sequence[str], titles: Sequence[str], legend: Sequence[str] = (), columns: int = 0
+    ) -> Self:
+        """Return a page with a panel for each of ``titles``, in so many ``columns`` unless they are 0 or too many.
+
+        The first of its ``lines`` is the heading, the others are notes below the picture.
+        """
         count = len(titles)
         if not 0 < columns <= MOST_COLUMNS:
             # As few rows as possible, and these equally long: five panels are three and two, not four and one.
             columns = -(-count // -(-count // MOST_COLUMNS))
         rows = -(-count // columns)
-        self.width = style.PAGE
-        if count == 1:
-            self.width = SINGLE
-
-        heading = wrap(self.lines[0], int(LETTERS * self.width))
+        width = SINGLE if count == 1 else style.PAGE
+        heading = style.wrapped_heading(lines[0], width)
         height = 2.4
         if rows > 1:
             height = 0.3 + 1.75 * rows
-        above = 0.15 * len(heading)
-        # A label in the middle of the page's left edge ends below the title, and above the label of the other axis.
-        self.label_height = height - above - BELOW
-        height += above
-        strip = self._legend_height()
-        self.figure = style.new_figure(self.width, height + strip)
-        for line in filter(None, self.lines[1:]):
-            style.add_note(self.figure, line)
-        self.body = self.figure
-        if strip:
-            self.body, legend = self.figure.subfigures(2, 1, height_ratios=(height, strip), hspace=0)
-            self._legend_figure = legend
-        self.body.suptitle("\n".join(heading))
+        above = 0.15 * (1 + heading.count("\n"))
 
-        grid = self.body.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-        letters = int(PANEL_LETTERS * (self.width - 0.6) / columns)
-        for tag, axes, title in zip(ascii_lowercase, grid, titles, strict=False):
-            if title:
-                lines = wrap(f"({tag}) {title.replace(BAND, TOGETHER)}", letters)
-                axes.set_title("\n".join(lines))
-        for axes in grid[count:]:
-            axes.set_axis_off()
-        for index, axes in enumerate(grid[:count]):
+        # As many columns as the longest label has room for, with six letters for its mark and the gaps.
+        longest = max(map(len, legend), default=0) + 6
+        legend_columns = max(1, min(len(legend), int(LEGEND_LETTERS * width / longest)))
+        page = Page.of(
+            rows,
+            columns,
+            width=width,
+            height=height + above,
+            heading=lines[0],
+            count=count,
+            legend=-(-len(legend) // legend_columns),
+            sharex=True,
+            sharey=True,
+        )
+        for line in filter(None, lines[1:]):
+            style.add_note(page.figure, line)
+        for index, (axes, title) in enumerate(zip(page.panels, titles, strict=True)):
+            axes.set_title(title.replace(BAND, TOGETHER))
             # The last panel of each column has the labels of the ticks, also above an empty place.
             axes.tick_params(labelbottom=index + columns >= count)
-        self.panels = list(grid[:count])
+        letter(page.panels)
+        letters = int(PANEL_LETTERS * (width - 0.6) / columns)
+        for axes in page.panels:
+            axes.set_title("\n".join(wrap(axes.get_title("left"), letters)))
+        # A label in the middle of the page's left edge ends below the title, and above the label of the other axis.
+        return cls(page, label, height - above - BELOW, legend, legend_columns)
 
-    def _legend_columns(self) -> int:
-        """Return for how many columns the longest label has room, with six letters for its mark and the gaps."""
-        letters = max(map(len, self.legend_labels)) + 6
-        return max(1, min(len(self.legend_labels), int(LEGEND_LETTERS * self.width / letters)))
-
-    def _legend_height(self) -> float:
-        """Return the height in inches of the strip that the legend takes."""
-        if not self.legend_labels:
-            return 0.0
-        return 0.08 + 0.14 * -(-len(self.legend_labels) // self._legend_columns())
+    @property
+    def width(self) -> float:
+        """The width of the page in inches."""
+        return float(self.page.figure.get_figwidth())
 
     def label_axes(self, x: SweptAxis, y: str) -> None:
         """Write what the axes of all panels are, and ticks at the values of ``x``."""
-        columns = self.panels[0].get_subplotspec().get_gridspec().ncols
-        for axes in self.panels:
+        columns = self.page.grid.shape[1]
+        for axes in self.page.panels:
             label_positions(axes.xaxis, x, (self.width - SIDES) / columns)
-        self.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
-        self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.label_height))))
+        self.page.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
+        self.page.body.supylabel("\n".join(wrap(y, int(LETTERS * self.label_height))))
 
     def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
         """Label and scale the axes of all panels of curves, and write the legend; return the figure.
@@ -163,7 +153,7 @@ class MeasurePage:
         if common:
             values = common.values
         finite = values[np.isfinite(values)]
-        first = self.panels[0]
+        first = self.page.panels[0]
 
         # The panels share their axes: scales and limits of the first one are those of all.
         if common:
@@ -179,14 +169,13 @@ class MeasurePage:
 
         self.label_axes(x, self.label)
         self.write_legend()
-        return self.figure
+        return self.page.figure
 
     def write_legend(self) -> None:
         """Write the legend of the curves in the strip below all panels."""
-        handles = self.panels[0].get_legend_handles_labels()[0]
+        handles = self.page.panels[0].get_legend_handles_labels()[0]
         if self.legend_labels:
-            columns = self._legend_columns()
-            self._legend_figure.legend(handles, self.legend_labels, loc="center", ncols=columns)
+            self.page.write_legend(handles, self.legend_labels, self.legend_columns)
 
 
 def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[int, float] | None) -> None:
@@ -242,7 +231,8 @@ def draw_maps(
     most_contours = CONTOURS_ON_ONE
     if len(fields) > 1:
         most_contours = CONTOURS_ON_SEVERAL
-    for axes, unordered in zip(page.panels, fields, strict=True):
+    panels = page.page.panels
+    for axes, unordered in zip(panels, fields, strict=True):
         values = unordered[np.ix_(y_order, x_order)]
         # The ground shows where values are missing.
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
@@ -260,15 +250,13 @@ def draw_maps(
         at = x.positions[ring.x], y.positions[ring.y]
         # A white ring below the red one, which is then seen on any colour of the map.
         for colour, thickness in (("white", 2.2), (style.RED, 1.2)):
-            page.panels[ring.panel].plot(*at, "o", mfc="none", mec=colour, mew=thickness, ms=9)
+            panels[ring.panel].plot(*at, "o", mfc="none", mec=colour, mew=thickness, ms=9)
     page.label_axes(x, y.label)
     ticks: dict[str, Any] = {}
     if isinstance(norm, LogNorm):
         ticks = {"ticks": log_ticks(norm.vmin, norm.vmax), "format": "%g"}
-    colour_bar(
-        image, page.panels, "\n".join(wrap(page.label, int(LETTERS * page.label_height))), extend="neither", **ticks
-    )
-    return page.figure
+    colour_bar(image, panels, "\n".join(wrap(page.label, int(LETTERS * page.label_height))), extend="neither", **ticks)
+    return page.page.figure
 
 
 def _norm(values: np.ndarray) -> Normalize:
@@ -310,7 +298,7 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
 
     Return the figure.
     """
-    (axes,) = page.panels
+    (axes,) = page.page.panels
     for curve in series:
         look = curve.look
         axes.plot(seeds, curve.values, label=curve.label, **look | {"ls": ""})
@@ -318,7 +306,7 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
         axes.axhline(np.nanmean(curve.values), color=look["color"], lw=0.9)
     axes.set(xlabel=key_name("disorder.seed"), ylabel=page.label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return page.figure
+    return page.page.figure
 
 
 def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page, letter
 from vipetsc.figures.style import NoPicture
 
 # Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy that all
@@ -87,11 +88,11 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     parts = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
     moved = MovedEnergies.of(run, analysis, parts)
     if not moved.labels:
-        figure = style.new_figure(style.COLUMN, 2.4)
-        axes = figure.subplots()
+        page = Page.of(height=2.4)
+        (axes,) = page.panels
         _draw_steps(axes, run, analysis, parts)
         axes.set(xlabel="Time (s)")
-        return figure
+        return page.lettered()
 
     figure = style.new_figure(style.PAGE, 3.3)
     ratios = {"width_ratios": (1.55, 1), "height_ratios": (2.6, 1)}
@@ -104,7 +105,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     percent = 100 * moved.energy / float(run["energy/work"][-1])
     _draw_matrix(panel["matrix"], moved.labels, [*(style.part_label(names[p]) for p in parts), "lost"], percent)
     panel["matrix"].set_ylabel(f"Contact site ({panels.sites_title(run)})")
-    panels.label_panels([panel["steps"], panel["impacts"], panel["matrix"]])
+    letter([panel["steps"], panel["impacts"], panel["matrix"]])
     if len(moved.labels) < moved.rows:
         style.add_note(figure, f"transfers: the {MOST_ROWS} of {moved.rows} rows with the largest ones")
     return figure

@@ -20,9 +20,9 @@ from PIL import Image
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.layout import lay_out
 from vipetsc.figures.movie_frames import WIDTH, MovieFrames
 from vipetsc.figures.strips import StripFrames
+from vipetsc.figures.style import lay_out
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 

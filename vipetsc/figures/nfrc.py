@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page
 from vipetsc.figures.series import Series
 from vipetsc.io.branch_kinds import CHOSEN, kind_names
 from vipetsc.io.netcdf import open_netcdf
@@ -105,22 +106,15 @@ def response_page(
     curves: Sequence[xr.Dataset], rows: Sequence[Callable[[Axes, xr.Dataset], None]], height: float
 ) -> Figure:
     """Return a page, ``height`` inches high, with a column for each of ``curves``, whose panels ``rows`` draw."""
-    width = style.COLUMN
-    if len(curves) > 1:
-        width = style.PAGE
-    figure = style.new_figure(width, height)
-    columns = figure.subplots(len(rows), len(curves), sharex="col", squeeze=False).T
-
-    for column, curve in zip(columns, curves, strict=True):
+    page = Page.of(len(rows), len(curves), height=height, sharex="col")
+    for column, curve in zip(page.grid.T, curves, strict=True):
         for axes, draw in zip(column, rows, strict=True):
             draw(axes, curve)
         column[-1].set_xlabel(parameter_label(curve))
         if "parameter" in curve:
             column[-1].ticklabel_format(axis="x", scilimits=(-2, 4))
         column[0].set_title(str(curve.attrs["name"]))
-    if columns.size > 1:
-        panels.label_panels(columns.T)
-    return figure
+    return page.lettered()
 
 
 def parameter_label(branch: xr.Dataset) -> str:

@@ -10,7 +10,8 @@ from matplotlib.ticker import MaxNLocator
 
 from vipetsc.case.nfrc import RESPONSE
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
-from vipetsc.figures import panels, style
+from vipetsc.figures import style
+from vipetsc.figures.page import Page
 from vipetsc.figures.series import Series
 from vipetsc.spectra.measures import row_of
 from vipetsc.wording import with_unit
@@ -79,8 +80,8 @@ def convergence(optimum: xr.Dataset) -> Figure:
     objectives = options.objective
     sought = [objective.describe(plan.amplitude_unit) for objective in objectives]
     sought += [constraint.describe(plan.amplitude_unit) for constraint in options.constraint or []]
-    figure = style.new_figure(style.PAGE, 2.8, "; ".join(sought))
-    values, *others = figure.subplots(1, 2 if options.measures_runs else 1, squeeze=False)[0]
+    page = Page.of(columns=1 + options.measures_runs, width=style.PAGE, height=2.8, heading="; ".join(sought))
+    values, *others = page.panels
     if len(objectives) == 1:
         _draw_one_objective(values, optimum, objectives[0])
     else:
@@ -89,8 +90,7 @@ def convergence(optimum: xr.Dataset) -> Figure:
 
     for axes in others:
         _draw_fractions(axes, optimum)
-    panels.label_panels([values, *others])
-    return figure
+    return page.lettered()
 
 
 def _draw_fractions(axes: Axes, optimum: xr.Dataset) -> None:
@@ -158,8 +158,8 @@ def _mark(axes: Axes, design: ComparedDesign, x: float, y: float) -> None:
 def compared_designs(optimum: xr.Dataset) -> Figure:
     """Draw the compared designs: clearances over the cells of the sites, and each variable between its bounds."""
     plan = OptimiseCase.of(optimum)
-    figure = style.new_figure(style.PAGE, 2.6)
-    sites, variables = figure.subplots(1, 2)
+    page = Page.of(columns=2, height=2.6)
+    sites, variables = page.panels
     for i, design in enumerate(_compared(optimum)):
         row = optimum.sel(compared=design.name)
         look = {"marker": MARKERS[design.name], **style.CURVES[design.name]}
@@ -177,8 +177,7 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
     variables.set(xlim=(-0.02, 1.02), xlabel="between its bounds", title="What varies", ylim=(len(names) - 0.3, -0.7))
     variables.set_yticks(np.arange(len(names)), names, fontsize=6 if len(names) > MOST_LINES else None)
     variables.grid(axis="y", color=style.PALE, lw=0.5)
-    panels.label_panels([sites, variables])
-    return figure
+    return page.lettered()
 
 
 def compared_curves(optimum: xr.Dataset) -> Figure:
@@ -187,18 +186,16 @@ def compared_curves(optimum: xr.Dataset) -> Figure:
     # Objectives that measure the same at different amplitudes have one panel, with the curve of the last of them.
     measures = {objective.name: i for i, objective in enumerate(plan.options.objective)}
     has_energies = plan.options.measures_runs
-    figure = style.new_figure(style.PAGE, 2.6)
-    drawn = figure.subplots(1, len(measures) + has_energies, squeeze=False)[0]
-    for axes, i in zip(drawn, measures.values(), strict=False):
+    page = Page.of(columns=len(measures) + has_energies, width=style.PAGE, height=2.6)
+    for axes, i in zip(page.panels, measures.values(), strict=False):
         if plan.options.objective[i].is_of_responses:
             _draw_response(axes, optimum, plan, i)
         else:
             _draw_measure(axes, optimum, plan, i)
-    drawn[0].legend(loc="best")
+    page.panels[0].legend(loc="best")
     if has_energies:
-        _draw_energies(drawn[-1], optimum, plan)
-    panels.label_panels(drawn)
-    return figure
+        _draw_energies(page.panels[-1], optimum, plan)
+    return page.lettered()
 
 
 def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:

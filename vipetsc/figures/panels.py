@@ -1,7 +1,6 @@
 """Panels of several figures: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,6 @@ DECADES = 5  # decades of energy that a map shows: each then has 50 of the map's
 PIXELS = 600
 MOST_DASHED = 12  # branches over a map that are dashed
 MOST_LINES = 30  # lines across a map at its sites; more would hide it
-# Numerals of the rows of a grid of panels. Further rows have none.
-ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 ROUNDING = 1e-6  # degrees by which equal phases may differ
@@ -73,23 +70,6 @@ def luminance(colour: Any) -> float:
     channels = 1 - opacity + opacity * np.array(channels)
     linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     return float(linear @ (0.2126, 0.7152, 0.0722))
-
-
-def label_panels(panels: Iterable[Axes]) -> None:
-    """Begin the titles of ``panels`` with (a), (b), ...; panels beyond the 26th have no letter.
-
-    In a grid (row, column) of several rows and columns each has the letter of its column and the numeral of its row,
-    (b.iii); panels beyond the last letter or numeral have none. Titles stand at the left, where the style puts them.
-    """
-    if isinstance(panels, np.ndarray) and panels.ndim == 2 and min(panels.shape) > 1:
-        tags = {}
-        for row, row_tag in zip(panels, ROMAN, strict=False):
-            for axes, column_tag in zip(row, ascii_lowercase, strict=False):
-                tags[axes] = f"{column_tag}.{row_tag}"
-    else:
-        tags = dict(zip(np.ravel(list(panels)).tolist(), ascii_lowercase, strict=False))
-    for axes, tag in tags.items():
-        axes.set_title(f"({tag}) {axes.get_title('left')}".rstrip())
 
 
 def block_means(values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.identify import MeasuredError, RecordTable, read_measured
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page, legend_entries
 from vipetsc.figures.style import NoPicture, Shown
 from vipetsc.io.tables import ColumnError, column_names, is_hdf5
 from vipetsc.spectra.fourier import amplitude_spectrum, spectrogram
@@ -58,29 +59,25 @@ def points(runs: Sequence[Shown], records: Sequence[str] = (), quantity: str = "
 
     shown_names = names[:MOST_POINTS]
     has_map = len(named) == 1
-    figure = style.new_figure(style.PAGE, 1.7 * len(shown_names) + 0.4 * bool(records or len(named) > 1))
-    grid = figure.subplots(len(shown_names), 2 + has_map, squeeze=False, width_ratios=(3, 2, 3)[: 2 + has_map])
+    height = 1.7 * len(shown_names) + 0.4 * bool(records or len(named) > 1)
+    page = Page.of(len(shown_names), 2 + has_map, height=height, width_ratios=(3, 2, 3)[: 2 + has_map])
     unit = _frequency_unit(first["time"].values)
-    for row, point in zip(grid, shown_names, strict=True):
+    for row, point in zip(page.grid, shown_names, strict=True):
         lines = _lines(named, measured, point, variable)
         _draw_history(row[0], lines, f"{point}: {quantity} ({panels.MOTION_UNITS[quantity]})")
         _draw_spectrum(row[1], lines, f"Amplitude ({panels.MOTION_UNITS[quantity]})", unit)
         if has_map:
             _draw_spectrogram(row[2], lines[0], f"Amplitude ({panels.MOTION_UNITS[quantity]})", unit)
-    for axes, title in zip(grid[0], ("History", "Spectrum", "Spectrogram"), strict=False):
+    for axes, title in zip(page.panels, ("History", "Spectrum", "Spectrogram")[: 2 + has_map], strict=False):
         axes.set_title(title)
-    panels.label_panels(grid)
     # A record may be of one point alone.
-    entries: dict[Any, Any] = {}
-    for axes in grid[:, 0]:
-        handles, labels = axes.get_legend_handles_labels()
-        entries |= dict(zip(labels, handles, strict=True))
+    entries = legend_entries(page.grid[:, 0])
     if len(entries) > 1:
         # The spectrum leaves more room than the history.
-        grid[0, 1].legend(list(entries.values()), list(entries), loc="best")
+        page.panels[1].legend(entries.values(), entries.keys(), loc="best")
     if len(names) > MOST_POINTS:
-        style.add_note(figure, f"the first {MOST_POINTS} of {len(names)} points; the files have all")
-    return figure
+        style.add_note(page.figure, f"the first {MOST_POINTS} of {len(names)} points; the files have all")
+    return page.lettered()
 
 
 # One figure for each quantity; that of the velocity has the plain name.

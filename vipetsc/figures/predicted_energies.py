@@ -7,7 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.figures import panels, style
+from vipetsc.figures import style
+from vipetsc.figures.page import Page
 
 LEAST = 1e-4  # smallest energy shown, over the work
 WHOLE = 1.5  # upper limit of an axis on which an energy may be as large as the work
@@ -28,9 +29,8 @@ def prediction(data: xr.Dataset) -> Figure:
     bands = data["band"].values
     name = "upper" if int(data.attrs["drive_band"]) < len(bands) else "other"
     title = "Bands above the driven one" if name == "upper" else "All bands except the driven one"
-    figure = style.new_figure(style.PAGE, 4.9)
-    grid = figure.subplots(2, 2, sharex=True)
-    (transferred, dissipated), (every_band, sites) = grid
+    page = Page.of(2, 2, height=4.9, count=4, sharex=True)
+    transferred, dissipated, every_band, sites = page.panels
 
     _draw_total(transferred, data, name)
     transferred.set(title=title, ylabel="Energy at the end / work", xscale="log", yscale="log")
@@ -57,10 +57,10 @@ def prediction(data: xr.Dataset) -> Figure:
         _put_legend_above(sites, columns=3)
 
     onset = float(data.attrs["onset_amplitude"])
-    for axes in grid.flat:
+    for axes in page.panels:
         axes.axvline(onset, color=style.GREY, lw=0.7, ls=style.DOTTED)
     _show_amplitudes(transferred, np.append(data["amplitude"].values, onset))
-    for axes in grid[1]:
+    for axes in (every_band, sites):
         axes.set_xlabel(f"Amplitude ({data['amplitude'].attrs['units']}); dotted: first contact")
 
     # A prediction without simulated runs to compare with has no error.
@@ -70,8 +70,7 @@ def prediction(data: xr.Dataset) -> Figure:
         # A lattice without dashpots has no such error.
         worst = max(data.attrs["worst_dissipated"], data.attrs.get("worst_dashpots", 0.0))
         dissipated.set_title(f"Dissipated: error at most {worst:.3f}")
-    panels.label_panels(grid.ravel())
-    return figure
+    return page.lettered()
 
 
 def _draw_total(axes: Axes, data: xr.Dataset, name: str) -> None:

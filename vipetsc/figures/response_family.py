@@ -25,6 +25,7 @@ from vipetsc.figures.nfrc import (
     parameter_of,
     responses_in,
 )
+from vipetsc.figures.page import Page
 from vipetsc.figures.series import UNDECIDED, Series
 from vipetsc.figures.style import NoPicture
 from vipetsc.figures.swept_axes import SweptKey
@@ -32,7 +33,6 @@ from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
 
 MOST_LOCATIONS = 4  # that have a row each: with those of the site and the phase they fill the height of a page
 MOST_CURVES = 24  # that the legend names, which is then three inches high
-LEGEND_LINE = 0.13  # height in inches of a line of the legend
 
 
 def response_family(paths: Sequence[Path]) -> Figure:
@@ -59,31 +59,28 @@ def response_family(paths: Sequence[Path]) -> Figure:
     locations = _common_locations(curves)
 
     names = legend_of(curves)
-    height = 1.7 * len(rows) + 0.3
     has_undecided = any(np.any(curve["unstable"].values < 0) for curve in curves)
-    legend_height = 0.1 + LEGEND_LINE * (min(len(curves), MOST_CURVES) + has_undecided)
-    figure = style.new_figure(1.3 * style.COLUMN, height + legend_height)
-    upper, lower = figure.subfigures(2, 1, height_ratios=[height, legend_height])
-    column = upper.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    lines = min(len(curves), MOST_CURVES) + has_undecided
+    height = 1.7 * len(rows) + 0.3
+    page = Page.of(len(rows), width=1.3 * style.COLUMN, height=height, legend=lines, sharex=True)
     colours = _colours(len(curves))
-    for axes, values_of, label in zip(column, rows, labels, strict=True):
+    for axes, values_of, label in zip(page.panels, rows, labels, strict=True):
         for curve, name, colour in zip(curves, names, colours, strict=True):
             _draw_curve(axes, curve, values_of(curve), name, colour)
         axes.set_ylabel(label)
     if has_phase:
-        panels.mark_degrees(column[-1])
-    column[-1].set_xlabel(parameter_label(curves[0]))
-    handles, texts = column[0].get_legend_handles_labels()
-    of_curves = [handle for handle, text in zip(handles, texts, strict=True) if text != UNDECIDED]
-    crosses = [handle for handle, text in zip(handles, texts, strict=True) if text == UNDECIDED]
-    lower.legend(handles=[*of_curves[:MOST_CURVES], *crosses], loc="center", fontsize=6)
+        panels.mark_degrees(page.panels[-1])
+    page.panels[-1].set_xlabel(parameter_label(curves[0]))
+    handles, texts = page.panels[0].get_legend_handles_labels()
+    # The curves first, and crosses for all of them behind.
+    order = sorted(range(len(texts)), key=lambda number: texts[number] == UNDECIDED)
+    shown = [*order[: len(curves)][:MOST_CURVES], *order[len(curves) :]]
+    page.write_legend([handles[number] for number in shown], [texts[number] for number in shown])
     if len(curves) > MOST_CURVES:
-        style.add_note(figure, f"the legend names the first {MOST_CURVES} of {len(curves)} curves")
-    if len(rows) > 1:
-        panels.label_panels(column)
+        style.add_note(page.figure, f"the legend names the first {MOST_CURVES} of {len(curves)} curves")
     if len(locations) > MOST_LOCATIONS:
-        style.add_note(figure, f"the first {MOST_LOCATIONS} of {len(locations)} named masses")
-    return figure
+        style.add_note(page.figure, f"the first {MOST_LOCATIONS} of {len(locations)} named masses")
+    return page.lettered()
 
 
 def _quantities(curves: Sequence[xr.Dataset]) -> dict[str, Callable[[xr.Dataset], np.ndarray]]:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_linear, draw_special, has_places, parameter_of, response_page, responses_in
+from vipetsc.figures.page import legend_entries
 from vipetsc.figures.series import Series
 from vipetsc.figures.style import NoPicture
 from vipetsc.io.branch_kinds import RESPONSES, kind_of_file
@@ -103,9 +104,8 @@ def decibels(ratio: Any) -> Any:
 
 def _legend(axes: Axes) -> None:
     """Draw a legend with one entry for each label."""
-    handles, labels = axes.get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
-    axes.legend(list(entries.values()), list(entries), fontsize=6, loc="best")
+    entries = legend_entries([axes])
+    axes.legend(entries.values(), entries.keys(), fontsize=6, loc="best")
 
 
 def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:

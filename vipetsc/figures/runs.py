@@ -12,8 +12,9 @@ from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page
 from vipetsc.figures.style import NoPicture
-from vipetsc.io.read import field_time, first_site
+from vipetsc.io.read import field_time
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.damped import decay_length
 
@@ -39,17 +40,16 @@ def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if analysis is None or analysis.sizes.get("time", 0) < 2:
         raise NoPicture("needs the analysis of a run with two samples or more")
 
-    has_content = "wavenumber_content" in analysis
-    figure = style.new_figure(style.PAGE if has_content else style.COLUMN, 2.5)
-    left, *right = np.atleast_1d(figure.subplots(1, 2 if has_content else 1))
+    page = Page.of(columns=1 + ("wavenumber_content" in analysis), height=2.5)
+    left, *right = page.panels
     _draw_energy(left, run, analysis)
     for axes in right:
         content = analysis["wavenumber_content"].load()
         image = panels.content_map(axes, content, panels.log_norm(content, decades=4))
-        left.set_title("(a) Kinetic energy")
-        axes.set_title("(b) Wavenumber content")
+        left.set_title("Kinetic energy")
+        axes.set_title("Wavenumber content")
         panels.colour_bar(image, axes, "Kinetic energy per bin (J)")
-    return figure
+    return page.lettered()
 
 
 def _draw_energy(axes: Axes, run: xr.Dataset, analysis: xr.Dataset) -> None:
@@ -105,9 +105,10 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     spectra = panels.below_cutoff(analysis, cell, parts or measured)
     norm = panels.log_norm(*spectra.values())
 
-    figure = style.new_figure(style.PAGE if len(spectra) > 1 else 5.0, 3.2)
     widths = [1.0] * len(spectra) + [0.55]
-    *maps, side = figure.subplots(1, len(spectra) + 1, sharey=True, width_ratios=widths)
+    width = style.PAGE if len(spectra) > 1 else 5.0
+    page = Page.of(columns=len(widths), width=width, height=3.2, sharey=True, width_ratios=widths)
+    *maps, side = page.panels
     # The pass bands are shaded, so that the energy that each has received can be read off the sums.
     panels.shade_bands(side, ((band.low, band.high) for band in pass_bands(cell)))
     for axes, (name, spectrum) in zip(maps, spectra.items(), strict=True):
@@ -124,9 +125,8 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     largest = float(spectra.sum("wavenumber").to_array().max()) or 1.0
     side.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
     side.set_title("Sum over κ")
-    panels.label_panels([*maps, side])
     side.legend(loc="lower right")
-    return figure
+    return page.lettered()
 
 
 def _mark_drive(axes: Axes, model: Model) -> None:
@@ -144,8 +144,8 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         raise NoPicture("the drive did no work")
 
     largest = float(np.abs(run["energy/work"]).max())
-    figure = style.new_figure(style.COLUMN, 3.3)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
+    page = Page.of(rows=2, height=3.3, sharex=True, height_ratios=(2.2, 1))
+    upper, lower = page.panels
     _draw_ledger(upper, run)
     # Room for the legend above the curves, 0.12 of the work for each of its rows.
     rows = -(-len(upper.get_lines()) // 2)
@@ -155,8 +155,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     _draw_residual(lower, run, largest)
     upper.set_title("Energies")
     lower.set_title("Residual of their balance over the work")
-    panels.label_panels([upper, lower])
-    return figure
+    return page.lettered()
 
 
 def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
@@ -230,7 +229,8 @@ class Motion(NamedTuple):
 
 def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw velocity against displacement at the first site: grey before the first contact, then by time."""
-    site = first_site(run)
+    case = Case.of(run)
+    site = case.nearest_site(run["sites/cell"].values)
     if site is None:
         raise NoPicture("the lattice has no contact sites")
     cell = int(run["sites/cell"][site])
@@ -240,7 +240,7 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         raise NoPicture("displacement and velocity were not both recorded")
     if not np.any(run["displacement"].sel(cell=cell)):
         raise NoPicture(f"cell {cell}, the first site, was at rest all the time")
-    chain = Case.of(run).model().chain
+    chain = case.model().chain
     if chain.has_own_pairs:
         raise NoPicture("portraits show the cell's contact pair, but the contacts join other masses")
 
@@ -249,27 +249,26 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     host = chain.cell.host
     resonator = chain.cell.resonator
     motions = (
-        Motion(f"(a) Host of cell {cell}", "u_h", u[:, host], v[:, host]),
-        Motion("(b) Resonator of the same cell", "u_r", u[:, resonator], v[:, resonator]),
-        Motion("(c) Relative motion", "w", u[:, resonator] - u[:, host], v[:, resonator] - v[:, host]),
+        Motion(f"Host of cell {cell}", "u_h", u[:, host], v[:, host]),
+        Motion("Resonator of the same cell", "u_r", u[:, resonator], v[:, resonator]),
+        Motion("Relative motion", "w", u[:, resonator] - u[:, host], v[:, resonator] - v[:, host]),
     )
     onsets = run["impacts/onset"].values[run["impacts/site"].values == site + 1]
     first_contact = int(np.searchsorted(time, onsets.min(initial=np.inf)))
 
-    figure = style.new_figure(style.PAGE, 2.4)
-    grid = figure.subplots(1, 3)
-    for axes, motion in zip(grid, motions, strict=True):
+    page = Page.of(columns=3, height=2.4)
+    for axes, motion in zip(page.panels, motions, strict=True):
         by_time = _draw_portrait(axes, motion, time, first_contact)
         velocity = rf"$\dot{{{motion.symbol}}}$ (m/s)"
         axes.set(title=motion.title, xlabel=f"${motion.symbol}$ (mm)", ylabel=velocity)
 
-    relative = grid[-1]
+    relative = page.panels[-1]
     _mark_stops(relative, _stops(run, site))
     if len(onsets):
-        panels.colour_bar(by_time, grid, "Time (s)", extend="neither")
+        panels.colour_bar(by_time, page.panels, "Time (s)", extend="neither")
     else:
         relative.text(0.5, 0.03, "no contact", ha="center", color=style.GREY, transform=relative.transAxes)
-    return figure
+    return page.lettered()
 
 
 def _draw_portrait(axes: Axes, motion: Motion, time: np.ndarray, first_contact: int) -> LineCollection:
@@ -342,31 +341,31 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
     if cell.is_damped:
         widths.append(1)
         width = 0.95
-    figure = style.new_figure(style.PAGE * width, 3.0)
-    left, right, *decay = figure.subplots(1, len(widths), sharey=True, width_ratios=widths)
+    page = Page.of(columns=len(widths), width=style.PAGE * width, height=3.0, sharey=True, width_ratios=widths)
+    left, right, *decay = page.panels
 
     panels.band_diagram(left, cell, frequency)
     for band in passing:
         middle = (band.low + band.high) / 2e3
         colour = style.band_colour(band.number)
         panels.note(left, f"{band.number}", (1, middle), (3, 0), va="center", color=colour)
-    left.set_title("(a) Bands; gaps shaded")
+    left.set_title("Bands; gaps shaded")
 
     point = bloch(cell, np.linspace(0, np.pi, 361))
     for number, (speed, omega) in enumerate(zip(point.group_velocity.T, point.frequency.T, strict=True), 1):
         right.plot(speed, omega / 1e3, color=style.band_colour(number))
-    right.set(title="(b) Group velocity", xlabel="Group velocity dω/dκ (cells/s)")
+    right.set(title="Group velocity", xlabel="Group velocity dω/dκ (cells/s)")
 
     for axes in decay:
         omega = np.linspace(0, 1.08 * passing[-1].high, 541)[1:]
         # The rate of decay rather than its length, which is infinite for an undamped wave in a band.
         rates = [1 / decay_length(cell, w) for w in omega.tolist()]
         axes.semilogx(rates, omega / 1e3, color=style.BLACK)
-        axes.set(title="(c) Decay along the lattice", xlabel="|Im κ| (1/cell)")
+        axes.set(title="Decay along the lattice", xlabel="|Im κ| (1/cell)")
 
     for axes in (right, *decay):
         panels.shade_bands(axes, gaps(passing))
         if frequency is not None:
             axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
     right.axvline(0, color=style.GREY, lw=0.5)
-    return figure
+    return page.lettered()

@@ -71,8 +71,8 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
     where a wall is moved.
     """
     unit = drive_unit(series.medium.case.drive)
-    figure, grid = series.page(3, 6.4, sharey="row")
-    for row, (name, label) in zip(grid, ROWS.items(), strict=True):
+    page = series.page(3, 6.4, sharey="row")
+    for row, (name, label) in zip(page.grid, ROWS.items(), strict=True):
         fields = [member.analysis[name].load() / member.case.drive.amplitude**2 for member in series.runs]
         norm = panels.log_norm(*fields)
         for axes, field, member in zip(row, fields, series.runs, strict=True):
@@ -90,9 +90,9 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
                 axes.set_ylim(0, BEYOND_BANDS * 1e-3 * pass_bands(cell)[-1].high)
         panels.colour_bar(image, row, f"{label} / A² (J/{unit}²)")
 
-    for axes in grid[:, 1:].flat:
+    for axes in page.grid[:, 1:].flat:
         axes.set_ylabel("")
-    return figure
+    return page.lettered()
 
 
 def _mark_driven(axes: Axes, series: AmplitudeSeries) -> None:
@@ -125,9 +125,9 @@ def wavelets(series: AmplitudeSeries) -> Figure:
     transforms = [_magnitudes(member, times, kappa) for member in series.runs]
     norm = panels.log_norm(*(transformed.values for transformed in transforms), decades=WAVELET_DECADES)
 
-    figure, grid = series.page(4, 6.6, sharex=True, sharey=True)
+    page = series.page(4, 6.6, sharex=True, sharey=True)
     for row, moment in enumerate(MOMENTS):
-        for axes, transformed, member in zip(grid[row], transforms, series.runs, strict=True):
+        for axes, transformed, member in zip(page.grid[row], transforms, series.runs, strict=True):
             cells = member.run["cell"].values
             image = panels.draw_map(axes, cells, kappa / np.pi, transformed.values[row], norm, "magma_r")
             axes.axhline(series.wave.wavenumber / np.pi, color=style.BLACK, lw=0.7)
@@ -135,12 +135,12 @@ def wavelets(series: AmplitudeSeries) -> Figure:
             box = {"facecolor": "white", "alpha": 0.6, "lw": 0, "pad": 1.0}
             text = f"t = {transformed.time[row]:.3g} s"
             axes.text(0.97, 0.94, text, transform=axes.transAxes, ha="right", va="top", bbox=box)
-        grid[row, 0].set(ylabel=f"{moment}\nκ (π rad/cell)", ylim=(0, 1))
+        page.grid[row, 0].set(ylabel=f"{moment}\nκ (π rad/cell)", ylim=(0, 1))
 
-    figure.supxlabel("Cell")
+    page.body.supxlabel("Cell")
     unit = drive_unit(series.medium.case.drive)
-    panels.colour_bar(image, grid, f"Wavelet transform |X| / A (m/s/{unit})", aspect=50)
-    return figure
+    panels.colour_bar(image, page.grid, f"Wavelet transform |X| / A (m/s/{unit})", aspect=50)
+    return page.lettered()
 
 
 def _magnitudes(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Magnitudes:
@@ -169,8 +169,8 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
         fields.append(member.analysis["entropy/local"].where(weight > LEAST_WEIGHT * weight.max()))
     norm = panels.percentile_norm(fields)
 
-    figure, grid = series.page(1, 2.7, sharey=True)
-    for axes, field, member in zip(grid[0], fields, series.runs, strict=True):
+    page = series.page(1, 2.7, sharey=True)
+    for axes, field, member in zip(page.panels, fields, series.runs, strict=True):
         image = panels.space_time_map(axes, field, norm)
         image.set_cmap("viridis")
         panels.mark_sites(axes, member.run, style.GREY)
@@ -188,5 +188,5 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
         line_axes.set(ylim=(norm.vmin, norm.vmax), xlim=time[[0, -1]], yticks=[])
     # One legend, in the last panel.
     line_axes.legend(loc="upper left")
-    panels.colour_bar(image, grid, "H(x, t) and line: H(t) (bit)", extend="both")
-    return figure
+    panels.colour_bar(image, page.grid, "H(x, t) and line: H(t) (bit)", extend="both")
+    return page.lettered()

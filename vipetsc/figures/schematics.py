@@ -13,12 +13,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
+from vipetsc.case.contacts import has_equal_sides
 from vipetsc.figures import style
-from vipetsc.figures.lattice_strip import draw_lattice, draw_wall
+from vipetsc.figures.page import Page, letter
 from vipetsc.figures.panels import band_diagram, note
-from vipetsc.figures.spring_line import ROD, Point, draw_spring
 from vipetsc.figures.style import with_prefix
-from vipetsc.lattice import Spring, UnitCell
+from vipetsc.lattice import Chain, Spring, UnitCell
 from vipetsc.lattice.cell import GROUND
 from vipetsc.lattice.sites import Pair
 from vipetsc.wording import counted
@@ -36,6 +36,10 @@ SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
 LEGEND = "above: cell; below: clearance in mm; arrow: drive"
+ROD = {"color": style.BLACK, "lw": 0.7}  # the look of a spring's line
+DISTANCE = 0.2  # from the middle of a spring to its text, in units of the drawing
+LEVEL = 0.01  # component of a unit vector up to which it counts as zero
+Point = tuple[float, float]
 
 
 def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -46,8 +50,8 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     model = case.model()
     if len(model.chain.cell.springs) > MOST_SPRINGS:
         raise style.NoPicture(f"needs a cell of at most {MOST_SPRINGS} springs")
-    figure = style.new_figure(style.PAGE, 2.7)
-    upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
+    page = Page.of(rows=2, width=style.PAGE, height=2.7, height_ratios=(2.1, 1))
+    upper, lower = page.panels
     pairs: list[Pair] = []
     if model.chain.has_own_pairs:
         pairs = [*dict.fromkeys(model.chain.sites.pairs)]
@@ -58,14 +62,14 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     driven = walls.get(Case.of(run).drive.end or "", model.drive_cell)
     draw_lattice(lower, model.chain, driven)
 
-    title = "(a) Unit cell"
+    title = "Unit cell"
     differing = int(model.chain.differs.sum())
     if differing:
         title += f" of the case; {counted(differing, 'cell')} differ"
     upper.set_title(title)
     legend = LEGEND if model.drive.amplitude else LEGEND.replace("arrow: drive", "arrow: initial motion")
-    lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {legend}")
-    return figure
+    lower.set_title(f"Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {legend}")
+    return page.lettered()
 
 
 def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
@@ -76,16 +80,17 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     left, right = upper.subplots(1, 2, width_ratios=(1.55, 1))
     cell = case.lattice.unit_cell()
     draw_unit_cell(left, cell)
-    left.set_title(f"(a) Unit cell, {case.lattice.reading} reading")
+    left.set_title(f"Unit cell, {case.lattice.reading} reading")
     band_diagram(right, cell, case.drive.frequency)
-    right.set_title("(b) Bands; gaps shaded, drive dotted")
+    right.set_title("Bands; gaps shaded, drive dotted")
 
-    rows = lower.subplots(len(sites), 1, squeeze=False).flat
-    for i, (axes, count) in enumerate(zip(rows, sites, strict=True)):
+    rows = lower.subplots(len(sites), 1, squeeze=False).ravel()
+    for axes, count in zip(rows, sites, strict=True):
         model = case.varied(contacts={"sites": count, "clearance": None}).model()
         draw_lattice(axes, model.chain, model.drive_cell)
-        title = f"(c.{i + 1}) {counted(count, 'contact site')}"
-        axes.set_title(f"{title}; {LEGEND}" if i == 0 else title)
+        axes.set_title(counted(count, "contact site"))
+    rows[0].set_title(f"{rows[0].get_title('left')}; {LEGEND}")
+    letter([left, right, rows])
     return figure
 
 
@@ -94,8 +99,8 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
 
     ``masses`` in kg and ``springs`` in N/m are those of host and resonator, ``clearance`` is in m.
     """
-    figure = style.new_figure(style.PAGE * 0.72, 1.7)
-    axes = figure.subplots()
+    page = Page.of(width=style.PAGE * 0.72, height=1.7)
+    (axes,) = page.panels
     host = 2.6
     resonator = 6.6
     start = host + SIDE
@@ -123,7 +128,7 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
         axes.annotate(f"$u_{i + 1}$", (x, 0.85), (x + 0.95, 0.85), va="center", color=style.BLUE, arrowprops=arrow)
     axes.set(xlim=(-0.5, 8.0), ylim=(-0.95, 1.2), aspect="equal")
     axes.set_axis_off()
-    return figure
+    return page.lettered()
 
 
 class SpringEnd(NamedTuple):
@@ -390,3 +395,116 @@ def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell, has_sto
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
     caption = f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}"
     axes.text(x, y - TALL - 0.08, caption, ha="center", va="top", linespacing=1.3)
+
+
+def draw_spring(
+    axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13, zorder: int = 2
+) -> None:
+    """Draw a spring along ``corners``: a zigzag with straight leads on the longest leg, and ``text`` next to it.
+
+    The zigzag has ``turns`` turns, ``height`` to either side.
+    """
+    legs = np.stack([corners[:-1], corners[1:]], axis=1)
+    lengths = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
+    longest = int(np.argmax(lengths))
+    for leg in np.delete(legs, longest, axis=0):
+        axes.plot(*leg.T, zorder=2, **ROD)
+
+    start = legs[longest, 0]
+    along = legs[longest, 1] - start
+    across = np.array([-along[1], along[0]]) / np.hypot(*along)
+    # Straight leads of a fifth of the leg at either end; between them two turning points for each turn, at equal
+    # distances, on either side of the leg alternately.
+    position = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
+    swing = np.zeros(len(position))
+    swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)
+    points = start + position[:, None] * along + swing[:, None] * across
+    axes.plot(*points.T, zorder=zorder, solid_joinstyle="round", **ROD)
+
+    _write_beside(axes, start + along / 2, across, text)
+
+
+def _write_beside(axes: Axes, middle: np.ndarray, across: np.ndarray, text: str) -> None:
+    """Write ``text`` next to the ``middle`` of a spring's leg: above the leg, or on the right of an upright one.
+
+    ``across`` is a unit vector at right angles to the leg.
+    """
+    is_upright = abs(across[1]) < LEVEL
+    points_up = across[0] > 0 if is_upright else across[1] > 0
+    side = across if points_up else -across
+    place = {"ha": "center", "va": "bottom"}
+    # The text of an oblique leg begins, or ends, beside the leg: a text above its middle would lie on the zigzag.
+    if side[0] > LEVEL:
+        place["ha"] = "left"
+    elif side[0] < -LEVEL:
+        place["ha"] = "right"
+    if is_upright:
+        place["va"] = "center"
+    axes.text(*(middle + DISTANCE * side), text, **place)
+
+
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: float) -> None:
+    """Draw the lattice as a strip: its ends, drive and contacts with their cells and clearances.
+
+    ``drive_cell`` is 0-based, and lies beyond the last cell where a wall moves. Cells have a width of 1 on the axis,
+    and the strip a height of 1.
+    """
+    n = chain.cells
+    axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
+    # Borders of more cells would merge.
+    if n <= 150:
+        axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
+    if chain.ends == "fixed":
+        for wall in (0.5 - 0.02 * n, n + 0.5):
+            draw_wall(axes, (wall, -0.25), 0.02 * n, 1.5)
+        axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
+
+    # The arrow of the drive ends on the strip, or above the number of a site in the driven cell or next to it.
+    near = min((abs(site.cell - drive_cell) for site in chain.sites), default=n)
+    tip = 1.8 if near < 0.03 * n else 1.0
+    arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (drive_cell + 1, tip), (drive_cell + 1 + 0.02 * n, tip + 0.7), arrowprops=arrow)
+
+    if chain.sites:
+        _draw_sites(axes, chain)
+    else:
+        axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, ha="center", va="top")
+    axes.set(xlim=(0.5 - 0.035 * n, 0.5 + 1.035 * n), ylim=(-1.2, 2.6))
+    axes.set_axis_off()
+
+
+def _draw_sites(axes: Axes, chain: Chain) -> None:
+    """Draw a mark for every site, with its cell above and its clearance in mm below where there is room."""
+    n = chain.cells
+    width = min(max(0.006 * n, 1), 0.02 * n)
+    gaps = chain.sites.gaps
+    if has_equal_sides(gaps):
+        texts = [f"{1e3 * gap:#.3g}" for gap, _ in gaps]
+    else:
+        texts = [_gap_label(plus, minus) for plus, minus in gaps]
+    # From the left to the right, so that the first of a group of sites has the label.
+    last_labelled = -np.inf
+    for site, text in sorted(zip(chain.sites.cells.tolist(), texts, strict=True)):
+        axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
+
+        # A label takes about a twentieth of the strip: sites next to one with a label have none.
+        if site - last_labelled > 0.06 * n:
+            axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
+            below = {"color": style.VERMILION, "ha": "center", "va": "top", "linespacing": 1.0}
+            axes.text(site + 1, -0.2, text, **below)
+            last_labelled = site
+
+
+def _gap_label(plus: float, minus: float) -> str:
+    """Return the clearances in mm of a site's stops by their side, a line each; a stop that touches is 0."""
+    lines = []
+    for side, gap in (("+", plus), ("-", minus)):
+        if np.isfinite(gap):
+            # "+ 0.5": the stop on the side +, 0.5 mm away. The clearance of a pressed stop is negative: "+ -0.5".
+            lines.append(f"{side} {1e3 * gap:.4g}" if gap else "0")
+    return "\n".join(lines)
+
+
+def draw_wall(axes: Axes, corner: tuple[float, float], width: float, height: float) -> None:
+    """Draw a hatched wall from its lower left ``corner`` on."""
+    axes.add_patch(Rectangle(corner, width, height, fc="white", ec=style.GREY, hatch="//////", lw=0.0))

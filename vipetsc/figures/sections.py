@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case
-from vipetsc.figures import panels, style
+from vipetsc.figures import style
+from vipetsc.figures.page import Page
 from vipetsc.figures.style import Drawing, NoPicture
 from vipetsc.figures.sweep_members import MemberRun, Sweeps
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey
@@ -60,17 +61,14 @@ def poincare(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw velocity over displacement of each named point at the beginning of each period of the drive."""
     sections = sections_of(run)
     shown = sections[:MOST_POINTS]
-    figure = style.new_figure(style.PAGE if len(shown) > 1 else style.COLUMN, 2.6)
-    grid = figure.subplots(1, len(shown), squeeze=False)[0]
-    for axes, section in zip(grid, shown, strict=True):
+    page = Page.of(columns=len(shown), height=2.6)
+    for axes, section in zip(page.panels, shown, strict=True):
         axes.plot(section.displacement, section.velocity, ".", color=style.BLUE, ms=2.5, mew=0)
         axes.set(title=f"{section.point}: {len(section.velocity)} periods", xlabel="Displacement (m)")
-    grid[0].set_ylabel("Velocity (m/s)")
-    if len(shown) > 1:
-        panels.label_panels(grid)
+    page.panels[0].set_ylabel("Velocity (m/s)")
     if len(sections) > len(shown):
-        style.add_note(figure, f"the first {len(shown)} of {len(sections)} points")
-    return figure
+        style.add_note(page.figure, f"the first {len(shown)} of {len(sections)} points")
+    return page.lettered()
 
 
 class SweptStates(NamedTuple):
@@ -145,23 +143,20 @@ def _draw_bifurcation(branches: list[SweptStates]) -> Figure:
     points = list(branches[0].displacement)[:MOST_POINTS]
     with_exponents = any(np.isfinite(branch.exponents).any() for branch in branches)
     rows = len(points) + with_exponents
-    figure = style.new_figure(style.PAGE, 2.2 * rows + 0.3)
-    grid = figure.subplots(rows, 1, squeeze=False, sharex=True)[:, 0]
+    page = Page.of(rows, width=style.PAGE, height=2.2 * rows + 0.3, sharex=True)
     if with_exponents:
-        _draw_exponents(grid[-1], branches)
-    for axes, point in zip(grid[: len(points)], points, strict=True):
+        _draw_exponents(page.panels[-1], branches)
+    for axes, point in zip(page.panels, points, strict=False):
         for direction, look in LOOKS.items():
             for branch in branches:
                 if branch.direction == direction and point in branch.displacement:
                     drawn = branch.displacement[point]
                     axes.plot(branch.values, drawn, ls="", marker=".", mew=0, rasterized=True, **look)
         axes.set_ylabel(f"{point}: displacement once a period (m)")
-    grid[-1].set_xlabel(with_unit(key_name(branches[0].key.path), branches[0].key.unit))
+    page.panels[-1].set_xlabel(with_unit(key_name(branches[0].key.path), branches[0].key.unit))
     if len(branches) > 1:
-        grid[0].legend(loc="best", markerscale=3)
-    if rows > 1:
-        panels.label_panels(grid)
-    return figure
+        page.panels[0].legend(loc="best", markerscale=3)
+    return page.lettered()
 
 
 def _draw_exponents(axes: Axes, branches: list[SweptStates]) -> None:

@@ -14,9 +14,9 @@ from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.strip import StripTable
 from vipetsc.figures import panels, style
-from vipetsc.figures.layout import lay_out
 from vipetsc.figures.movie_frames import WIDTH, CheckedShot, Shot
-from vipetsc.figures.style import NoPicture
+from vipetsc.figures.page import Page
+from vipetsc.figures.style import NoPicture, lay_out
 from vipetsc.io.read import field_time
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.plane import PlaneCell
@@ -155,8 +155,8 @@ def bands(strip: StripTable, cell: UnitCell, frequency: float | None = None) -> 
         frequencies = point.frequency
         across = plane.across(point.vectors * np.sqrt(cell.masses)[:, None], kappa, strip.edges)
 
-    figure = style.new_figure(style.COLUMN, 3.0)
-    axes = figure.subplots()
+    page = Page.of(height=3.0)
+    (axes,) = page.panels
     points = np.stack(np.broadcast_arrays(kappa[:, None] / np.pi, frequencies / 1e3), axis=-1)
     segments = np.stack([points[:-1], points[1:]], axis=2)
     colours = across[:-1] / np.pi
@@ -175,7 +175,7 @@ def bands(strip: StripTable, cell: UnitCell, frequency: float | None = None) -> 
     axes.set(xlim=(0, 1), ylim=(0, 1.08 * passing[-1].high / 1e3), xlabel=panels.KAPPA, ylabel=panels.OMEGA)
     axes.set_title(f"{strip.rows} rows, {strip.edges} edges")
     panels.colour_bar(lines, axes, "|Wavenumber across| (π rad/row)", extend="neither")
-    return figure
+    return page.lettered()
 
 
 def snapshots(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -192,20 +192,16 @@ def snapshots(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     norm = _symmetric(fields)
     shape = (len(rows), 1) if strip.ratio > WIDE else (-(-len(rows) // 2), 2)
     height = shape[0] * (style.PAGE - 1.2) / shape[1] / strip.ratio
-    figure = style.new_figure(style.PAGE, min(height + 0.25 * shape[0] + 0.4, 9.0))
-    grid = figure.subplots(*shape, squeeze=False, sharex=True, sharey=True)
-    for axes, field, row in zip(grid.flat, fields, rows, strict=False):
+    height = min(height + 0.25 * shape[0] + 0.4, 9.0)
+    page = Page.of(*shape, width=style.PAGE, height=height, count=len(rows), sharex=True, sharey=True)
+    for axes, field, row in zip(page.panels, fields, rows, strict=True):
         mesh = strip.draw(axes, field, norm, "RdBu_r")
         axes.set_title(f"t = {time[row]:.4g} s")
         axes.label_outer()
-    for axes in grid.flat[len(rows) :]:
-        axes.set_axis_off()
-    if len(rows) > 1:
-        panels.label_panels(grid.flat[: len(rows)])
-    panels.colour_bar(mesh, grid, "Displacement (m)", extend="neither", aspect=40)
+    panels.colour_bar(mesh, page.grid, "Displacement (m)", extend="neither", aspect=40)
     if strip.plane.dofs > 1:
-        style.add_note(figure, f"degree of freedom 1 of the {strip.plane.dofs} of each cell")
-    return figure
+        style.add_note(page.figure, f"degree of freedom 1 of the {strip.plane.dofs} of each cell")
+    return page.lettered()
 
 
 def envelope(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -218,12 +214,12 @@ def envelope(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     for row in range(len(field_time(run))):
         largest = np.maximum(largest, strip.kinetic(run["velocity"][row].values))
 
-    figure = style.new_figure(style.PAGE, (style.PAGE - 1.2) / strip.ratio + 0.7)
-    axes = figure.subplots()
+    page = Page.of(width=style.PAGE, height=(style.PAGE - 1.2) / strip.ratio + 0.7)
+    (axes,) = page.panels
     mesh = strip.draw(axes, largest, panels.log_norm(largest, decades=DECADES), "inferno")
     axes.set_title("Largest kinetic energy of a cell at any time")
     panels.colour_bar(mesh, axes, "Energy (J)", cax=panels.bar_axes(axes))
-    return figure
+    return page.lettered()
 
 
 def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -235,8 +231,8 @@ def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if not content.any():
         raise NoPicture("nothing moves at the last sample")
 
-    figure = style.new_figure(style.COLUMN, 2.6)
-    axes = figure.subplots()
+    page = Page.of(height=2.6)
+    (axes,) = page.panels
     # From -pi to pi: of an even number of cells -pi is the first wave vector, and the last one, too.
     counts = content.shape
     along, across = (2 * np.arange(-(n // 2), n // 2 + 1) / n for n in counts)
@@ -252,7 +248,7 @@ def wave_vectors(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     axes.set_aspect("equal")
     axes.set_title(f"t = {field_time(run)[-1]:.4g} s")
     panels.colour_bar(image, axes, "Energy per wave vector (J)", cax=panels.bar_axes(axes))
-    return figure
+    return page.lettered()
 
 
 def _content(strip: Strip, run: xr.Dataset, row: int) -> np.ndarray:

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import Bbox
 
-from vipetsc.figures.layout import apply_aspects, lay_out, without_engine
 from vipetsc.figures.log_ticks import label_log_axes
 from vipetsc.figures.look import Look
 from vipetsc.figures.prefixed_units import prefix_units
@@ -240,8 +239,13 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
     # The canvas that measures text for the layout prints it too, and remembers what it has measured.
     FigureCanvasAgg(figure)
     if heading:
-        figure.suptitle("\n".join(wrap(heading, int(HEADING_LETTERS * width))))
+        figure.suptitle(wrapped_heading(heading, width))
     return figure
+
+
+def wrapped_heading(heading: str, width: float) -> str:
+    """Return a ``heading`` in lines of ``width`` inches."""
+    return "\n".join(wrap(heading, int(HEADING_LETTERS * width)))
 
 
 def add_note(figure: Figure, sentence: str) -> None:
@@ -350,3 +354,41 @@ def draw_each(
         # Asked for only now: a counter of all ranks must not give a number to a rank that is still drawing.
         turn = next(turns, None)
     return written
+
+
+def lay_out(figure: Figure) -> None:
+    """Place the axes of ``figure`` by its layout engine, and remove the engine: they then stay where they are."""
+    figure.get_layout_engine().execute(figure)
+    remove_engine(figure)
+
+
+def remove_engine(figure: Figure) -> None:
+    """Leave ``figure`` without a layout engine: its axes stay where they are."""
+    # ``set_layout_engine("none")`` would give the figure an engine that does nothing, with which ``savefig`` draws it
+    # twice. None gives it the engine that the settings ask for, here none.
+    with without_engine():
+        figure.set_layout_engine(None)
+
+
+@contextmanager
+def without_engine() -> Iterator[None]:
+    """Let the settings ask for no layout engine within the block; ``savefig`` gives a figure that has none theirs."""
+    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        yield
+
+
+def apply_aspects(figure: Figure) -> None:
+    """Give all axes of ``figure`` the frames that matplotlib gives them when it draws the figure."""
+    renderer = pixel_canvas(figure).get_renderer()
+    for axes in figure.get_axes():
+        # Colour bars have a locator, which says where they stand next to their map.
+        locator = axes.get_axes_locator()
+        axes.apply_aspect(locator(axes, renderer) if locator else None)
+
+
+def pixel_canvas(figure: Figure) -> FigureCanvasAgg:
+    """Return the canvas of ``figure`` if it draws pixels, else a new one: a user's module may have made another."""
+    canvas = figure.canvas
+    if not isinstance(canvas, FigureCanvasAgg):
+        canvas = FigureCanvasAgg(figure)
+    return canvas

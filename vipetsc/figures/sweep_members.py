@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
-from vipetsc.figures import style
-from vipetsc.figures.panels import label_panels, recorded_sites
+from vipetsc.figures.page import Page
+from vipetsc.figures.panels import recorded_sites
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.swept_axes import SweptAxis, in_pi
 from vipetsc.io.netcdf import naming_spoilt, open_netcdf
@@ -169,14 +169,12 @@ class AmplitudeSeries(NamedTuple):
         drives = zip(LEVELS, (run.case.drive for run in self.runs), strict=True)
         return [f"{level} amplitude, {drive.amplitude:g} {drive_unit(drive)}" for level, drive in drives]
 
-    def page(self, rows: int, height: float, **shared: Any) -> tuple[Figure, np.ndarray]:
-        """Return a figure with a column of panels (row, column) for each amplitude, lettered and headed."""
-        figure = style.new_figure(style.PAGE, height, self.title)
-        grid = figure.subplots(rows, len(self.runs), squeeze=False, **shared)
-        for panel, heading in zip(grid[0], self.headings, strict=True):
+    def page(self, rows: int, height: float, **shared: Any) -> Page:
+        """Return a page with a column of panels for each amplitude, headed."""
+        page = Page.of(rows, len(self.runs), height=height, heading=self.title, **shared)
+        for panel, heading in zip(page.grid[0], self.headings, strict=True):
             panel.set_title(heading)
-        label_panels(grid)
-        return figure, grid
+        return page
 
     def snapshot_times(self) -> np.ndarray:
         """Return times (4,) in s of the linear wave: midway to the first site, at it, past the last one, near the end.

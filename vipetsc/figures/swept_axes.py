@@ -1,7 +1,6 @@
 """The axes of a sweep as pictures name them: keys by their path in the case, values with units, scales of numbers."""
 
 import tomllib
-from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple, Self
 
@@ -193,8 +192,3 @@ def in_pi(wavenumber: float) -> str:
     if near.denominator > 1:
         text += f"/{near.denominator}"
     return text
-
-
-def joined(parts: Sequence[str]) -> str:
-    """Return the ``parts`` as a phrase: "a", "a and b", "a, b and c"."""
-    return " and ".join(filter(None, [", ".join(parts[:-1]), *parts[-1:]]))

@@ -9,9 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from string import ascii_lowercase
 from textwrap import wrap
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,10 +21,11 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
+from vipetsc.figures.page import Page, letter
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, phrase, transfer_members
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
-from vipetsc.io.read import field_interval, field_time, first_site, nearest_cell
+from vipetsc.io.read import field_interval, field_time, nearest_cell
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, taper
 
@@ -77,10 +77,9 @@ def nine_panels(member: MemberRun) -> Figure:
     """
     run = member.run
     cell = member.model.chain.cell
-    tags = iter(ascii_lowercase)
     figure = style.new_figure(style.PAGE, 7.6, member.labels.member)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
-    _draw_space_time(upper, member, tags)
+    _draw_space_time(upper, member)
 
     # Both segments have one scale, and each the mark that it has in the space-time map.
     spectra = panels.below_cutoff(member.analysis, cell, list(SEGMENTS))
@@ -88,7 +87,7 @@ def nine_panels(member: MemberRun) -> Figure:
     maps = middle.subplots(1, 2, sharey=True)
     for axes, (name, segment) in zip(maps, SEGMENTS.items(), strict=True):
         image = panels.dispersion_map(axes, spectra[name], norm, cell)
-        axes.set_title(f"({next(tags)}) {segment.label}")
+        axes.set_title(segment.label)
         axes.plot(
             [0.03, 0.03], [0.03, 0.97], color=segment.colour, lw=2.2, path_effects=OUTLINE, transform=axes.transAxes
         )
@@ -101,14 +100,15 @@ def nine_panels(member: MemberRun) -> Figure:
     for axes, number in zip(both, cells, strict=True):
         index = nearest_cell(run, number)
         peaks.append(_draw_spectra(axes, member, run["velocity"][:, index].values))
-        axes.set_title(f"({next(tags)}) Velocity spectra, cell {run['cell'].values[index]}")
+        axes.set_title(f"Velocity spectra, cell {run['cell'].values[index]}")
         axes.label_outer()
     # Their axis is common.
     both[0].set_ylim(_spectra_limits(peaks))
+    letter([*upper.axes[: 1 + len(member.analysis[FIELD])], *maps, *both])
     return figure
 
 
-def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) -> None:
+def _draw_space_time(page: SubFigure, member: MemberRun) -> None:
     """Draw kinetic energy of all frequencies and of each pass band with one scale of colours; segments are marked."""
     run = member.run
     energy = member.analysis["kinetic_energy"]
@@ -120,12 +120,12 @@ def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) ->
 
     whole = page.add_subplot(grid[:, 0])
     image = panels.space_time_map(whole, energy, norm, run)
-    whole.set_title(f"({next(tags)}) Kinetic energy")
+    whole.set_title("Kinetic energy")
     for i, field in enumerate(fields):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
         panels.draw_map(axes, energy["time"].values, energy["cell"].values, field.values.T, norm)
         part = parts[int(field["bands/band"]) - 1]
-        axes.set(title=f"({next(tags)}) {part.capitalize()}", xlabel="Time (s)")
+        axes.set(title=part.capitalize(), xlabel="Time (s)")
         axes.label_outer()
     panels.colour_bar(image, page.axes, "Kinetic energy of a cell (J)", aspect=35)
     _mark_segments(whole, member)
@@ -134,7 +134,8 @@ def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) ->
 def _mark_segments(axes: Axes, member: MemberRun) -> None:
     """Draw lines along the cells before and behind the first site, on the right edge of a map over cells."""
     cells = member.analysis["kinetic_energy"]["cell"].values
-    first = member.run["sites/cell"].values[first_site(member.run)]
+    sites = member.run["sites/cell"].values
+    first = sites[member.case.nearest_site(sites)]
     lower_cells = (cells[0], first - 1)
     higher_cells = (first + 1, cells[-1])
     driven_below = member.model.drive_cell + 1 <= first
@@ -266,10 +267,12 @@ def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: 
     """Draw panels in rows of ``columns``; colours are over five decades below the largest value of each panel."""
     columns = min(len(shown), columns, MOST_COLUMNS)
     rows = -(-len(shown) // columns)
-    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * rows, heading)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    # A full grid is a table.
+    count = len(shown) % (rows * columns)
+    options = {"sharex": True, "sharey": True}
+    page = Page.of(rows, columns, width=style.PAGE, height=0.4 + 2.1 * rows, heading=heading, count=count, **options)
     letters = int(LETTERS * style.PAGE / columns)
-    for axes, (member_folder, text) in zip(grid.flat, shown, strict=False):
+    for axes, (member_folder, text) in zip(page.panels, shown, strict=True):
         axes.set_title("\n".join(wrap(text, letters)))
         if member_folder is None:
             panels.annotate_empty(axes, "no such run")
@@ -283,17 +286,13 @@ def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: 
         transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
         axes.text(0.03, 0.41, transferred, color="white", transform=axes.transAxes)
 
-    for axes in grid.flat[len(shown) :]:
-        axes.set_axis_off()
     if columns == MOST_COLUMNS:
         # Narrow panels have no room for labels of their own.
-        figure.supxlabel(panels.KAPPA)
-        for axes in grid.flat:
+        page.body.supxlabel(panels.KAPPA)
+        for axes in page.panels:
             axes.set_xlabel("")
-    if len(shown) > 1:
-        panels.label_panels(grid if len(shown) == grid.size else grid.flat[: len(shown)])
-    panels.colour_bar(image, grid, "Energy per bin / maximum", aspect=35)
-    return figure
+    panels.colour_bar(image, page.grid, "Energy per bin / maximum", aspect=35)
+    return page.lettered()
 
 
 def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
@@ -341,15 +340,17 @@ def energies_over_time(member: MemberRun) -> Figure:
     series = np.stack([time, total, parts.sum(axis=0), *parts])
     mean_time, mean_total, mean_sum, *mean_parts = sliding_window_view(series, samples, axis=1).mean(axis=2)
 
-    figure = style.new_figure(style.PAGE * 0.8, 4.2, member.labels.member)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
+    width = style.PAGE * 0.8
+    options: dict[str, Any] = {"sharex": True, "height_ratios": (2.4, 1)}
+    page = Page.of(rows=2, width=width, height=4.2, heading=member.labels.member, **options)
+    upper, lower = page.panels
     draw_parts(upper, mean_time, analysis["bands/energy"].attrs["parts"], mean_parts)
     upper.plot(mean_time, mean_total, color=style.BLACK, lw=1.6, label="total")
     upper.plot(mean_time, mean_sum, color=style.SKY, lw=0.8, ls="--", label="sum of parts")
     top = total.max() or 1.0
     upper.set(yscale="log", ylim=(top * 10.0**-DECADES, 3 * top), ylabel="Kinetic energy (J)")
     upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    upper.set_title("(a) Parts of the frequency axis, mean over a period of the drive")
+    upper.set_title("Parts of the frequency axis, mean over a period of the drive")
 
     error = closing_error(parts, total, samples)
     # Sums that agree to the last bit would leave gaps in the curve.
@@ -360,8 +361,8 @@ def energies_over_time(member: MemberRun) -> Figure:
     text = f"whole record: {100 * whole_record:.2g} %; at most 1 % for {100 * below:.3g} % of the time"
     lower.text(0.5, 0.93, text, ha="center", va="top", transform=lower.transAxes)
     lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=time[[0, -1]], xlabel="Time (s)", ylabel="Error (%)")
-    lower.set_title("(b) Sum of the parts compared with the total")
-    return figure
+    lower.set_title("Sum of the parts compared with the total")
+    return page.lettered()
 
 
 def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:

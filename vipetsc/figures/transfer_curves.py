@@ -9,7 +9,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from string import ascii_lowercase
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -20,7 +19,8 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
-from vipetsc.figures.panels import label_panels, note, quantile_band, recorded_sites, shade_regions
+from vipetsc.figures.page import Page
+from vipetsc.figures.panels import note, quantile_band, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
 from vipetsc.figures.series import Series
 from vipetsc.figures.style import Drawing
@@ -83,14 +83,12 @@ def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable
     if len(shown) > 1:
         width = style.PAGE
     varied = str(shown[0].data.get("varied", ""))
-    figure = style.new_figure(width, 2.9, Labels.of(shown[0].case, varied).page)
-    grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for axes, curve in zip(grid, shown, strict=True):
+    heading = Labels.of(shown[0].case, varied).page
+    page = Page.of(columns=len(shown), width=width, height=2.9, heading=heading, sharey=True)
+    for axes, curve in zip(page.panels, shown, strict=True):
         axes.set_title(panel(axes, curve))
-    if len(shown) > 1:
-        label_panels(grid)
-    grid[0].set_ylabel(ylabel)
-    return figure
+    page.panels[0].set_ylabel(ylabel)
+    return page.lettered()
 
 
 def sampled_points(sweeps: Sweeps) -> Iterator[TransferCurve]:
@@ -125,15 +123,11 @@ def _page(reading: str, page_curves: Sequence[TransferCurve], points: Sequence[T
     laws = sorted({curve.case.contacts.law for curve in page_curves}, reverse=True)
     kinds = list(dict.fromkeys(Labels.of(curve.case).configuration for curve in page_curves))
     looks = {kind: _Look(kind, f"C{i}", MARKERS[i % len(MARKERS)]) for i, kind in enumerate(kinds)}
-    width = style.COLUMN
-    if len(laws) > 1:
-        width = style.PAGE
-    figure = style.new_figure(width, 4.6)
-    grid = figure.subplots(2, len(laws), sharey="row", squeeze=False)
-    figure.supxlabel("Amplitude of the drive (N)")
-    figure.supylabel("Inter-band transfer (1)")
+    page = Page.of(2, len(laws), height=4.6, sharey="row")
+    page.body.supxlabel("Amplitude of the drive (N)")
+    page.body.supylabel("Inter-band transfer (1)")
 
-    for tag, (linear, logarithmic), law in zip(ascii_lowercase, grid.T, laws, strict=False):
+    for (linear, logarithmic), law in zip(page.grid.T, laws, strict=True):
         law_curves = [curve for curve in page_curves if curve.case.contacts.law == law]
         for row, curve in enumerate(law_curves):
             kind = Labels.of(curve.case).configuration
@@ -145,14 +139,14 @@ def _page(reading: str, page_curves: Sequence[TransferCurve], points: Sequence[T
             _mark_peak(linear, curve, looks[kind], row)
 
         reach = max(REACH * curve.data[AMPLITUDE][curve.data["peak"]] for curve in law_curves)
-        linear.set(title=f"({tag}.i) {law.capitalize()}, {reading}", xlim=(0, float(reach)))
-        logarithmic.set(title=f"({tag}.ii) {law.capitalize()}, {reading}", xscale="log", yscale="log")
+        linear.set(title=f"{law.capitalize()}, {reading}", xlim=(0, float(reach)))
+        logarithmic.set(title=f"{law.capitalize()}, {reading}", xscale="log", yscale="log")
         logarithmic.legend(loc="upper right")
 
     # The limits of all columns, once all is drawn: their axes are common.
-    grid[0, 0].set_ylim(0, None)
-    grid[1, 0].set_ylim(None, 6.0)
-    return figure
+    page.grid[0, 0].set_ylim(0, None)
+    page.grid[1, 0].set_ylim(None, 6.0)
+    return page.lettered()
 
 
 def _draw_curve(axes: Axes, curve: TransferCurve, look: _Look, name_band: bool) -> None:
@@ -376,6 +370,7 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
     transfer.set(xscale="log", yscale="log")
     transfer.set(xlabel=f"Amplitude of the drive ({unit})", ylabel="Inter-band transfer (1)")
     transfer.margins(x=0.08, y=0.12)
+    # By hand: the numbers of the panels are those of the points in the first one.
     transfer.set_title("(a) Transfer to higher bands")
     right.supxlabel("Displacement $u$ (mm)\nblue: resonator, red and dashed: host")
     right.supylabel(r"Velocity $\dot u$ (m/s)")

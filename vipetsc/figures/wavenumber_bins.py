@@ -29,7 +29,7 @@ from scipy.ndimage import gaussian_filter
 
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import ROMAN
+from vipetsc.figures.page import letter
 from vipetsc.figures.scattering import MOMENTS
 from vipetsc.figures.sweep_members import AmplitudeSeries, MemberRun, from_series
 from vipetsc.io.read import field_time
@@ -118,10 +118,10 @@ def partition(series: AmplitudeSeries) -> Figure:
     # A panel for each bin that is shown, and the last one for the driven band.
     grid = upper.subplots(2, SHOWN // 2 + 1)
     *maps, band = grid.flat
-    for axes, b, roman in zip(maps, bins, ROMAN, strict=False):
+    for axes, b in zip(maps, bins, strict=False):
         image = panels.space_time_map(axes, field[b], norm, medium.run)
         is_left = axes in grid[:, 0]
-        axes.set(title=f"(a.{roman}) $K_{{{b + 1}}}$", ylabel="Cell" if is_left else "")
+        axes.set(title=f"$K_{{{b + 1}}}$", ylabel="Cell" if is_left else "")
         axes.tick_params(labelleft=is_left)
     for axes in maps[len(bins) :]:
         axes.set_axis_off()
@@ -129,14 +129,15 @@ def partition(series: AmplitudeSeries) -> Figure:
     _draw_driven_band(band, series, colours)
 
     contours = lower.subplots(1, 3, sharey=True)
-    for axes, roman, heading, member in zip(contours, ROMAN, series.headings, series.runs, strict=False):
+    for axes, heading, member in zip(contours, series.headings, series.runs, strict=True):
         _draw_contours(axes, member, colours)
-        axes.set(title=f"(b.{roman}) {heading}", xlabel="Time (s)")
+        axes.set(title=heading, xlabel="Time (s)")
     contours[0].set_ylabel("Cell")
     number = np.arange(1, len(colours) + 1)
     bounds = np.append(0, number) + 0.5
     keys = mpl.cm.ScalarMappable(BoundaryNorm(bounds, len(colours)), ListedColormap(colours))
     panels.colour_bar(keys, contours, "Bin", ticks=number, extend="neither")
+    letter([maps[: len(bins)], contours, band])
     return figure
 
 
@@ -150,7 +151,7 @@ def _draw_driven_band(axes: Axes, series: AmplitudeSeries, colours: np.ndarray) 
         frequency = bloch(medium.model.chain.cell, kappa).frequency[:, wave.band - 1]
         axes.plot(kappa / np.pi, frequency / 1e3, color=colour, lw=3, solid_capstyle="butt")
     axes.axvline(wave.wavenumber / np.pi, color=style.BLACK, lw=0.6, ls=":")
-    axes.set(title=f"(c) Band {wave.band} by bin", xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
+    axes.set(title=f"Band {wave.band} by bin", xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
 
 
 def _draw_contours(axes: Axes, member: MemberRun, colours: np.ndarray) -> None:
@@ -194,8 +195,8 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
     cells alone, which makes them smaller still. In a single cell m v_b v_c has either sign.
     """
     unit = drive_unit(series.medium.case.drive)
-    figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
-    for (energies, errors, crosses), member in zip(grid.T, series.runs, strict=True):
+    page = series.page(3, 5.0, sharex="col", sharey="row")
+    for (energies, errors, crosses), member in zip(page.grid.T, series.runs, strict=True):
         analysis = member.analysis
         time = analysis["partition/snapshot"].values
         kinetic = analysis["partition/kinetic"].values
@@ -216,13 +217,14 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
         crosses.set(ylim=(0, 1), xlabel="Time (s)", xlim=time[[0, -1]])
         crosses.locator_params(axis="x", nbins=5)
 
-    grid[0, 0].set(ylabel=f"Kinetic energy / A² (J/{unit}²)", ylim=(0, None))
-    grid[0, 0].legend(loc="upper left")
-    grid[1, 0].set(ylabel="Relative error")
+    energies, errors, crosses = page.grid[:, 0]
+    energies.set(ylabel=f"Kinetic energy / A² (J/{unit}²)", ylim=(0, None))
+    energies.legend(loc="upper left")
+    errors.set(ylabel="Relative error")
     limit = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
-    panels.note(grid[1, 0], f"{100 * COMPLETE:g} %", (1, COMPLETE), (-2, -2), **limit)
-    grid[2, 0].set(ylabel="Fraction of KE between bins")
-    return figure
+    panels.note(errors, f"{100 * COMPLETE:g} %", (1, COMPLETE), (-2, -2), **limit)
+    crosses.set(ylabel="Fraction of KE between bins")
+    return page.lettered()
 
 
 class Snapshot(NamedTuple):
@@ -282,7 +284,7 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.8), wspace=0.1)
     above, below = left.subplots(2, 1, sharex=True)
     above.plot(cells, snapshot.velocity, color=style.BLACK, lw=0.4)
-    title = f"(a) Snapshot at t = {snapshot.time:.3g} s"
+    title = f"Snapshot at t = {snapshot.time:.3g} s"
     above.set(title=title, ylabel="Host velocity (m/s)", xlim=cells[[0, -1]])
     _draw_domain(below, cells, snapshot, bounds)
 
@@ -290,14 +292,14 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     norm = panels.log_norm(field[bins], decades=BINS_DECADES)
     grid = right.subplots(len(bins), 2, sharex="col", sharey="col", squeeze=False)
     # Bins rise upwards, as in the wavelet domain.
-    for roman, b, (trace, energy) in zip(ROMAN, reversed(bins), grid, strict=False):
+    for b, (trace, energy) in zip(reversed(bins), grid, strict=True):
         trace.plot(cells, snapshot.parts[b], color=colours[b], lw=0.5)
-        trace.set(title=f"(c.{roman}) Velocity (m/s) of $K_{{{b + 1}}}$", xlim=cells[[0, -1]], ylim=(-largest, largest))
+        trace.set(title=f"Velocity (m/s) of $K_{{{b + 1}}}$", xlim=cells[[0, -1]], ylim=(-largest, largest))
         trace.yaxis.tick_right()
 
         image = panels.space_time_map(energy, field[b], norm, member.run)
         energy.axvline(snapshot.time, color="white", lw=0.6)
-        energy.set(title=f"(d.{roman}) Energy of $K_{{{b + 1}}}$", xlabel="")
+        energy.set(title=f"Energy of $K_{{{b + 1}}}$", xlabel="")
 
         # The domain shows no wavenumbers below the lowest node and none above pi.
         middle = np.clip(0.5 * (bounds[b] + bounds[b + 1]), snapshot.nodes.kappa[0], np.pi)
@@ -306,6 +308,7 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     grid[-1, 0].set_xlabel("Cell")
     grid[-1, 1].set_xlabel("Time (s)")
     panels.colour_bar(image, grid[:, 1], "Energy of a bin in a cell (J)", aspect=40)
+    letter([above, below, *grid.T])
     return figure
 
 
@@ -337,4 +340,4 @@ def _draw_domain(axes: Axes, cells: np.ndarray, snapshot: Snapshot, bounds: np.n
     for number, (middle, colour) in enumerate(zip(middles, bin_colours(len(middles)), strict=True), 1):
         text = {"ha": "right", "va": "center", "fontsize": 5.5, "fontweight": "bold", "color": colour}
         axes.text(0.985, middle, f"{number}", transform=axes.get_yaxis_transform(), **text)
-    axes.set(title="(b) Wavelets |X| and bins", xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))
+    axes.set(title="Wavelets |X| and bins", xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))

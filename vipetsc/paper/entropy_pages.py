@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.measure_panels import cell_edges
+from vipetsc.figures.page import Page, legend_entries
 from vipetsc.figures.panels import percentile_norm, quantile_band
 from vipetsc.figures.series import Series
 from vipetsc.figures.style import Drawing
@@ -27,6 +28,7 @@ AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1, with room for the text above the peak
 FEWEST = 4  # amplitudes of a sweep with pages: with fewer, a peak and a power law beyond it cannot be seen
+MOST_ENTRIES = 6  # of the legend: three averages, samples, another reading, the power law
 MOST_COLUMNS = 3  # of histories: each is then as wide as a third of a page
 FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
 
@@ -166,8 +168,10 @@ def _driven_wavenumber(row: xr.Dataset, ensemble: xr.Dataset) -> str:
 
 def _entropy(facet: Facet, average: str) -> Figure:
     """Draw an average over the amplitude for each row: with the other averages, and below in logarithms."""
-    figure, grid = _panels(2, len(facet.rows), 1.55, facet.heading(f"{AVERAGES[average]} mean entropy"))
-    for (upper, lower), row in zip(grid.T, facet.rows, strict=True):
+    columns = 3 if len(facet.rows) > 4 else 2
+    heading = facet.heading(f"{AVERAGES[average]} mean entropy")
+    page = _page(2, len(facet.rows), 1.55, heading, legend=-(-MOST_ENTRIES // columns))
+    for (upper, lower), row in zip(page.grid.T, facet.rows, strict=True):
         upper.set_title(facet.row_title(row))
         curve = _curve_or_reason(upper, row, average)
         if curve is None:
@@ -185,12 +189,12 @@ def _entropy(facet: Facet, average: str) -> Figure:
         _draw_other_readings(lower, facet.ensemble, row, average)
         _draw_log_panel(lower, curve, average, size=2.2)
 
-    for axes in grid[0]:
+    for axes in page.grid[0]:
         axes.set_xlabel("A (N)")
-    panels.label_panels(grid)
-    figure.supylabel("Normalised entropy")
-    _add_legend(figure, grid, columns=3 if len(facet.rows) > 4 else 2)
-    return figure
+    page.body.supylabel("Normalised entropy")
+    entries = legend_entries(page.panels)
+    page.write_legend(entries.values(), entries.keys(), columns)
+    return page.lettered()
 
 
 def _draw_other_readings(axes: Axes, ensemble: xr.Dataset, row: xr.Dataset, average: str) -> None:
@@ -206,26 +210,13 @@ def _draw_other_readings(axes: Axes, ensemble: xr.Dataset, row: xr.Dataset, aver
             axes.plot(other.amplitude, other.value, label=f"{reading} reading", **line)
 
 
-def _add_legend(figure: Figure, grid: np.ndarray, columns: int) -> None:
-    """Write one legend for all panels of ``grid`` into a strip below them, each label once."""
-    handles = {}
-    for axes in grid.flat:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            handles[label] = handle
-
-    rows = -(-len(handles) // columns)
-    strip = (0.05 + 0.13 * rows) / figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0, strip, 1, 1 - strip))
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns)
-
-
 def _entropy_all(facet: Facet, average: str) -> Figure:
     """Draw an average in logarithms: wavenumbers in rows, configurations in columns."""
     by_wavenumber = grouped(facet.rows, partial(_driven_wavenumber, ensemble=facet.ensemble))
     columns = len(facet.rows) // len(by_wavenumber)
     heading = facet.heading(f"{AVERAGES[average]} mean entropy", wave=False)
-    figure, grid = _panels(len(by_wavenumber), columns, 1.25, heading)
-    for line, (wavenumber, rows) in zip(grid, by_wavenumber.items(), strict=True):
+    page = _page(len(by_wavenumber), columns, 1.25, heading)
+    for line, (wavenumber, rows) in zip(page.grid, by_wavenumber.items(), strict=True):
         line[0].set_ylabel(wavenumber)
         for axes, row in zip(line, rows, strict=True):
             curve = _curve_or_reason(axes, row, average)
@@ -235,10 +226,9 @@ def _entropy_all(facet: Facet, average: str) -> Figure:
                 _draw_log_panel(axes, curve, average, size=1.6)
             axes.label_outer()
 
-    for axes, row in zip(grid[0], facet.rows, strict=False):
+    for axes, row in zip(page.grid[0], facet.rows, strict=False):
         axes.set_title(facet.row_title(row))
-    panels.label_panels(grid)
-    return figure
+    return page.lettered()
 
 
 def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve | None:
@@ -253,14 +243,14 @@ def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve 
     return curve
 
 
-def _panels(rows: int, columns: int, height: float, heading: str) -> tuple[Figure, np.ndarray]:
-    """Return a page with a grid of panels over the amplitude, each row ``height`` inches."""
+def _page(rows: int, columns: int, height: float, heading: str, legend: int = 0) -> Page:
+    """Return a page of panels over the amplitude, each row ``height`` inches, with so many lines of a ``legend``."""
     width = style.PAGE * max(columns, 4) / 6
-    figure = style.new_figure(width, 0.6 + rows * height, heading)
-    grid = figure.subplots(rows, columns, sharex="row", sharey="row", squeeze=False)
-    for axes in grid[-1]:
+    whole = 0.6 + rows * height
+    page = Page.of(rows, columns, width=width, height=whole, heading=heading, legend=legend, sharex="row", sharey="row")
+    for axes in page.grid[-1]:
         axes.set_xlabel("A (N)")
-    return figure, grid
+    return page
 
 
 def _draw_points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
@@ -306,8 +296,10 @@ def _history(facet: Facet) -> Figure:
     columns = min(len(facet.rows), MOST_COLUMNS)
     rows = -(-len(facet.rows) // columns)
     width = max(style.PAGE * columns / MOST_COLUMNS, style.COLUMN)
-    figure = style.new_figure(width, 0.7 + 1.9 * rows, facet.heading("entropy H(t) at each amplitude"))
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    heading = facet.heading("entropy H(t) at each amplitude")
+    count = len(facet.rows)
+    options = {"sharex": True, "sharey": True}
+    page = Page.of(rows, columns, width=width, height=0.7 + 1.9 * rows, heading=heading, count=count, **options)
 
     # One scale of colours for all panels, from the times over which averages are taken: from the wave's arrival at the
     # first site on.
@@ -316,20 +308,15 @@ def _history(facet: Facet) -> Figure:
         row["entropy/history"].where(row["entropy/time"] >= start)
         for row, start in zip(facet.rows, starts, strict=True)
     )
-    for axes, row, start in zip(grid.flat, facet.rows, starts, strict=False):
+    for axes, row, start in zip(page.panels, facet.rows, starts, strict=True):
         image = _draw_history(axes, row, norm)
         axes.set_title(facet.row_title(row))
         if start > 0:
             axes.axvline(start, color="white", lw=0.7, ls="--")
-    for axes in grid.flat[len(facet.rows) :]:
-        axes.set_axis_off()
-    if len(facet.rows) > 1:
-        panels.label_panels(grid.flat[: len(facet.rows)])
-
-    figure.supxlabel("Time (s)")
-    figure.supylabel("Amplitude A (N)")
-    panels.colour_bar(image, grid, "H(t) (bit)", extend="both")
-    return figure
+    page.body.supxlabel("Time (s)")
+    page.body.supylabel("Amplitude A (N)")
+    panels.colour_bar(image, page.grid, "H(t) (bit)", extend="both")
+    return page.lettered()
 
 
 def _draw_history(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
