@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 import vipetsc
-from vipetsc.cli.chapters import KEYS, chapter, parts
+from vipetsc.cli.verbs.reference_verbs import KEYS, chapter, parts
 
 PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"

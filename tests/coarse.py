@@ -8,7 +8,7 @@ from collections.abc import Callable
 def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
     """Make pictures coarse and leave out their layout, the slowest step; ``replace`` acts as ``setattr`` does."""
     from vipetsc.figures import style
-    from vipetsc.figures.layout import remove_engine
+    from vipetsc.figures.style import remove_engine
 
     replace(style, "SCREEN", 80)
     replace(style, "_lay_out", remove_engine)

@@ -18,6 +18,11 @@ def shortened(items: Sequence[object]) -> str:
     return shown
 
 
+def joined(parts: Sequence[str]) -> str:
+    """Return the ``parts`` as a phrase: "a", "a and b", "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(parts[:-1]), *parts[-1:]]))
+
+
 def system_number(error: Exception) -> int:
     """Return the number of the system's error that an ``error`` of Python or HDF5 reports; 0 without one."""
     # HDF5 gives the number in its message alone.

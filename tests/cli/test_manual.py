@@ -12,7 +12,7 @@ import pytest
 
 import vipetsc
 from tests.cli.browser import NEEDED, SCREENS, browsing
-from vipetsc.cli.chapters import KEYS, parts
+from vipetsc.cli.verbs.reference_verbs import KEYS, parts
 
 ROOT = Path(vipetsc.__file__).parents[1]
 CHAPTERS = {path.stem for path in (ROOT / "vipetsc/manual").glob("*.md")}

@@ -19,8 +19,7 @@ from vipetsc.case.drive import DriveTable
 from vipetsc.case.reading import read_section, sections_in
 from vipetsc.case.section import CaseError
 from vipetsc.case.verb_cases import SECTIONS, load_every
-from vipetsc.cli.chapters import KEYS
-from vipetsc.cli.verbs.reference_verbs import schema_of
+from vipetsc.cli.verbs.reference_verbs import KEYS, schema_of
 from vipetsc.cli.verbs.verb_list import VERBS
 
 ROOT = Path(package.__file__).parents[1]

@@ -7,7 +7,7 @@ import xarray as xr
 
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, Sweeps
-from vipetsc.paper.pages import PAGES
+from vipetsc.paper.paper_figures import PAGES
 
 AMPLITUDES = [1.0, 4.0, 16.0, 64.0, 256.0]  # N
 

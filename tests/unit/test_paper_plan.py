@@ -20,12 +20,12 @@ from vipetsc.case import Case
 from vipetsc.io.folder import FolderError, claimed
 from vipetsc.io.kinds import SEARCH
 from vipetsc.paper import make
-from vipetsc.paper.build_record import read_record
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.claims.criteria import UNMEASURED
 from vipetsc.paper.claims.measure import measure_claims
 from vipetsc.paper.paper_figures import TRANSFER
 from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, STALE, PaperStep, Plan, paper_plan
+from vipetsc.paper.steps import read_record
 from vipetsc.parallel import StopRequest
 
 ROOT = Path(__file__).parents[2]

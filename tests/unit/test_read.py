@@ -1,4 +1,4 @@
-"""Results are read by names and values: the variables and first site of a run, members of a sweep, their folders."""
+"""Results are read by names and values: the variables and nearest site of a run, members of a sweep, their folders."""
 
 import h5py
 import numpy as np
@@ -6,13 +6,13 @@ import pytest
 import xarray as xr
 
 from tests.conftest import with_every_variable
+from vipetsc.case import Case
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import (
     RUN_NEEDS,
     curves,
     field_interval,
     field_time,
-    first_site,
     nearest_cell,
     open_ensemble,
     open_run,
@@ -95,7 +95,7 @@ def test_a_run_is_read_by_name(run):
         # The cells of the sites differ from the coordinate ``cell``, the recorded cells.
         assert list(data["sites/cell"].values) == [3, 20, 14]
         # The drive is in cell 12, two cells from the third site.
-        assert first_site(data) == 2
+        assert Case.of(data).nearest_site(data["sites/cell"].values) == 2
 
         assert [nearest_cell(data, cell) for cell in (1, 4, 20, 99)] == [0, 1, 6, 9]
         assert list(field_time(data)) == [0, 1, 2, 3, 4]

@@ -18,7 +18,7 @@ BANDS = [0, 2, 4, 6]
 def builtin():
     """The built-in run by exact steps, and its modal energies and transfers."""
     run = run_of(Case.load(overrides=['time.engine="propagator"']))
-    return run, analyse(run, ("modal", "transfers"))
+    return run, analyse(run, ["bands/transfer"])
 
 
 def losses(run, analysis):
@@ -86,7 +86,7 @@ def test_what_contacts_that_are_closed_at_first_and_last_dissipate_is_that_of_th
     table = {"lattice": {"cells": 2, "cell": cell}, "contacts": contacts, "initial": initial}
     run = run_of(Case.from_table(table | {"time": {"end": 3.6e-3, "engine": engine}}))
     contact = run["energy/contact"].values
-    analysis = analyse(run, ("modal", "transfers"))
+    analysis = analyse(run, ["bands/transfer"])
 
     moved = MovedEnergies.of(run, analysis, parts=[0])
 
@@ -105,7 +105,7 @@ def test_work_of_the_drive_is_no_transfer():
     """
     run = run_of(small_case(time={"engine": "propagator", "end": 0.08}))
     model = Case.of(run).model()
-    analysis = analyse(run, ("modal", "transfers"))
+    analysis = analyse(run, ["bands/transfer"])
     time = run["time"].values
     work = run["energy/work"].values
     begin = analysis["bands/cluster_begin"].values
@@ -131,11 +131,11 @@ def test_a_run_in_memory_ends_with_the_state_of_its_last_sample(engine):
         assert np.array_equal(run[f"end/{name}"].values, run[name].values[-1])
 
     # The share at the end needs only the state at the end, not the recorded displacements.
-    both = analyse(run, ("modal",))["upper_share_at_end"].item()
-    without = analyse(run.drop_vars("displacement"), ("modal",))["upper_share_at_end"].item()
+    both = analyse(run, ["upper_share_at_end"])["upper_share_at_end"].item()
+    without = analyse(run.drop_vars("displacement"), ["upper_share_at_end"])["upper_share_at_end"].item()
     assert both == without > 0
 
-    neither = analyse(run.drop_vars(["displacement", "end/displacement"]), ("modal",))
+    neither = analyse(run.drop_vars(["displacement", "end/displacement"]), ["upper_share_at_end"])
     assert "upper_share_at_end" not in neither
     assert "displacement was not recorded" in neither.attrs["left_out"]
 
@@ -148,12 +148,12 @@ def test_a_run_in_memory_ends_with_the_state_of_its_last_sample(engine):
 def test_a_long_lattice_is_measured_on_a_ring(monkeypatch):
     """A lattice with more than MOST_DOFS degrees of freedom is measured by modes of a ring with one cell more."""
     run = run_of(small_case(lattice={"cells": 60}, time={"engine": "propagator", "end": 0.08}))
-    exact = analyse(run, ("modal", "transfers"))
+    exact = analyse(run, ["bands/transfer"])
 
     # The modes of this lattice are kept from the analysis before, and must not be kept for the next test.
     modes._modes.cache_clear()
     monkeypatch.setattr(modes, "MOST_DOFS", 100)
-    ring = analyse(run, ("modal", "transfers"))
+    ring = analyse(run, ["bands/transfer"])
     modes._modes.cache_clear()
 
     assert ring["bands/modal_energy"].attrs["modes"] == "of a ring of 61 cells"

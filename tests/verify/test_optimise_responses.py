@@ -20,9 +20,9 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.responses import CurvePart, largest_response
-from vipetsc.studies import response_objective
+from vipetsc.studies import objective
+from vipetsc.studies.objective import measured_responses
 from vipetsc.studies.optimum_search import run_search
-from vipetsc.studies.response_objective import measured_responses
 
 PEAK = "response/peak_displacement/mass"
 RATIO = 0.05  # the absorber's mass over the main mass of 1 kg, whose springs have 1 N/m in total
@@ -173,6 +173,6 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     # A complete curve is taken there and back: turning back by itself would need impacts.
     ended = Ending.CLOSED.with_numbers()
     there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ended=ended)
-    monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
+    monkeypatch.setattr(objective, "follow_all", lambda *arguments, **options: [there_and_back])
     with pytest.raises(RuntimeError, match=r"r1-1: turned back and closed.*, without states up to 1\.2"):
         measured(case)

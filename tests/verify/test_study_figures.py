@@ -17,7 +17,7 @@ from vipetsc.figures.wavenumber_bins import bin_colours, shown_bins
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.paper.entropy_pages import AVERAGES
-from vipetsc.paper.pages import PAGES
+from vipetsc.paper.paper_figures import PAGES
 from vipetsc.spectra import normalised, transform
 from vipetsc.studies.sweep import run_sweep
 

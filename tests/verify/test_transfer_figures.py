@@ -19,7 +19,7 @@ from vipetsc.figures.style import rc_style
 from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
-from vipetsc.paper.pages import PAGES
+from vipetsc.paper.paper_figures import PAGES
 from vipetsc.studies.backbone import initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 

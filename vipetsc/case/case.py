@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import tomli_w
+from numpy.typing import ArrayLike
 
 from vipetsc.case.case_file import CaseFile, Valid
 from vipetsc.case.contacts import check_joined, check_pairs, check_touching
@@ -42,6 +43,7 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
+from vipetsc.lattice.topology import Topology
 from vipetsc.plugins import without_folders
 
 # The absolute tolerances are this fraction of the relative one times the drive's wave, so that waves weaker by this
@@ -253,6 +255,13 @@ class Case(CaseFile):
             return CONTACTS["radius"]
         return self.contacts.radius
 
+    def nearest_site(self, cells: ArrayLike) -> int | None:
+        """Return the index in ``cells`` (site,) of the site that the drive's wave meets first: the nearest one.
+
+        Cells count from 1. None without sites; of two at the same distance it is the first.
+        """
+        return Topology(self.lattice.cells, self.lattice.ends).nearest_index(cells, self.drive.cell)
+
     def runs(self) -> list[CaseFile]:
         """Return the case itself; verbs that simulate several runs vary it."""
         return [self]
@@ -416,3 +425,29 @@ def case_id(case: Case) -> str:
     if case.plugins is not None:
         text = tomli_w.dumps(without_folders(tomllib.loads(text)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class StudyCase(CaseFile):
+    """The case of a study of many runs: its ``table`` is that of a run, without the study's ``section``."""
+
+    table: Table
+
+    @classmethod
+    def keywords(cls) -> Iterable[str]:
+        """Return the sections of a run, and that of the study."""
+        # This class itself has no section.
+        if not cls.section:
+            return [*Case.sections()]
+        return [*Case.sections(), cls.section]
+
+    @classmethod
+    def divide(cls, table: Table, remedy: str) -> tuple[Table, Table, list[Problem]]:
+        """Return table of a run and the study's section, out of ``table``; the problem of a section that is missing.
+
+        The problem's text ends with the ``remedy``.
+        """
+        of_run = dict(table)
+        section = of_run.pop(cls.section, None)
+        if not isinstance(section, dict):
+            return of_run, {}, [Problem(cls.section, section, f"missing; {remedy}")]
+        return of_run, section, []

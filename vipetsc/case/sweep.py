@@ -15,14 +15,13 @@ from typing import Any, Literal
 import numpy as np
 import tomli_w
 
-from vipetsc.case.case import Case
+from vipetsc.case.case import Case, StudyCase
 from vipetsc.case.case_file import CaseFile
 from vipetsc.case.contacts import keys_of_other_laws
 from vipetsc.case.html import html_table
 from vipetsc.case.reading import Table, put, read_section
 from vipetsc.case.schema import number
 from vipetsc.case.section import CaseError, Problem, Section, described, unit_at
-from vipetsc.case.study import StudyCase
 from vipetsc.case.units import in_unit
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 from vipetsc.plugins import without_folders

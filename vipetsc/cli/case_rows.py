@@ -6,7 +6,7 @@ from vipetsc.case import Case
 from vipetsc.case.absorbing import reflected, reflected_at, sections_of, sources_of
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.warnings import losses
-from vipetsc.cli.tables import first_few
+from vipetsc.cli.messages import first_few
 from vipetsc.lattice import gaps, wave_bands
 from vipetsc.wording import MOST_SHOWN, counted
 

@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import on_root
 from vipetsc.progress import BAR
+from vipetsc.wording import shortened
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -156,3 +157,22 @@ def _report_phase(event: str, arguments: tuple[Any, ...]) -> None:
     # Python removes no audit hook: after the block the level silences this one.
     if event.startswith("vipetsc.") and event not in OFTEN and logger.isEnabledFor(logging.DEBUG):
         logger.debug("%s %s", event.removeprefix("vipetsc."), " ".join(map(str, arguments)))
+
+
+def table(rows: Sequence[tuple[str, str]]) -> str:
+    """Return the ``rows`` (name, value) in two columns; a row with an empty value is left out."""
+    width = max(len(name) for name, value in rows if value)
+    return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows if value)
+
+
+def first_few(items: Sequence[object]) -> str:
+    """Return the first ``items``, and how many there are if these are not all; "none" of an empty list."""
+    return shortened(items) or "none"
+
+
+def duration(seconds: float) -> str:
+    """Return a time as text: seconds in two digits or, from two minutes on, minutes in three, without powers of ten."""
+    # It is rounded first, since the format "g" alone writes 110 in two digits as 1.1e+02.
+    if seconds < 120:
+        return f"{float(f'{seconds:.2g}'):g} s"
+    return f"{float(f'{seconds / 60:.3g}'):g} min"

@@ -13,7 +13,7 @@ from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 
 from vipetsc.figures import style
 from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
-from vipetsc.figures.page import Page, letter
+from vipetsc.figures.page import Page, add_letters
 from vipetsc.figures.panels import colour_bar
 from vipetsc.figures.series import Series
 from vipetsc.figures.swept_axes import SweptAxis
@@ -124,7 +124,7 @@ class MeasurePage(NamedTuple):
             axes.set_title(title.replace(BAND, TOGETHER))
             # The last panel of each column has the labels of the ticks, also above an empty place.
             axes.tick_params(labelbottom=index + columns >= count)
-        letter(page.panels)
+        add_letters(page.panels)
         letters = int(PANEL_LETTERS * (width - 0.6) / columns)
         for axes in page.panels:
             axes.set_title("\n".join(wrap(axes.get_title("left"), letters)))

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.page import Page, letter
+from vipetsc.figures.page import Page, add_letters
 from vipetsc.figures.style import NoPicture
 
 # Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy that all
@@ -105,7 +105,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     percent = 100 * moved.energy / float(run["energy/work"][-1])
     _draw_matrix(panel["matrix"], moved.labels, [*(style.part_label(names[p]) for p in parts), "lost"], percent)
     panel["matrix"].set_ylabel(f"Contact site ({panels.sites_title(run)})")
-    letter([panel["steps"], panel["impacts"], panel["matrix"]])
+    add_letters([panel["steps"], panel["impacts"], panel["matrix"]])
     if len(moved.labels) < moved.rows:
         style.add_note(figure, f"transfers: the {MOST_ROWS} of {moved.rows} rows with the largest ones")
     return figure

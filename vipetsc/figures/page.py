@@ -1,6 +1,6 @@
 """A page of panels: letters before their titles, empty places behind the last one, a legend in a strip below all."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import Any, Self
@@ -80,9 +80,9 @@ class Page:
         Panels of a table have the letter of their column and the numeral of their row.
         """
         if self.count or min(self.grid.shape) == 1:
-            letter(self.panels)
+            add_letters(self.panels)
         else:
-            letter(self.grid.T)
+            add_letters(self.grid.T)
         return self.figure
 
 
@@ -94,7 +94,7 @@ def _grid(body: Figure | SubFigure, rows: int, columns: int, count: int, options
     return grid
 
 
-def letter(groups: Iterable[Axes | Iterable[Axes]]) -> None:
+def add_letters(groups: Iterable[Axes | Iterable[Axes]]) -> None:
     """Begin the titles of panels with (a), (b), ..., those of a group with (b.i), (b.ii), ...; a single one has none.
 
     Panels beyond the last letter or numeral have none either. Titles stand at the left, where the style puts them.
@@ -108,7 +108,7 @@ def letter(groups: Iterable[Axes | Iterable[Axes]]) -> None:
             axes.set_title(f"({tag}{numeral}) {axes.get_title('left')}".rstrip())
 
 
-def legend_entries(panels: Sequence[Axes]) -> dict[str, Any]:
+def legend_entries(panels: Iterable[Axes]) -> dict[str, Any]:
     """Return the handles of all curves in ``panels`` by their labels, each label once."""
     entries: dict[str, Any] = {}
     for axes in panels:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import shortest_path
 from vipetsc.case import Case
 from vipetsc.case.contacts import has_equal_sides
 from vipetsc.figures import style
-from vipetsc.figures.page import Page, letter
+from vipetsc.figures.page import Page, add_letters
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.style import with_prefix
 from vipetsc.lattice import Chain, Spring, UnitCell
@@ -90,7 +90,7 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
         draw_lattice(axes, model.chain, model.drive_cell)
         axes.set_title(counted(count, "contact site"))
     rows[0].set_title(f"{rows[0].get_title('left')}; {LEGEND}")
-    letter([left, right, rows])
+    add_letters([left, right, rows])
     return figure
 
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.page import Page, letter
+from vipetsc.figures.page import Page, add_letters
 from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, phrase, transfer_members
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
@@ -104,7 +104,7 @@ def nine_panels(member: MemberRun) -> Figure:
         axes.label_outer()
     # Their axis is common.
     both[0].set_ylim(_spectra_limits(peaks))
-    letter([*upper.axes[: 1 + len(member.analysis[FIELD])], *maps, *both])
+    add_letters([*upper.axes[: 1 + len(member.analysis[FIELD])], *maps, *both])
     return figure
 
 

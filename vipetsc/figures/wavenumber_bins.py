@@ -29,7 +29,7 @@ from scipy.ndimage import gaussian_filter
 
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import panels, style
-from vipetsc.figures.page import letter
+from vipetsc.figures.page import add_letters
 from vipetsc.figures.scattering import MOMENTS
 from vipetsc.figures.sweep_members import AmplitudeSeries, MemberRun, from_series
 from vipetsc.io.read import field_time
@@ -137,7 +137,7 @@ def partition(series: AmplitudeSeries) -> Figure:
     bounds = np.append(0, number) + 0.5
     keys = mpl.cm.ScalarMappable(BoundaryNorm(bounds, len(colours)), ListedColormap(colours))
     panels.colour_bar(keys, contours, "Bin", ticks=number, extend="neither")
-    letter([maps[: len(bins)], contours, band])
+    add_letters([maps[: len(bins)], contours, band])
     return figure
 
 
@@ -308,7 +308,7 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     grid[-1, 0].set_xlabel("Cell")
     grid[-1, 1].set_xlabel("Time (s)")
     panels.colour_bar(image, grid[:, 1], "Energy of a bin in a cell (J)", aspect=40)
-    letter([above, below, *grid.T])
+    add_letters([above, below, *grid.T])
     return figure
 
 

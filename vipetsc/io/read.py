@@ -16,7 +16,6 @@ import numpy as np
 
 from vipetsc.io.kinds import BRANCHES, RUN, STUDIES, SWEEP
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice.topology import Topology
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -140,13 +139,6 @@ def field_interval(run: xr.Dataset) -> float:
     if len(time) < 2:
         return np.nan
     return float(time[1] - time[0])
-
-
-def first_site(run: xr.Dataset) -> int | None:
-    """Return the index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
-    case = tomllib.loads(run.attrs["case"])
-    lattice = case["lattice"]
-    return Topology(lattice["cells"], lattice["ends"]).nearest_index(run["sites/cell"].values, case["drive"]["cell"])
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:

@@ -9,8 +9,8 @@ from mpi4py import MPI
 from vipetsc.figures import style
 from vipetsc.figures.style import Drawing, draw_each
 from vipetsc.figures.sweep_members import Files
-from vipetsc.paper.build_record import FORMATS, BuildRecord, is_drawn, read_record, write_record
 from vipetsc.paper.plan import Plan
+from vipetsc.paper.steps import FORMATS, BuildRecord, is_drawn, read_record, write_record
 from vipetsc.parallel import SharedCounter, StopRequest, on_every_rank, on_root
 
 MANY = 2**40  # more than the number of pictures

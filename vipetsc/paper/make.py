@@ -17,13 +17,12 @@ from mpi4py import MPI
 
 from vipetsc.io.folder import Claim, claimed, provenance
 from vipetsc.io.kinds import PAPER
-from vipetsc.paper.build_record import FORMATS, BuildRecord, is_whole, read_record, write_record
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.draw import draw_paper
 from vipetsc.paper.paper_figures import RELATED, TRANSFER, PaperFigure
 from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, fingerprint, read_json
 from vipetsc.paper.report import ReportContents, write_report
-from vipetsc.paper.steps import make_steps, noted, rough_time
+from vipetsc.paper.steps import FORMATS, BuildRecord, is_whole, make_steps, noted, read_record, rough_time, write_record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 from vipetsc.wording import counted

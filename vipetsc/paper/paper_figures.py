@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
@@ -14,12 +15,14 @@ from pydantic import TypeAdapter
 
 from vipetsc.case import Case
 from vipetsc.case.schema import PRESETS
-from vipetsc.figures.registry import FIGURES, drawings, specified_drawings, with_ensemble
+from vipetsc.figures import transfer, transfer_curves
+from vipetsc.figures.registry import FIGURES, FigureSpec, drawings, specified_drawings, with_ensemble
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import Files
+from vipetsc.io.kinds import SWEEP
 from vipetsc.io.read import open_ensemble
-from vipetsc.paper.pages import PAGES
+from vipetsc.paper import entropy_pages
 
 READINGS = ("calibrated", "printed")
 # The sweep whose transfer is related to branches, and the steps of these.
@@ -150,3 +153,13 @@ NAMES = (
 def describe(stem: str) -> str:
     """Return name ``stem`` of a picture's file in words, as in "calibrated reading, 5π/9, energy-weighted average"."""
     return ", ".join(match.expand(text) for pattern, text in NAMES for match in re.finditer(pattern, stem))
+
+
+_SPECS = (
+    FigureSpec("entropy", SWEEP, entropy_pages.entropy, measure="entropy"),
+    FigureSpec("entropy_all", SWEEP, entropy_pages.entropy_all, measure="entropy"),
+    FigureSpec("entropy_history", SWEEP, entropy_pages.entropy_history, measure="entropy"),
+    FigureSpec("band_energies-shares", SWEEP, transfer.band_shares, measure="transfer"),
+    FigureSpec("ibtet", SWEEP, transfer_curves.ibtet, measure="transfer"),
+)
+PAGES = MappingProxyType({spec.name: spec for spec in _SPECS})

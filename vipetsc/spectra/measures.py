@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -234,12 +234,22 @@ def group_of(name: str) -> Group:
     return _of_name(name).group
 
 
-def take(record: RunRecord, groups: Collection[str]) -> dict[str, Any]:
-    """Return the values by name of the measures of these ``groups`` that the run of ``record`` has."""
+def names_in(asked: Collection[str]) -> set[str]:
+    """Return the names of measures that are ``asked`` for, with those of all measures of a group for its name."""
+    names = {measure.name for measure in every_measure().values() if measure.group in asked}
+    return names | {name for name in asked if name not in get_args(Group)}
+
+
+def take(record: RunRecord, asked: Collection[str] | None = None) -> dict[str, Any]:
+    """Return the values by name of the measures ``asked`` for, by default all, that the run of ``record`` has.
+
+    A name without points stands for those of all points.
+    """
     values = {}
     foreign = _foreign(record.run)
     for name, measure in measures_of([*record.points], record.pairs).items():
-        if measure.of is None or measure.group not in groups or name in foreign:
+        is_asked = asked is None or name in asked or name.partition("/")[0] in asked
+        if measure.of is None or not is_asked or name in foreign:
             continue
         value = measure.of(record)
         # None is a measure that the run cannot have; NaN, one that it should have, is written.

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 
 from vipetsc import spectra
 from vipetsc.lattice import pass_bands
@@ -18,14 +19,13 @@ from vipetsc.studies.velocity_record import VelocityRecord
 
 ENDS = 0.02  # fraction of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
-# Rows of ``studies.analysis.LAYOUT``.
+# Dimension, unit and description of each variable.
 BANDS = {
     "ibtet": MEASURES["ibtet"].row,
     "ibtet_whole": MEASURES["ibtet_whole"].row,
     "bands/edge": ("bands/edge", "1", "edge of a part"),
     "bands/part": ("bands/part", "1", "part of the frequency axis"),
     "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),
-    "bands/sample": ("bands/sample", "s", "time of a sample"),
     "bands/energy": ("bands/part bands/sample", "J", "kinetic energy of a part"),
     "bands/band": ("bands/band", "1", "part that contains pass bands"),
     "bands/kinetic_energy": ("bands/band time cell", "J", "kinetic energy of a part in a cell"),
@@ -46,12 +46,16 @@ class AveragingSpan(NamedTuple):
     starts_when: str
 
 
-def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Return the energies of the pass bands and gaps, and the inter-band transfer from the front's arrival on."""
+def band_energies(record: VelocityRecord, asked: Collection[str]) -> xr.Dataset:
+    """Return the energies of the pass bands and gaps, and the inter-band transfer from the front's arrival on.
+
+    Energies of each cell are among them where they are ``asked`` for.
+    """
     parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
     above = parts.above(record.model.drive.frequency)
     stride = record.options.band_stride
     bands = np.flatnonzero([bool(inside) for inside in parts.bands])
+    with_maps = "bands/kinetic_energy" in asked
     energies = spectra.part_energies(
         record.weighted,
         record.masses,
@@ -59,11 +63,9 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         parts.edges,
         stride=stride,
         memory=record.memory,
-        mapped=bands.tolist() if "maps" in measures else (),
+        mapped=bands.tolist() if with_maps else (),
         sizes=record.sizes,
     )
-    if not above.any():
-        record.left_out.append("ibtet: no pass band lies above the driven one")
     energy = energies.total
     span = _span(record)
     total = energy[:, span.first : span.last].sum(axis=0)
@@ -80,14 +82,17 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         "ends_when": f"before the last {ENDS:.0%} of the record",
     }
     names = {"parts": list(parts.names)}
-    record.attributes["bands/energy"] = names
-    record.attributes["bands/share"] = times | names
-
-    values = _transfers(record, energy, above, span, times)
-    if "maps" in measures:
+    attributes: dict[str, dict[str, Any]] = {"bands/energy": names, "bands/share": times | names}
+    values: dict[str, Any] = {}
+    for name, transfer in _transfers(record, energy, above, span).items():
+        values[name] = transfer.value
+        attributes[name] = {"band_stride": stride, "sampling_error": transfer.error}
+    attributes["ibtet"] |= times
+    attributes["ibtet_whole"] |= {"start": times["start"], "end": record.time[-1]}
+    if with_maps:
         values["bands/band"] = bands + 1
         values["bands/kinetic_energy"] = energies.maps
-    return values | {
+    values |= {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
         "bands/edges": parts.edges,
@@ -95,6 +100,8 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         "bands/above": above.astype(np.int8),
         "bands/share": fractions,
     }
+    left_out = [] if above.any() else ["ibtet: no pass band lies above the driven one"]
+    return record.measures(BANDS, values, attributes, left_out)
 
 
 def _span(record: VelocityRecord) -> AveragingSpan:
@@ -118,9 +125,16 @@ def _span(record: VelocityRecord) -> AveragingSpan:
     return AveragingSpan(first, last, f"{reason}, or after the first {ENDS:.0%} of the record")
 
 
+class Transfer(NamedTuple):
+    """A transfer: its ``value``, and the ``error`` that the stride of samples makes."""
+
+    value: float
+    error: float
+
+
 def _transfers(
-    record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: AveragingSpan, times: dict[str, Any]
-) -> dict[str, Any]:
+    record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: AveragingSpan
+) -> dict[str, Transfer]:
     """Return the transfer to the bands ``above`` over the ``span``, and as the paper's, to the record's end."""
     stride = record.options.band_stride
     samples = len(record.time)
@@ -130,16 +144,12 @@ def _transfers(
     # Only the last part, above the bands, is sampled at a stride: all others are exact at every sample.
     coarse[-1] = np.interp(np.arange(samples), taken, energy[-1, taken])
 
-    def transfer(end: int) -> tuple[float, float]:
-        """Return the transfer up to the sample ``end``, and its error."""
+    def transfer(end: int) -> Transfer:
+        """Return the transfer up to before the sample ``end``."""
         value = spectra.ibtet(energy[:, :end], above, span.first)
-        if stride == 1:
-            return value, 0.0
-        return value, abs(spectra.ibtet(coarse[:, :end], above, span.first) - value)
+        error = 0.0
+        if stride > 1:
+            error = abs(spectra.ibtet(coarse[:, :end], above, span.first) - value)
+        return Transfer(value, error)
 
-    inner, inner_error = transfer(span.last)
-    whole, whole_error = transfer(samples)
-    to_the_end = {"start": times["start"], "end": record.time[-1]}
-    record.attributes["ibtet"] = times | {"band_stride": stride, "sampling_error": inner_error}
-    record.attributes["ibtet_whole"] = to_the_end | {"band_stride": stride, "sampling_error": whole_error}
-    return {"ibtet": inner, "ibtet_whole": whole}
+    return {"ibtet": transfer(span.last), "ibtet_whole": transfer(samples)}

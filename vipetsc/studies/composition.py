@@ -32,8 +32,7 @@ from vipetsc.case.law import lesser_clearances
 from vipetsc.lattice import ToneBurst, WaveCompliance, Waveform, bloch
 from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, self_response, unit_phase
-from vipetsc.studies.spectral_line import SpectralLine
-from vipetsc.studies.wave_losses import SentPowers, WaveLosses
+from vipetsc.studies.wave_losses import SentPowers, SpectralLine, WaveLosses
 
 # The changes below are those of the energies of bands in the built-in lattice and a shorter one with shorter bursts,
 # where predictions differ from simulations by 0.08 and 0.1 decades (root mean square).

@@ -5,9 +5,10 @@ A dispersion is the kinetic energy of the velocity's transform over time and cel
 comes and what is sent back, the part after it what passes.
 """
 
-from typing import Any
+from collections.abc import Collection
 
 import numpy as np
+import xarray as xr
 from scipy import fft
 
 from vipetsc import spectra
@@ -18,14 +19,19 @@ from vipetsc.studies.velocity_record import VelocityRecord
 # the energy beyond 1.1 times the edge, and 5e-5 beyond 1.4 times.
 HEADROOM = 1.5
 
+# Dimensions, units and description of each variable.
+DISPERSIONS = {
+    "wavenumber": ("wavenumber", "rad/cell", "wavenumber"),
+    "frequency": ("frequency", "rad/s", "angular frequency"),
+    "dispersion": ("wavenumber frequency", "J", "mean kinetic energy per bin"),
+    "dispersion_before": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells before the first site"),
+    "dispersion_after": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells after the first site"),
+}
 
-def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
+
+def dispersions_by_side(record: VelocityRecord, asked: Collection[str]) -> xr.Dataset:
     """Return dispersion of all cells, of those before and of those after the first site."""
     nt, cells = record.velocity.shape[:2]
-    if cells < 2:
-        record.left_out.append("dispersion: a single cell was recorded")
-        return {}
-
     # Time is padded to a length that transforms fast; a padded row of cells would have other wavenumbers.
     length = fft.next_fast_len(nt, real=True)
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
@@ -33,12 +39,16 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
     # Wavenumbers and frequencies in a bin of the map. Wavenumbers of both signs are folded to half as many as cells, so
     # that the map has at most ``pixels`` of them, and twice as many frequencies.
     sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
-    windows: dict[str, spectra.CellWindow] = {}
-    for name, window in _windows(record).items():
-        if len(range(cells)[window.cells]) < 2:
-            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
-        else:
-            windows[name] = window
+    windows = _windows(record)
+    left_out = []
+    if len(windows) == 1:
+        reason = "on a ring the wave travels in both directions"
+        if record.site is None:
+            reason = "the lattice has no sites"
+        left_out.append(f"dispersion_before, dispersion_after: {reason}")
+    for name in [name for name, window in windows.items() if len(range(cells)[window.cells]) < 2]:
+        left_out.append(f"{name}: fewer than two of its cells were recorded")
+        del windows[name]
 
     pieces: dict[str, list[spectra.Dispersion]] = {name: [] for name in windows}
     for block in spectra.blocks(-(-frequencies // sizes[1]), 16 * cells * sizes[1], record.memory):
@@ -59,17 +69,13 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
     values = {"wavenumber": whole[0].wavenumber, "frequency": np.concatenate([piece.frequency for piece in whole])}
     for name, window_pieces in pieces.items():
         values[name] = np.concatenate([piece.energy for piece in window_pieces], axis=1).astype(np.float32)
-    return values
+    return record.measures(DISPERSIONS, values, left_out=left_out)
 
 
 def _windows(record: VelocityRecord) -> dict[str, spectra.CellWindow]:
-    """Return the recorded cells of which a dispersion is taken, by its name."""
+    """Return the recorded cells of which a dispersion is taken, by its name: on a ring and without sites of all."""
     windows = {"dispersion": spectra.CellWindow()}
-    if record.site is None:
-        record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
-    elif record.model.chain.ends == "periodic":
-        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave travels in both directions")
-    else:
+    if record.site is not None and record.model.chain.ends != "periodic":
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
         # A window with sharp borders would smear a wave that crosses one over all wavenumbers: wide flanks taper it
         # off.

@@ -1,25 +1,26 @@
 """Content of ``identified.h5``: parameters with their uncertainty, windows, starts, residuals, warnings and a table."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from vipetsc.case.identify import SENSOR_UNITS, IdentifyCase
+from vipetsc.case.identify import SENSOR_UNITS, IdentifyCase, SensorTable
 from vipetsc.identification.growing_windows import GrowingWindows, largest_towards, motion_without, reached_by
+from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.misfit_profile import ProfileCosts
 from vipetsc.identification.uncertainty import (
     DETERMINED,
     SMALLEST,
     Uncertainty,
+    errors_with_sensor,
     ljung_box,
     marginal_jacobian,
     quantile,
     uncertainty_of,
 )
 from vipetsc.io.records import Record
-from vipetsc.studies.further_sensor import further_sensor_values
 from vipetsc.wording import counted
 
 LAYOUT = {
@@ -112,6 +113,10 @@ AT_BOUND = 1e-6
 STEP = 0.01
 # Fits whose coordinates differ by at most this, or by three standard errors if these are more, lie in one valley.
 SAME_VALLEY = 1e-3
+# Masses at most, evenly over the lattice, at which a sensor is tried.
+MOST_CANDIDATES = 400
+# Derivatives at these masses that are kept in memory, at most: 40 MB, those of a thousand samples by ten parameters.
+MOST_NUMBERS = 5_000_000
 
 
 def identified_values(
@@ -495,3 +500,55 @@ def _channel_line(channel: xr.Dataset) -> str:
     misfit = f"{float(channel['channels/misfit']):.3g} {channel['channels/unit'].values}"
     white = f"whiteness p = {float(channel['channels/probability']):.2g}"
     return f"  {channel['channel'].values}: misfit {misfit}, {noise} {float(channel['channels/noise']):.3g}, {white}"
+
+
+def _further_sensor(sensors: Sequence[SensorTable], noise: np.ndarray) -> tuple[str, float]:
+    """Return the quantity that one more sensor would measure, and its noise in that quantity's unit.
+
+    They are those of the first of the ``sensors`` that measures motion, and the mean ``noise`` (sensor,) of all that
+    measure the same; without any, a velocity with a noise of 1 m/s.
+    """
+    quantities = [sensor.quantity for sensor in sensors]
+    of_motion = [quantity for quantity in quantities if quantity != "force"]
+    if not of_motion:
+        return "velocity", 1.0
+    return of_motion[0], float(np.mean(noise[np.equal(quantities, of_motion[0])]))
+
+
+def further_sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
+    """Return the mass at which one more sensor of the first record with contact would lower each error most.
+
+    ``windows`` is the fit, ``z`` (coordinate,) its solution. The ``uncertainty`` is that of all coordinates: the sensor
+    also measures an initial state that is estimated. Returns variables of ``identified.h5`` by name: the cell and the
+    mass, both from 1, and the error with the sensor, for each parameter.
+    """
+    misfit = windows.misfit
+    plan = misfit.plan
+    tables = plan.options.records
+    record = next((number for number, table in enumerate(tables) if table.contact), 0)
+    quantity, noise = _further_sensor(tables[record].sensors, misfit.noise[record])
+
+    dofs = plan.base.lattice.unit_cell().dofs
+    count = plan.base.lattice.cells * dofs
+    candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
+    # Of long records of large lattices every n-th sample, which stands for n of them, is enough.
+    times = misfit.records[record].times
+    stride = -(-len(times) * len(candidates) * len(z) // MOST_NUMBERS)
+
+    def measured(moved: np.ndarray) -> np.ndarray:
+        """Return what sensors at all candidates would measure (sample, mass) at the coordinates ``moved``."""
+        response = misfit.respond(moved, record, candidates.tolist(), times[::stride])
+        return response.motion[:, :, ROWS[quantity]]
+
+    slopes = np.zeros((len(times[::stride]), len(candidates), len(z)))
+    for p in range(len(z)):
+        if misfit.acts_on(p, record):
+            # Each sample stands for ``stride`` of them, whose information adds: sensitivities grow with its root.
+            slopes[:, :, p] = np.sqrt(stride) * misfit.difference(z, p, measured)
+    errors = errors_with_sensor(uncertainty, slopes, noise)[:, : misfit.count]
+    chosen = errors.argmin(axis=0)
+    return {
+        "sensor/cell": candidates[chosen] // dofs + 1,
+        "sensor/mass": candidates[chosen] % dofs + 1,
+        "sensor/relative_error": errors.min(axis=0),
+    }

@@ -27,7 +27,6 @@ from vipetsc.io.read import field_time
 from vipetsc.io.records import Record
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice.sites import Pair
-from vipetsc.lattice.topology import Topology
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, group_of, is_measure, row_of
@@ -285,7 +284,7 @@ def _linear_table(case: Case) -> dict[str, Any]:
 def first_site_cell(case: Case) -> int:
     """Return the cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
-    first = Topology(case.lattice.cells, case.lattice.ends).nearest_index(cells, case.drive.cell)
+    first = case.nearest_site(cells)
     return 0 if first is None else int(cells[first])
 
 

@@ -20,9 +20,10 @@ from vipetsc.studies.velocity_record import VelocityRecord
 # modes are computed at each: in the built-in lattice a thousand take 0.2 s of CPU, a quarter of the analysis.
 MOST_BRACKETS = 1000
 
-# Rows of ``studies.analysis.LAYOUT``.
+# Dimensions, unit and description of each variable.
 MODAL = {
     "upper_share_at_end": MEASURES["upper_share_at_end"].row,
+    "bands/part": ("bands/part", "1", "part of the frequency axis"),
     "bands/instant": ("bands/instant", "s", "time of an energy of the linear modes"),
     "bands/modal_energy": ("bands/part bands/instant", "J", "energy of the linear modes in a part"),
     "bands/bin": ("bands/bin", "1", "wavenumber bin, of twelve from 0 to pi"),
@@ -37,21 +38,26 @@ MODAL = {
 }
 
 
-def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Return variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
+def modal_energies(record: VelocityRecord, asked: Collection[str]) -> xr.Dataset:
+    """Return variables of ``MODAL``: at the last sample alone, or over time where transfers are ``asked`` for."""
+    run = record.run
     time = record.time
-    parts = _modal_parts(run, record)
-    if parts is None:
-        return {}
+    try:
+        parts = ModalParts.of(record.model.chain)
+    except ValueError as error:
+        return record.measures(MODAL, {}, left_out=[f"upper_share_at_end, bands/modal_energy: {error}"])
 
     names = parts.parts.names
     kind = f"of a ring of {parts.modes.cells} cells"
     if parts.modes.exact:
         kind = "of the lattice"
-    record.attributes["bands/modal_energy"] = {"parts": list(names), "modes": kind}
+    attributes: dict[str, dict[str, Any]] = {"bands/modal_energy": {"parts": list(names), "modes": kind}}
     values: dict[str, Any] = {"bands/part": np.arange(1, len(names) + 1)}
-    if "displacement" in run and "transfers" in measures:
-        values |= _history(run, record, parts)
+    if "displacement" in run and "bands/transfer" in asked:
+        history = _history(record, parts)
+        values |= history.values
+        attributes["bands/modal_energy"] |= {"modal_stride": record.options.modal_stride, "error": history.error}
+        attributes["bands/transfer"] = {"parts": list(names), "cluster_stride": history.stride}
     else:
         if "displacement" in run:
             last = run["displacement"][-1:].values
@@ -67,33 +73,20 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
     upper = np.nan
     if above.any() and work:
         upper = values["bands/modal_energy"][above, -1].sum() / work
-    return values | {"upper_share_at_end": upper}
+    return record.measures(MODAL, values | {"upper_share_at_end": upper}, attributes)
 
 
-def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
-    """Return modes by part of the frequency axis; None, and why in the ``record``, where they cannot be measured."""
-    chain = record.model.chain
-    reason = ""
+class ModalHistory(NamedTuple):
+    """Variables of ``MODAL`` over time by name, the largest ``error`` of their sum, and the ``stride`` of clusters."""
 
-    # From what is missing in the file to what the physics does not have.
-    if "displacement" not in run and "end/displacement" not in run:
-        reason = "the displacement was not recorded"
-    elif len(record.cells) < chain.cells:
-        reason = f"{chain.cells - len(record.cells)} cells were not recorded"
-    elif not chain.cell.joins_cells:
-        reason = "without springs from cell to cell a lattice has no bands"
-    else:
-        try:
-            return ModalParts.of(chain)
-        except ValueError as error:
-            reason = str(error)
-
-    record.left_out.append(f"upper_share_at_end, bands/modal_energy: {reason}")
-    return None
+    values: dict[str, Any]
+    error: float
+    stride: int
 
 
-def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict[str, Any]:
+def _history(record: VelocityRecord, parts: ModalParts) -> ModalHistory:
     """Return energies at every ``modal_stride``-th sample and at the bounds of clusters, and the transfers of these."""
+    run = record.run
     time = record.time
     displacement = record.field(run["displacement"])
     clusters = _clusters(run, time)
@@ -115,10 +108,7 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
     stored = (run["energy/kinetic"] + run["energy/spring"]).values[np.searchsorted(run["time"].values, time[rows])]
     # 1e-300, since a lattice that never moved has no energy to divide by.
     error = np.abs(by_part.sum(axis=0) - stored).max() / max(stored.max(), 1e-300)
-    record.attributes["bands/modal_energy"] |= {"modal_stride": record.options.modal_stride, "error": error}
-    names = list(parts.parts.names)
-    record.attributes["bands/transfer"] = {"parts": names, "cluster_stride": clusters.stride}
-    return {
+    values = {
         "bands/instant": time[rows],
         "bands/modal_energy": by_part,
         "bands/bin": np.arange(1, energy.shape[1] + 1),
@@ -131,6 +121,7 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
         "bands/episode": np.arange(1, len(clusters.by_episode) + 1),
         "bands/cluster_of_episode": clusters.by_episode + 1,
     }
+    return ModalHistory(values, error, clusters.stride)
 
 
 class Clusters(NamedTuple):

@@ -22,7 +22,7 @@ from vipetsc.io.read import open_run
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.spectra.measures import is_measure
-from vipetsc.studies.analysis import FULL, analyse
+from vipetsc.studies.analysis import analyse
 from vipetsc.studies.analysis_options import options_of
 from vipetsc.studies.ensemble import MISSING, Results
 from vipetsc.studies.linear_run import first_site_cell, measured, read_linear
@@ -38,7 +38,7 @@ class MeasurableRun(NamedTuple):
 
     folder: Path
     sweep: Path
-    measures: Collection[str]
+    measures: Collection[str] | None
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
@@ -102,7 +102,7 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
         raise FolderError(f"{path}: contains no run.h5; give the folder of a finished run or sweep")
 
     files = [folder / "run.h5"]
-    measures: Collection[str] = FULL
+    measures: Collection[str] | None = None
     if sweep:
         files = sorted(folder.glob("*/run.h5"))
         measures = measures_of(Sweep.load(folder / "case.toml"))
@@ -127,7 +127,7 @@ def _containing_folder(folder: Path) -> Path:
 def measure_run(
     folder: Path,
     sweep: Path | None = None,
-    measures: Collection[str] = FULL,
+    measures: Collection[str] | None = None,
     overrides: Sequence[str] = (),
     comm: MPI.Comm = MPI.COMM_SELF,
     find_arrival: Callable[[], float | None] = lambda: None,

@@ -22,7 +22,7 @@ from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.progress import Progress
 from vipetsc.spectra.measures import can_be_scaled
-from vipetsc.studies.analysis import WHOLE, analyse
+from vipetsc.studies.analysis import analyse
 from vipetsc.studies.linear_run import (
     LINEAR,
     MARGIN,
@@ -39,8 +39,11 @@ from vipetsc.studies.pool import reason_of
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
 
 FIELDS = ("displacement", "velocity")
-# What ``analyse`` is asked for, by the sweep's ``measures``.
-ANALYSED = {"entropy": ("entropy",), "transfer": ("bands", "modal")}
+# What pictures of members whose fields are kept need beside the groups of measures that the sweep takes, by these.
+PICTURED = {
+    "entropy": ("kinetic_energy", "wavenumber_content", "dispersion", "partition/kinetic_energy", "entropy/local"),
+    "transfer": ("kinetic_energy", "dispersion", "bands/kinetic_energy", "bands/total"),
+}
 
 
 class NeededRun(NamedTuple):
@@ -300,12 +303,10 @@ def _with_everything(case: Case, fields: list[str]) -> Case:
 
 def measures_of(plan: Sweep) -> set[str]:
     """Return the measures that ``analyse`` takes of a member: those asked for, and its pictures' if fields are kept."""
-    asked: Mapping[str, Sequence[str]] = ANALYSED
+    measures: set[str] = {"motion", *plan.options.measures}
     if plan.options.fields:
-        asked = WHOLE
-    measures = {"motion"}
-    for name in plan.options.measures:
-        measures |= {*asked.get(name, ())}
+        for group in plan.options.measures:
+            measures |= {*PICTURED.get(group, ())}
     return measures
 
 

@@ -1,7 +1,7 @@
 """The velocity that a run kept, in memory or in its file, with the numbers of its case that measures need."""
 
-from copy import copy
-from typing import Any, Self
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,9 +10,15 @@ from numpy.typing import ArrayLike
 from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
+from vipetsc.io.netcdf import tabulated
 from vipetsc.io.read import field_interval, field_time
-from vipetsc.lattice import wave_bands
-from vipetsc.lattice.topology import Topology
+
+# Axes that several measures have: dimension, unit and description.
+AXES = {
+    "time": ("time", "s", "time"),
+    "cell": ("cell", "1", "cell"),
+    "bands/sample": ("bands/sample", "s", "time of a sample"),
+}
 
 
 class VelocityRecord:
@@ -24,11 +30,11 @@ class VelocityRecord:
     meets first (None without sites), are numbers from 1.
 
     Maps hold means over blocks of ``sizes`` (samples, cells), at ``mean_time`` and ``mean_cells``. Fields larger than
-    ``memory`` in bytes stay in their file. Measures enter the ``attributes`` of their variables, by name (those of the
-    analysis under ""), and sentences about what is ``left_out``, and ``warnings``.
+    ``memory`` in bytes stay in their file.
     """
 
     def __init__(self, run: xr.Dataset, case: Case, options: AnalysisTable) -> None:
+        self.run = run
         self.options = options
         self.memory = options.memory * 2**30
         self.model = case.model()
@@ -42,7 +48,7 @@ class VelocityRecord:
         self.interval = field_interval(run)
         self.cells = run["cell"].values
         sites = run["sites/cell"].values
-        first = Topology(case.lattice.cells, case.lattice.ends).nearest_index(sites, case.drive.cell)
+        first = case.nearest_site(sites)
         self.site = None if first is None else int(sites[first])
 
         # Rounded up: a map has at most so many pixels on either side.
@@ -52,17 +58,26 @@ class VelocityRecord:
         if self.sizes[1] > 1:
             self.mean_cells = spectra.block_means(self.cells, self.sizes[1], 0)
 
-        self.attributes: dict[str, dict[str, Any]] = {}
-        self.left_out: list[str] = []
-        self.warnings: list[str] = []
+    def measures(
+        self,
+        layout: Mapping[str, tuple[str, str, str]],
+        values: Mapping[str, Any],
+        attributes: Mapping[str, Mapping[str, Any]] | None = None,
+        left_out: Iterable[str] = (),
+        **about: Any,
+    ) -> xr.Dataset:
+        """Return the ``values`` by name, with rows of the ``layout``, as a dataset with the axes that they need.
 
-    def blank(self) -> Self:
-        """Return a copy of the record without measures: no attributes, nothing left out, no warnings."""
-        record = copy(self)
-        record.attributes = {}
-        record.left_out = []
-        record.warnings = []
-        return record
+        ``attributes`` are those of variables by name; those of the dataset are sentences on what is ``left_out``, and
+        what is said ``about`` all.
+        """
+        dims = {dim for name in values for dim in layout[name][0].split()}
+        axes = {"time": self.mean_time, "cell": self.mean_cells, "bands/sample": self.time}
+        values = {name: axis for name, axis in axes.items() if name in dims} | dict(values)
+        data = xr.Dataset(tabulated(AXES | dict(layout), values), attrs={"left_out": [*left_out], **about})
+        for name, texts in (attributes or {}).items():
+            data[name].attrs.update(texts)
+        return data
 
     def field(self, field: xr.DataArray, factor: ArrayLike = 1.0) -> Any:
         """Return a recorded ``field`` (t, cell, dof) times a ``factor``, a number 1 or (cell, dof).
@@ -72,29 +87,6 @@ class VelocityRecord:
         if field.nbytes > self.memory:
             return _StoredField(field, factor)
         return field.values * factor if np.ndim(factor) else field.values
-
-    def unresolved(self) -> set[str]:
-        """Return names of the groups of measures that what was kept does not resolve, with a warning for each.
-
-        Fields that are stored at too few samples, or of too few cells, show waves as slower or longer ones (aliasing).
-        """
-        bands = wave_bands(self.model.chain.cell)
-        every = int(np.diff(self.cells).max(initial=1))
-        names: set[str] = set()
-        if not bands:
-            self.left_out.append("dispersion, bands, ibtet: without springs from cell to cell a lattice has no bands")
-            names |= {"dispersion", "bands"}
-        # The Nyquist limit: the top band would appear at lower frequencies.
-        elif self.interval * bands[-1].high >= np.pi:
-            top = bands[-1].high
-            text = f"fields stored every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
-            self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
-            names |= {"dispersion", "bands"}
-        if every > 1:
-            text = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
-            self.warnings.append(f"{text}: wavenumber_content, dispersion, partition and entropy are not measured")
-            names |= {"wavenumber", "dispersion", "partition", "entropy"}
-        return names
 
     def mean(self, energy: np.ndarray) -> np.ndarray:
         """Return means of an ``energy`` (t, cell) over the blocks of a map, in single precision."""

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tomli_w
 from pydantic import Field
 
-from vipetsc.case.case import Case
+from vipetsc.case.case import Case, StudyCase
 from vipetsc.case.case_file import CaseFile
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.identify.measured import MeasuredError, RecordTable, read_measured, sensor_problems
@@ -26,7 +26,6 @@ from vipetsc.case.identify.trial import TrialCases
 from vipetsc.case.quantities import QUANTITIES, differs_by_side
 from vipetsc.case.reading import Table, read_section
 from vipetsc.case.section import CaseError, Problem, Section, described
-from vipetsc.case.study import StudyCase
 from vipetsc.case.warnings import loss_warnings, unit_warnings
 from vipetsc.case.waveforms import OneDrive
 from vipetsc.lattice.contact import LAWS

@@ -1,8 +1,8 @@
 """What belongs to the verb ``nfrc`` alone.
 
 ``case`` has its case, ``table`` its section. A curve may run over a key of the case (``varied_key``), and a family has
-curves with several values of keys (``family``). ``ends`` checks what holds the lattice: walls, pressed contacts, open
-ends. ``measures`` names the measures of a whole curve, by which ``optimise`` judges a design.
+curves with several values of keys (``family``). ``measures`` names the measures of a whole curve, by which ``optimise``
+judges a design.
 """
 
 from vipetsc.case.nfrc.case import MOST_UNKNOWNS, NfrcCase, ResponseCurve, needs_modes

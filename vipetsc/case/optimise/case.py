@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.amplitude import amplitude_changes, amplitude_of, amplitude_unit, has_free_amplitude
-from vipetsc.case.case import Case
+from vipetsc.case.case import Case, StudyCase
 from vipetsc.case.case_file import CaseFile
 from vipetsc.case.law import LawCase
 from vipetsc.case.nfrc import NfrcCase
@@ -26,7 +26,6 @@ from vipetsc.case.optimise.variables import Variable, VariablesTable
 from vipetsc.case.reading import Table, read_section
 from vipetsc.case.schema import Positive
 from vipetsc.case.section import CaseError, Problem, Section, described, is_within
-from vipetsc.case.study import StudyCase
 
 # Designs of a search: with a run of 0.3 s for each, as of the built-in case, so many take eight hours.
 MOST_DESIGNS = 100_000

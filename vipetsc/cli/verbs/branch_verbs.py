@@ -17,8 +17,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, case_with
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.messages import echo_warnings
-from vipetsc.cli.tables import first_few, table
+from vipetsc.cli.messages import echo_warnings, first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.endings import Ending
 from vipetsc.io.kinds import BRANCHES

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from vipetsc.cli.arguments import argument
 from vipetsc.cli.installation import checks
-from vipetsc.cli.messages import echo
-from vipetsc.cli.tables import duration, table
+from vipetsc.cli.messages import duration, echo, table
 from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest

@@ -17,8 +17,7 @@ from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, STUDY_ARGUMENTS, argument
 from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.messages import logger
-from vipetsc.cli.tables import duration, first_few, table
+from vipetsc.cli.messages import duration, first_few, logger, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import RUN

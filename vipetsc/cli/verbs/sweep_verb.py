@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from vipetsc.case import Sweep
 from vipetsc.cli.arguments import STUDY_ARGUMENTS, case_with
 from vipetsc.cli.drawing import Pictures
-from vipetsc.cli.tables import duration, table
+from vipetsc.cli.messages import duration, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import FolderError
 from vipetsc.io.kinds import SWEEP

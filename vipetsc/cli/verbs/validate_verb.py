@@ -11,8 +11,7 @@ from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.parts import parts_in_use
 from vipetsc.case.verb_cases import disorder_of, load_every
 from vipetsc.cli.arguments import CASE, SET
-from vipetsc.cli.messages import echo
-from vipetsc.cli.tables import first_few, table
+from vipetsc.cli.messages import echo, first_few, table
 from vipetsc.cli.verb import DONE, PlainVerb, Rows
 from vipetsc.parallel import StopRequest, on_root
 
