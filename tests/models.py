@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from vipetsc.lattice import Contact, contact_stiffness, four_band
 from vipetsc.modes.stops import Stops
 from vipetsc.modes.system import SmoothSpring, System
@@ -22,6 +24,14 @@ GRAZING_ENERGY = {OUT_OF_PHASE: 0.0293434562302, IN_PHASE: 0.0035442314356}
 def four_band_contact(law: str = "hertz", modulus: float = 1e8, exponent: float | None = None) -> Contact:
     """The conservative contact of the four-band lattice; its ``modulus`` is 100 MPa in the paper."""
     return Contact(law, contact_stiffness(modulus, RADIUS, POISSON), exponent=exponent)
+
+
+def force_of(
+    law: Contact, w: np.ndarray, clearance: float, rate: float | np.ndarray = 0.0, approach: float = np.inf
+) -> np.ndarray:
+    """Return the force in N on the host at ``w`` (...) in m, with stops of a ``law`` on both sides."""
+    elastic = law.elastic_force(w - clearance) - law.elastic_force(-w - clearance)
+    return elastic * law.dissipation_factor(rate, approach)
 
 
 def reduced_model(law: str = "bilinear", modulus: float = 1e8, exponent: float | None = None) -> System:

@@ -169,7 +169,7 @@ def test_a_branch_is_stored_with_states_and_a_table_and_drawn(whole):
     chain = build_chain(case.lattice, case.contacts)
     u = state.on(0, 60)[0]
     w = u[19, chain.cell.resonator] - u[19, chain.cell.host]
-    energy = 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel() + HERTZ.potential(w, CLEARANCE)
+    energy = 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel() + HERTZ.elastic_energy(np.abs(w) - CLEARANCE)
     # The state has the harmonics up to a truncation of 1e-5.
     assert branch.points[0].energy == pytest.approx(float(energy), rel=1e-5)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from tests.models import force_of
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact, DenseCompliance, Spring
 from vipetsc.modes.balance import conservative
@@ -120,7 +121,7 @@ def test_a_dissipative_contact_loses_the_work_of_its_force(law):
     # w = cos theta passes -1/2 and 1/2 with |dw/dtheta| = sqrt(3)/2 and returns there symmetrically.
     theta = np.linspace(-np.pi / 3, np.pi / 3, 400001)
     approach = OMEGA * np.sqrt(0.75)
-    force = law.force(np.cos(theta), 0.5, -OMEGA * np.sin(theta), approach)
+    force = force_of(law, np.cos(theta), 0.5, -OMEGA * np.sin(theta), approach)
     loss = 2 * trapezoid(force * -np.sin(theta), theta)
     assert series.loss[0] == pytest.approx(loss, rel=1e-8)
     assert series.loss[0] > 0

@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import small_case
 from vipetsc.case import CaseError
 from vipetsc.dynamics import energies, run
-from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, EnergyMeter, add_energy
+from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, SPRING, EnergyMeter, add_one
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_scalars
@@ -25,7 +25,7 @@ from vipetsc.io.store import RunMemory
 def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
     """Sums of energies that are cut off at ``LARGEST`` saturate; 2^14 of them would add up to 2^64, 0 in 64 bits."""
     model = small_case(lattice={"cells": 2**14, "damping": {"mass": 1.0}}).model()
-    layout = Layout(model, MPI.COMM_SELF, dashpots=True)
+    layout = Layout(model, MPI.COMM_SELF)
     sums = EnergyMeter(model, layout, create_record(model, layout)).sums(np.full(layout.size, np.nan))
     kinetic, spring, _, _, damping = sums[:, 0] >= LARGEST
     assert kinetic
@@ -34,7 +34,7 @@ def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
 
     sums[:] = 0
     for _ in range(2**14):
-        add_energy(sums, np.nan, 1.0)
+        add_one(sums, SPRING, np.nan, 1.0)
     assert sums[1, 0] >= LARGEST
 
 
@@ -90,7 +90,7 @@ def test_remainders_are_carried_so_that_those_of_many_cells_do_not_overflow():
     energy = 0.5 - 2.0**-40
     sums = np.zeros((ENERGY_SUMS, 2), np.int64)
     for _ in range(3):
-        add_energy(sums, energy, 1.0)
+        add_one(sums, SPRING, energy, 1.0)
     whole, fine = sums[1].tolist()
     assert 0 <= fine < 2**52
     assert whole + fine / 2**52 == pytest.approx(3 * energy, rel=1e-15)

@@ -158,9 +158,9 @@ def rates_of(lattice: LatticeRecord, time: float, state: PETSc.Vec) -> PETSc.Vec
     return rates
 
 
-def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
+def evaluate(model: Model, motion: Motion) -> Evaluated:
     """Evaluate the right-hand side in a motion, with the sites in the modes of ``set_contacts``."""
-    layout = Layout(model, MPI.COMM_SELF, dashpots=dashpots)
+    layout = Layout(model, MPI.COMM_SELF)
     record = create_record(model, layout)
     set_contacts(record)
 
@@ -245,7 +245,7 @@ def test_the_sites_motion_is_that_of_the_rates(ends):
 
 def test_the_first_change_of_the_sites_is_found_by_the_address_of_their_lattice():
     model = lattice("free")
-    record = create_record(model, Layout(model, MPI.COMM_SELF, dashpots=True))
+    record = create_record(model, Layout(model, MPI.COMM_SELF))
     start = np.zeros((len(SITES), 3))
     end = np.zeros((len(SITES), 3))
     # Free sites that rise to both stops: the third one is first.

@@ -90,7 +90,7 @@ def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
         wave = phi * np.exp(1j * kappa * np.arange(cells))[:, None]
         # Velocities are larger than displacements by |s|.
         tight = replace(model, rtol=1e-12, atol=(1e-12, 1e-12 * abs(s)))
-        engine = Integrator(tight, Layout(model, MPI.COMM_SELF, True))
+        engine = Integrator(tight, Layout(model, MPI.COMM_SELF))
         engine.state.array[:half] = wave.real.T.ravel()
         engine.state.array[half : 2 * half] = (s * wave).real.T.ravel()
 

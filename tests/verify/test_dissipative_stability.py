@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from tests.models import force_of
 from tests.steady_states import motion_at, nfrc_case
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -40,7 +41,7 @@ class ForcedCell:
         if side:
             # Rounding may put w just outside the stop while the contact is closed.
             w = side * max(side * self.pair @ u, self.clearance)
-            force -= self.pair * self.contact.force(w, self.clearance, self.pair @ v, approach)
+            force -= self.pair * force_of(self.contact, w, self.clearance, self.pair @ v, approach)
         return np.concatenate([v, force / self.masses])
 
     def gap(self, t, y, side, approach):

@@ -31,18 +31,17 @@ class Layout:
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
     numbers of the owned sites, ``acting_sites`` of all that act on its masses. A cell has ``per_cell`` components,
-    as a ghost ``ghost_rows``. With ``dashpots`` a damped lattice is ``damped``: its ghosts have velocities, and
-    ``create_record`` has its dashpots. Where ``integrates_damping`` is true, too, each cell of it has one more
-    component, the energy that its dashpots have dissipated.
+    as a ghost ``ghost_rows``. Ghosts have velocities where the lattice is ``damped``. If ``integrates_damping``, each
+    cell of such a lattice has one more component, the energy that its dashpots have dissipated.
     """
 
-    def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False, integrates_damping: bool = True) -> None:
+    def __init__(self, model: Model, comm: MPI.Comm, integrates_damping: bool = True) -> None:
         chain = model.chain
         self.comm = comm
         self.cells = chain.cells
         self.dofs = chain.cell.dofs
         self.topology = chain.topology
-        self.damped = dashpots and chain.is_damped
+        self.damped = chain.is_damped
         self.integrates_damping = self.damped and integrates_damping
         self.per_cell = 2 * self.dofs + self.integrates_damping
         self.ghost_rows = self.dofs * (1 + (self.damped or chain.sites.join_cells))

@@ -12,6 +12,8 @@ from vipetsc.io.read import open_results
 if TYPE_CHECKING:
     import xarray as xr
 
+    from vipetsc.dynamics.plan import RunPlan
+
 # Statistics that a notebook shows, with their words.
 SHOWN = {
     "engine": "engine",
@@ -31,7 +33,8 @@ class Result:
     ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
     checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
     it in words, ``statistics`` in numbers; ``warnings`` are sentences about results that are not what they seem. All
-    are the same on all ranks, but for ``held``, the run of a simulation without a folder, which rank 0 has.
+    are the same on all ranks, but for ``held``, the run of a simulation without a folder, which rank 0 has. A run in a
+    folder has its ``plan``.
     """
 
     complete: bool
@@ -41,6 +44,7 @@ class Result:
     warnings: list[str]
     folder: Path | None
     held: "xr.Dataset | None" = field(default=None, repr=False, compare=False)
+    plan: "RunPlan | None" = field(default=None, repr=False, compare=False)
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], *, resumable: bool, folder: Path | None) -> "Result":

@@ -145,7 +145,7 @@ def simulate(
             result = simulation.make(output)
         if not result.resumable:
             claim.publish()
-    return replace(result, folder=claim.folder)
+    return replace(result, folder=claim.folder, plan=plan)
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Simulation:
         sys.audit("vipetsc.set-up", case.name)
         with log.SET_UP, petsc_options(case.petsc_options):
             kind = ENGINES[engine_choice.name]
-            layout = Layout(model, output.comm, dashpots=True, integrates_damping=kind.integrates_damping)
+            layout = Layout(model, output.comm, kind.integrates_damping)
             engine = kind(model, layout, self.stop)
         with released(engine, output.comm):
             setup = Setup(

@@ -283,19 +283,6 @@ class Contact:
         g = 1 + self.damping * np.asarray(rate, float) / floored
         return np.maximum(g, 0) if self.adhesion == "clip" else g
 
-    def force(
-        self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf
-    ) -> np.ndarray:
-        """Return the force F (...) in N for relative displacements w (...) in m; g = 1 unless an approach is given."""
-        w = np.asarray(w, float)
-        elastic = self.elastic_force(w - clearance) - self.elastic_force(-w - clearance)
-        return elastic * self.dissipation_factor(rate, approach)
-
-    def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
-        """Return the elastic energy (...) in J stored at relative displacements w (...) in m."""
-        w = np.asarray(w, float)
-        return self.elastic_energy(w - clearance) + self.elastic_energy(-w - clearance)
-
 
 PARAMETERS: Mapping[str, LawParameter] = {
     item.name: item.metadata["parameter"] for item in fields(Contact) if "parameter" in item.metadata

@@ -21,7 +21,6 @@ from scipy.sparse import csc_matrix, diags
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.drive import Drive
 from vipetsc.lattice.inertia import count_below
 from vipetsc.lattice.sites import NO_SITES
 
@@ -87,14 +86,6 @@ class Modes:
         waves = self.vectors[:, mass].conj() * shift[:, None]
         back = waves[self._backward(len(k))].conj()
         return np.concatenate([waves.ravel(), back.ravel()]) / root
-
-    def later(self, amplitudes: np.ndarray, interval: float) -> np.ndarray:
-        """Free ``amplitudes`` (mode) after an ``interval`` in s."""
-        return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
-
-    def driven(self, drive: Drive, start: float, stop: float) -> np.ndarray:
-        """Return change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for ``force`` 1."""
-        return drive.response(self.frequency, start, stop)
 
 
 def linear_modes(chain: Chain) -> Modes:

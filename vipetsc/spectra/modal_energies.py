@@ -76,10 +76,10 @@ class ModalParts:
         ``state`` (mode,) are the amplitudes at the beginning of the span. The result is exact.
         """
         begin, end = span
-        later = self.modes.later(state, end - begin)
+        later = state * np.exp(1j * self.modes.frequency * (end - begin))
         for drive in drives:
             force = self.modes.force(drive.cell, drive.mass) * drive.scale
-            later += force * self.modes.driven(drive, begin, end)
+            later += force * drive.response(self.modes.frequency, begin, end)
         change = 0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)
         return np.asarray(self.sums(change[None]).sum(axis=(1, 2)))
 

@@ -78,12 +78,14 @@ def _sweep_of(options: argparse.Namespace) -> Sweep:
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
     """Simulate the case, and measure its fields and the motion of its named points, as far as they are stored."""
     from vipetsc.dynamics import simulate
-    from vipetsc.dynamics.plan import RunPlan, estimate
+    from vipetsc.dynamics.plan import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
 
     result = simulate(case, work.folder, work.comm, extend=work.options.extend, **work.keywords)
     work.warn(result.warnings)
-    faster = on_root(work.comm, lambda: estimate(RunPlan.of(case), work.comm.size).faster)
+    plan = result.plan
+    assert plan is not None
+    faster = on_root(work.comm, lambda: estimate(plan, work.comm.size).faster)
     measured_drives = [
         drive.describe() for _, drive in case.drive.every if drive.amplitude and drive.samples is not None
     ]

@@ -2,34 +2,18 @@
 
 A force acts on the lattice along a DoF x = c u, a relative displacement or a mass's own (sec. 2 of the derivation in
 the package's docstring). DoFs so close that one feels the other within a step form a cluster (sec. 6). Two tables hold
-all that a step must know of the lattice at their place: the rows c (-A)^m, by which ``expand_free_motion`` finds the
-Taylor series of x(s) and ``apply_impulses`` adds what forces leave in the lattice (sec. 5); and the responses G of
-``create_responses``, by which one DoF moves another (sec. 3).
-
-**Notation.** M, K and C are the matrices of masses, springs and dashpots, H the step in s, t the time from its
-beginning, s = t/H, and A = H^2 M^-1 K. From the displacements u_0 and velocities v_0 at the beginning free motion is
-
-    u(s) = sum_m (-A)^m [u_0 s^2m / (2m)! + H v_0 s^(2m+1) / (2m+1)!].
-
-Powers of A bear H^2m already; ``factors`` H^(k mod 2)/k! add what the power s^k lacks (see ``series``). With dashpots
-(sec. 7) it is
-
-    u(s) = sum_k s^k/k! (P_k u_0 + Q_k H v_0),   P_(k+1) = -Q_k H^2 M^-1 K,   Q_(k+1) = P_k - Q_k H M^-1 C,
-
-from P_0 = 1 and Q_0 = 0, and the rows are c P_k and c Q_k, two for each power of time. ``StepSeries`` says how many
-powers of A count, ``terms``, which make twice as many powers of s (with dashpots there is a row for each of these), and
-at how many cells' distance they end, ``reach``.
+all that a step must know of the lattice at their place: the rows c (-A)^m, with dashpots c P_k and c Q_k (sec. 7, and
+``series`` for their factors), by which ``expand_free_motion`` finds the Taylor series of x(s) and ``apply_impulses``
+adds what forces leave in the lattice (sec. 5); and the responses G of ``create_responses``, by which one DoF moves
+another (sec. 3).
 
 **Numbers of DoFs** are those of ``contact_dofs``: 0 to n - 1 the n sites, then the nonlinear springs, and -1 - i for
 drive i, counted from 0. Its array has the drives last and in reverse, so that a negative number is an index from the
 end.
 
-**Rows that serve both ways** (Maxwell's reciprocity). M and K are symmetric, so that (-A)^m M^-1 is: what the force on
-x leaves in every displacement, (-A)^m M^-1 c^T, is M^-1 times the transposed row c (-A)^m, by which x is read from
-every displacement. With dashpots C is symmetric, too, and so is Q_k M^-1, the series of the inverse of M p^2 + C p + K,
-p being Laplace's variable. A force changes velocities alone at once; what follows is the motion from these velocities,
-for which the Q_k stand: no P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the
-factor 1/(k-1)!.
+**Rows that serve both ways** (Maxwell's reciprocity, sec. 5 and 7). A force changes velocities alone at once; what
+follows is the motion from these, for which with dashpots the Q_k stand: no P_k is needed. The velocity, the derivative
+of sum_k Q_k s^k H/k!, has the same Q_k with the factor 1/(k-1)!.
 
 **Words.** The *form* of a DoF is its c, the weights of the masses of its cell and, if forces join cells, of the next
 one. A *group* is a set of DoFs of the lattice that are solved for together, as numbers (``Groups``); a *cluster* is
@@ -231,6 +215,15 @@ def create_responses(groups: Groups, tables: Record, model: Model, series: StepS
 
 
 @kernel
+def _is_damped(dofs: DofTables, rows: int) -> bool:
+    """Return whether ``dofs`` have rows for displacements and rows for velocities, of a state with so many ``rows``.
+
+    Without dashpots the rows of displacements serve for both, and are half as many.
+    """
+    return dofs.rows.shape[1] == rows
+
+
+@kernel
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
@@ -238,66 +231,49 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     m go into ``taylor`` (dof, coefficient); ``columns`` (2 mass, column) hold the lattice's state at the beginning of
     the step.
     """
-    # With dashpots there are rows for displacements and rows for velocities, as many as ``columns`` has; without, the
-    # rows of displacements serve for both, and are half as many.
-    if dofs.rows.shape[1] == columns.shape[0]:
-        return _expand_damped_motion(dofs, c, columns, taylor)
+    masses = columns.shape[0] // 2
+    terms = dofs.rows.shape[3]
+    # Displacements add to the even coefficients and velocities to the odd ones, with dashpots both to all of them.
+    of_velocities = 0
+    stride = 2
+    odd = 1
+    factors_of_velocities = 1
+    if _is_damped(dofs, columns.shape[0]):
+        of_velocities = masses
+        stride = 1
+        odd = 0
+        factors_of_velocities = terms
 
-    masses = dofs.rows.shape[1]
+    # For each term: the sum over displacements, and that over velocities.
+    total = np.empty((2, terms))
     may_touch = False
     for i in range(dofs.first[c], dofs.first[c + 1]):
         rows = dofs.rows[dofs.table[i]]
         leftmost = dofs.column[i]
-        taylor[i] = 0.0
+        total[:] = 0.0
         for j in range(masses):
             for k in range(rows.shape[1]):
-                u = columns[j, leftmost + k]
-                v = columns[masses + j, leftmost + k]
-                _add_powers(rows[j, k], u, v, taylor[i])
+                _add_row(rows[j, k], columns[j, leftmost + k], total[0])
+                _add_row(rows[of_velocities + j, k], columns[masses + j, leftmost + k], total[1])
 
         # The sum of all |a_k| bounds |x| in the whole step, 0 <= s <= 1.
         bound = 0.0
-        for m in range(rows.shape[2]):
-            taylor[i, 2 * m] *= dofs.factors[2 * m]
-            taylor[i, 2 * m + 1] *= dofs.factors[2 * m + 1]
-            bound += abs(taylor[i, 2 * m]) + abs(taylor[i, 2 * m + 1])
+        taylor[i] = 0.0
+        for m in range(terms):
+            taylor[i, stride * m] += total[0, m] * dofs.factors[stride * m]
+            taylor[i, stride * m + odd] += total[1, m] * dofs.factors[stride * m + factors_of_velocities]
+        for coefficient in taylor[i]:
+            bound += abs(coefficient)
         # Not ``bound >= clearance``: a state that is not finite must be looked at, too.
         may_touch |= not bound < dofs.clearance[i]
     return may_touch
 
 
 @kernel
-def _add_powers(row: np.ndarray, u: float, v: float, series: np.ndarray) -> None:
-    """Add ``row`` (term,) times ``u`` to the even coefficients of a ``series``, and times ``v`` to the odd ones."""
+def _add_row(row: np.ndarray, x: float, total: np.ndarray) -> None:
+    """Add ``row`` (term,) times ``x`` to ``total`` (term,)."""
     for m in range(row.size):
-        series[2 * m] += u * row[m]
-        series[2 * m + 1] += v * row[m]
-
-
-@kernel
-def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
-    """Expand the free motion as ``expand_free_motion`` does, in a lattice with dashpots."""
-    _, rows, width, terms = dofs.rows.shape
-    # For each power of time: the sum over displacements, and that over velocities.
-    total = np.empty((2, terms))
-    may_touch = False
-    for i in range(dofs.first[c], dofs.first[c + 1]):
-        leftmost = dofs.column[i]
-        total[:] = 0.0
-        for j in range(rows):
-            for k in range(width):
-                x = columns[j, leftmost + k]
-                row = dofs.rows[dofs.table[i], j, k]
-                # 2 j // rows is 0 in the first half of the rows, those of displacements, and 1 in the second.
-                for m in range(terms):
-                    total[2 * j // rows, m] += x * row[m]
-
-        bound = 0.0
-        for m in range(terms):
-            taylor[i, m] = total[0, m] * dofs.factors[m] + total[1, m] * dofs.factors[terms + m]
-            bound += abs(taylor[i, m])
-        may_touch |= not bound < dofs.clearance[i]
-    return may_touch
+        total[m] += x * row[m]
 
 
 @kernel
@@ -316,55 +292,37 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
     Row i of ``moments`` (dof, k) in N s belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt
     over the step. Displacements in m come before velocities in m/s.
     """
-    # With dashpots: see ``expand_free_motion``.
-    if dofs.rows.shape[1] == out.shape[0]:
-        _apply_damped_impulses(dofs, first, moments, out)
-        return
+    masses = out.shape[0] // 2
+    terms = dofs.rows.shape[3]
+    # Term m of u goes with the factor and the moment of the power 2 m + 1, that of v with those of 2 m. With dashpots
+    # the terms are those of Q_m, which go with the powers m and m - 1; u begins with Q_1, and v has the same rows.
+    first_row = 0
+    begin = 0
+    stride = 2
+    shift = 0
+    factors_of_u = 0
+    if _is_damped(dofs, out.shape[0]):
+        first_row = masses
+        begin = 1
+        stride = 1
+        shift = -1
+        factors_of_u = terms
 
-    masses, width, terms = dofs.rows.shape[1:]
-    for i in range(moments.shape[0]):
-        if is_zero(moments[i]):
-            continue
-        dof = first + i
-        for k in range(width):
-            cell = dofs.owned[dof, k]
-            if cell < 0:
-                continue
-            for j in range(masses):
-                row = dofs.rows[dofs.table[dof], j, k]
-                u = 0.0
-                v = 0.0
-                for m in range(terms):
-                    v += row[m] * dofs.factors[2 * m] * moments[i, 2 * m]
-                    u += row[m] * dofs.factors[2 * m + 1] * moments[i, 2 * m + 1]
-                inverse_mass = dofs.inverse_masses[dofs.table[dof], j, k]
-                out[j, cell] += u * inverse_mass
-                out[masses + j, cell] += v * inverse_mass
-
-
-@kernel
-def _apply_damped_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
-    """Add the motion that forces have caused as ``apply_impulses`` does, in a lattice with dashpots.
-
-    Only the rows of velocities count: see **Rows that serve both ways** in the module's docstring.
-    """
-    rows, width, terms = dofs.rows.shape[1:]
-    masses = rows // 2
     for i in range(moments.shape[0]):
         if is_zero(moments[i]):
             continue
         table = dofs.table[first + i]
-        for k in range(width):
+        for k in range(dofs.rows.shape[2]):
             cell = dofs.owned[first + i, k]
             if cell < 0:
                 continue
             for j in range(masses):
-                row = dofs.rows[table, masses + j, k]
+                row = dofs.rows[table, first_row + j, k]
                 u = 0.0
                 v = 0.0
-                # An impulse moves nothing at once, Q_0 = 0: u begins with Q_1, and v has the same coefficient.
-                for m in range(1, terms):
-                    v += row[m] * dofs.factors[m - 1] * moments[i, m - 1]
-                    u += row[m] * dofs.factors[terms + m] * moments[i, m]
+                for m in range(begin, terms):
+                    power = stride * m + shift
+                    v += row[m] * dofs.factors[power] * moments[i, power]
+                    u += row[m] * dofs.factors[factors_of_u + power + 1] * moments[i, power + 1]
                 out[j, cell] += u * dofs.inverse_masses[table, j, k]
                 out[masses + j, cell] += v * dofs.inverse_masses[table, j, k]
