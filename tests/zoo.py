@@ -164,7 +164,11 @@ ZOO = {
     "slow approaches": Kind({"contacts": {"restitution": 0.4, "approach_floor": 0.3}}, conservative=False),
     "unequal stops": Kind({"contacts": {"clearance_minus": 1e-4, "restitution": 0.7}}, conservative=False),
     "each its law": Kind(
-        {"contacts": {"sites": [6, 7, 9], "exponent": 1.25, "clearance": [3e-5, 2e-5, 1e-5], "each": DIFFERING}},
+        {
+            "contacts": {"sites": [6, 7, 9], "exponent": 1.25, "clearance": [3e-5, 2e-5, 1e-5], "each": DIFFERING}
+            # No site has the common restitution, whose exact factor would be infinite.
+            | {"restitution": 0.0, "damping": "exact"}
+        },
         exact=False,
         conservative=False,
         mirrored=False,
@@ -244,6 +248,30 @@ ZOO = {
         scaled=False,
         mirrored=False,
         linear_without_sites=False,
+    ),
+    # Springs of all cells are linear; the one to the left wall is that of the reference cell.
+    "curved at the wall": Kind(
+        {
+            "lattice": {
+                "cell": PAIR | {"springs": [PAIR["springs"][0] | {"cubic": 3e10, "quadratic": 4e6}, INSIDE]},
+                "profiles": {
+                    f"springs[1].{term}": {"cells": [*range(1, 17)], "value": 0.0} for term in ("cubic", "quadratic")
+                },
+            },
+            "drive": {"cell": 2},
+        },
+        scaled=False,
+        mirrored=False,
+        linear_without_sites=False,
+    ),
+    "strip": Kind(
+        {
+            "lattice": {"cell": None, "strip": {"rows": 5, "mass": 0.35, "stiffness": 1.3e5}},
+            "contacts": {"sites": None, "places": [[5, 1], [8, 2], [9, 3]], "restitution": 0.8},
+            "drive": {"cell": None, "place": [3, 2], "amplitude": 240.0},
+        },
+        conservative=False,
+        mirrored=False,
     ),
     "damped ring": Kind(
         {"lattice": {"ends": "periodic", "damping": {"mass": 50.0, "stiffness": 1e-4}}, "drive": {"amplitude": 240.0}},

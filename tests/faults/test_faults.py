@@ -5,19 +5,16 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from typing import get_args
 
-import h5py
-import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from tests.faults.campaign import KILLED, fault_table
 from tests.faults.inject import KINDS
 from tests.faults.phases import phases
-from tests.faults.scenarios import OF_ONE_CALL, SCENARIOS, difference, prepare
+from tests.faults.scenarios import SCENARIOS, prepare
 from tests.faults.trials import ROOT, Crew, judge, last_words, matrix, processes_of, references
 from vipetsc.case import Case
 from vipetsc.case.nnm import NnmTable
@@ -56,59 +53,6 @@ def test_every_system_of_normal_modes_meets_faults():
             systems.add(tomllib.loads(scenario.case)["nnm"].get("system", "reduced"))
 
     assert systems == {*get_args(NnmTable.model_fields["system"].annotation)} - ONE_CELL
-
-
-@pytest.mark.parametrize(("place", "value"), [("/", "ended"), ("bands", np.array([1.0, 2.0])), ("bands/energy", None)])
-def test_attributes_of_files_groups_and_datasets_are_compared(tmp_path, place, value):
-    """Two outcomes differ by one attribute that has another value or is missing, unless it belongs to one call."""
-    paths = [outcome_file(tmp_path / name) for name in ("wanted", "found")]
-    folders = [path.parent for path in paths]
-    assert difference(*folders) == ""
-
-    for path, number in zip(paths, (1, 2), strict=True):
-        with h5py.File(path, "r+") as file:
-            file.attrs["statistics"] = json.dumps({"steps": 5, "wall_seconds": number})
-            file[place].attrs.update({name: str(number) for name in OF_ONE_CALL})
-    assert difference(*folders) == ""
-
-    with h5py.File(paths[1], "r+") as file:
-        attributes = file[place].attrs
-        del attributes["about"]
-        if value is not None:
-            attributes["about"] = value
-    name = place.strip("/")
-    assert difference(*folders) == f"results.h5: ['{name}@about']"
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (lambda file: file.attrs.update(statistics='{"steps": 6}'), "@statistics"),
-        (lambda file: file["bands/energy"].dims[0].detach_scale(file["time"]), "bands/energy@dimensions"),
-        (lambda file: file.create_group("more"), "more"),
-    ],
-)
-def test_statistics_and_dimensions_are_compared(tmp_path, change, named):
-    """Two outcomes differ by a number of the statistics, by a dimension and by a group that only one of them has."""
-    paths = [outcome_file(tmp_path / name) for name in ("wanted", "found")]
-    with h5py.File(paths[1], "r+") as file:
-        change(file)
-    assert difference(paths[0].parent, paths[1].parent) == f"results.h5: ['{named}']"
-
-
-def outcome_file(folder):
-    """Write a small file of results into ``folder``, which is created; returns its path."""
-    folder.mkdir()
-    path = folder / "results.h5"
-    with h5py.File(path, "w") as file:
-        file["time"] = np.arange(3.0)
-        file["time"].make_scale("time")
-        file["bands/energy"] = np.ones(3)
-        file["bands/energy"].dims[0].attach_scale(file["time"])
-        file.attrs["statistics"] = '{"steps": 5}'
-        for place in ("/", "bands", "bands/energy"):
-            file[place].attrs["about"] = 1.0
-    return path
 
 
 @pytest.mark.mpirun

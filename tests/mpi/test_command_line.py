@@ -110,29 +110,6 @@ def test_a_module_that_fails_on_one_rank_ends_all(folder, failing, verb, call):
 
 
 @pytest.mark.parallel([2])
-def test_a_file_that_is_no_branch_is_refused(folder, call):
-    """An HDF5 file of another kind under a branch's name is named once, without a traceback."""
-
-    def write() -> None:
-        with h5py.File(folder / "branch-x.h5", "w") as file:
-            file["energy"] = [1.0]
-
-    on_root(COMM, write)
-    code, _, errors = call("plot", folder)
-    assert code == 2
-    assert errors.count("is not a branch") == 1
-    assert "Traceback" not in errors
-
-
-@pytest.mark.parallel([2])
-def test_doctor_finds_no_problem_here(call):
-    """``doctor`` finds no problem with this installation on either rank."""
-    code, printed, _ = call("doctor")
-    assert code == 0
-    assert printed.count("no problems") == 1
-
-
-@pytest.mark.parallel([2])
 def test_a_run_is_drawn_and_filmed_together(folder, call, plain_pictures, with_figures):
     """Both ranks leave one run, one summary and its pictures; what one finds in a folder is sent to the other."""
     with_figures("ledger", "spacetime")

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import SimpleNamespace
-
-from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-from tests.conftest import small_case
-from tests.mpi.alike import COMM, as_alone
+from tests.mpi.alike import as_alone
 from vipetsc.case import Case
-from vipetsc.dynamics import simulate
-from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.observers import Observer
-from vipetsc.dynamics.propagator import engine
-from vipetsc.io.store import RunMemory
-from vipetsc.lattice.sites import Pair, sites_at
-from vipetsc.lattice.topology import Topology
 
 STALLING = 1e45  # N/m
 
@@ -109,32 +99,3 @@ def test_a_run_that_fails_ends_as_on_one_rank(name):
 @pytest.mark.parallel([3])
 def test_a_run_that_fails_on_one_of_three_ranks_ends_as_on_one():
     assert_ends_as_alone("between samples")
-
-
-@pytest.mark.parallel(2)
-def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
-    """An error of one rank in the set-up of the propagator is raised on all ranks."""
-    clusters = engine.SiteClusters
-
-    def fail_on_rank_1(*arguments):
-        if COMM.rank == 1:
-            raise ValueError("no room")
-        return clusters(*arguments)
-
-    monkeypatch.setattr(engine, "SiteClusters", fail_on_rank_1)
-    case = small_case(contacts={"sites": [5]}, time={"engine": "propagator"})
-    with pytest.raises(ValueError, match="no room"):
-        simulate(case, RunMemory(MPI.COMM_WORLD))
-
-
-@pytest.mark.parallel([1, 2])
-@pytest.mark.parametrize(("ends", "site"), [("fixed", "site 1 in cell 6"), ("periodic", "site 2 in cell 20")])
-def test_of_cells_that_move_equally_fast_the_first_is_named(ends, site):
-    """Many cells of several ranks may be not finite. On a ring the last cell is next to the first."""
-    layout = SimpleNamespace(comm=COMM, dofs=1, owned=3, start=3 * COMM.rank)
-    engine = SimpleNamespace(state=SimpleNamespace(array_r=np.array([0.0, 0.0, 0.0, 1.0, np.nan, np.nan])))
-    sites = sites_at([5, 19], Pair(0, 0))
-    cell = SimpleNamespace(springs=())
-    model = SimpleNamespace(chain=SimpleNamespace(sites=sites, topology=Topology(20, ends), cell=cell))
-    place = failing_place(SimpleNamespace(layout=layout, engine=engine, model=model))
-    assert place == f"cell 2, nearest {site}"

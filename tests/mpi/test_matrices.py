@@ -110,20 +110,6 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
     matrices.destroy()
 
 
-@pytest.mark.parallel(2)
-def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
-    """Without a direct solver for several ranks, two ranks find the modes of the closed form."""
-    monkeypatch.setattr(eigen, "ON_SEVERAL", ())
-    chain = Chain(four_band("calibrated"), 60, "fixed")
-    matrices = LatticeMatrices(chain, COMM)
-    modes = modes_near(matrices, 4, 2034.0)
-    every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
-    nearest = np.sort(every[np.argsort(np.abs(every - 2034.0), kind="stable")[:4]])
-    assert modes.frequency == pytest.approx(nearest, rel=1e-9)
-    assert modes.residual.max() < 1e-9
-    matrices.destroy()
-
-
 @pytest.mark.parallel([3])
 def test_modes_of_one_frequency_span_the_same_motions_on_any_number_of_ranks():
     """On a ring, waves in both directions have one frequency: their modes span the motions that those of one rank do.

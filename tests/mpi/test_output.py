@@ -13,7 +13,6 @@ import pytest
 from tests.conftest import assert_same_bits, datasets, small_case
 from tests.mpi.alike import arrays
 from vipetsc.dynamics import simulate
-from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
 
 COMM = MPI.COMM_WORLD
@@ -40,26 +39,6 @@ def test_all_ranks_agree_on_the_file_and_rank_0_has_the_run_in_memory(folder):
     held.pop("end/displacement")
     held.pop("end/velocity")
     assert_same_bits(datasets(folder / "run" / "run.h5"), held)
-
-
-@pytest.mark.parallel(2)
-def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch):
-    """An error of the rank that writes is raised on all ranks; the earlier run and the parts of the new one remain."""
-    path = folder / "run"
-    simulate(small_case(time={"end": 0.01}), path)
-    before = (path / "run.h5").read_bytes()
-
-    # Rank 0 writes the file.
-    def fails(*arguments):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(chunks, "put_chunks", fails)
-    with pytest.raises(OSError, match=r"run\.h5 could not be written"):
-        simulate(small_case(time={"end": 0.02}), path, force=True)
-
-    COMM.Barrier()
-    assert (path.with_name("run.old") / "run.h5").read_bytes() == before
-    assert {p.name for p in path.iterdir()} == {"case.toml", "parts"}
 
 
 @pytest.mark.parallel(2)

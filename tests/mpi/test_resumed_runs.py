@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import InParts, StopAt, assert_same_bits, datasets, small_case
 from tests.mpi.alike import COMM
 from tests.mpi.test_same_bits import drives
-from tests.verify.test_rigid_impacts import joined
+from tests.verify.test_impacts import joined
 from vipetsc.dynamics import simulate
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import on_root, wait_for_all

@@ -11,8 +11,8 @@ import pytest
 import vipetsc
 from tests.conftest import small_case
 from tests.mpi.alike import as_alone
-from tests.verify.test_lyapunov import EXPONENT_OF_CHAIN
-from tests.verify.test_rigid_impacts import joined
+from tests.verify.test_impacts import joined
+from tests.verify.test_measures_of_runs import EXPONENT_OF_CHAIN
 from tests.zoo import ZOO
 from vipetsc.case import Case, CaseError
 from vipetsc.dynamics import simulate
@@ -25,7 +25,7 @@ def case_at_border(name: str, engine: str) -> Case:
     """Return a lattice of the zoo with its sites on both sides of the border of two ranks."""
     table = ZOO[name].table(engine)
     # 16 cells are cut after cell 8.
-    if table["contacts"]["sites"] == [7, 8]:
+    if table["contacts"].get("sites") == [7, 8]:
         table["contacts"]["sites"] = [8, 9]
     return Case.from_table(table)
 
@@ -153,21 +153,6 @@ def sharing_masses(engine: str) -> Case:
     return joined(engine, [11, 12, 13], 0.3, "periodic", time={"end": 0.03})
 
 
-def strip(engine: str) -> Case:
-    """Return a strip with stops to the ground and one between rows."""
-    return Case.from_table({
-        "lattice": {"cells": 24, "strip": {"rows": 5, "mass": 0.01, "stiffness": 1e4}},
-        "contacts": {
-            "places": [[5, 1], [12, 2], [13, 3]],
-            "clearance": 1e-4,
-            "stiffness": 1e8,
-            "restitution": 0.8,
-        },
-        "drive": {"amplitude": 20.0, "waveform": "harmonic", "frequency": 1000.0, "place": [3, 2]},
-        "time": {"end": 0.04, "engine": engine},
-    })  # fmt: skip
-
-
 def exponent(engine: str) -> Case:
     """Return a run with a Lyapunov exponent, whose companion lies on all ranks too."""
     time = EXPONENT_OF_CHAIN["time"] | {"engine": engine, "end": 0.2}
@@ -195,7 +180,6 @@ ACROSS = {
     wide_band: ("propagator",),
     sticking: BOTH,
     sharing_masses: ("propagator",),
-    strip: BOTH,
     exponent: BOTH,
     users_law: BOTH,
 }

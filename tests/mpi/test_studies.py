@@ -9,9 +9,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-import xarray as xr
 
-from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets
 from tests.faults.inject import Injector
 from tests.faults.scenarios import difference
 from tests.identified import identify_table, lattice_table, measured_table
@@ -19,14 +18,12 @@ from tests.studies import STUDIES, compute
 from vipetsc.case import CaseError, Sweep
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.nnm import NnmCase
-from vipetsc.dynamics import simulate
 from vipetsc.io.records import RecordFile
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.register import PartError
-from vipetsc.studies import analysis, linear_run
-from vipetsc.studies.analysis import analyse
+from vipetsc.studies import linear_run
 from vipetsc.studies.ensemble import FAILED
 from vipetsc.studies.identification import run_identification
 from vipetsc.studies.recorded_runs import RecordedRuns
@@ -107,34 +104,6 @@ def test_ranks_divide_a_single_start_to_the_same_bits(folder):
     run_identification(plan, folder / "together", COMM)
     assert_same_bits(datasets(folder / "together/identified.h5"), datasets(folder / "alone/identified.h5"))
     COMM.Barrier()
-
-
-@pytest.mark.parallel([2])
-def test_ranks_take_different_measures_of_one_run(monkeypatch):
-    """Each measure is computed on one rank; all ranks get all measures, with the order and attributes of one rank.
-
-    An error in a measure is raised on all ranks.
-    """
-
-    def measured() -> tuple[xr.Dataset, xr.Dataset]:
-        run = simulate(small_case(time={"end": 0.02}), comm=MPI.COMM_SELF).dataset
-        return run, analyse(run)
-
-    run, measured_alone = on_root(COMM, measured)
-    taken = []
-    bands = analysis.band_energies
-    monkeypatch.setattr(analysis, "band_energies", lambda *arguments: taken.append(1) or bands(*arguments))
-    together = analyse(run, comm=COMM)
-    assert together.identical(measured_alone)
-    assert list(together.variables) == list(measured_alone.variables)
-    assert COMM.allreduce(len(taken)) == 1
-
-    def fail(*arguments):
-        raise ValueError("no bands")
-
-    monkeypatch.setattr(analysis, "band_energies", fail)
-    with pytest.raises(ValueError, match="no bands"):
-        analyse(run, comm=COMM)
 
 
 def three_cells(**nnm) -> NnmCase:

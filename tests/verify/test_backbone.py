@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,7 +12,7 @@ from tests.conftest import record_of_linear
 from vipetsc.case import Case
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import RecordFile
-from vipetsc.studies.backbone import BRANCH, LAYOUT, LEAST_FITTED, align, initiation_of, read_slope
+from vipetsc.studies.backbone import LAYOUT, align, initiation_of
 from vipetsc.studies.linear_run import LinearRun, linear_name
 
 GRAZING = 0.03
@@ -67,28 +66,6 @@ def test_energies_align_at_grazing(tmp_path):
     np.testing.assert_allclose(energy / energy[0], amplitude**2, rtol=1e-13)
 
 
-def linear_record(folder, *overrides: str) -> Case:
-    """Record the linear run of a case with ``overrides``, whose envelope is 2e-4 m everywhere; returns the case."""
-    case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", *overrides])
-    linear = LinearRun(np.full(20, 2e-4), np.zeros(20), {"work": 1.5e-3}, {})
-    RecordFile(folder / "members-0.jsonl").append(record_of_linear(linear, linear_name(case)))
-    return case
-
-
-@pytest.mark.parametrize(
-    ("override", "reason"),
-    [
-        ("contacts.clearance=0.0", "touches at rest"),
-        ("drive.more=[{waveform='step', amplitude=0.1, ramp=1e-3, cell=3}]", "not proportional"),
-    ],
-)
-def test_contacts_without_a_first_amplitude_have_no_initiation(tmp_path, override, reason):
-    """Contacts that touch at rest act at any amplitude; a second force makes the motion not proportional to it."""
-    case = linear_record(tmp_path, "contacts.side='plus'", "contacts.restitution=1.0", override)
-    with pytest.raises(ValueError, match=reason):
-        initiation_of(tmp_path, case)
-
-
 @settings(deadline=None, max_examples=25)
 @given(st.floats(1e2, 1e6), st.floats(1e-3, 1e3), st.floats(-2.0, -0.3), st.integers(0, 99))
 def test_power_laws_are_found(divisor, initiation, exponent, seed):
@@ -138,60 +115,3 @@ def test_divisor_is_the_least_squares_one():
 
     best = found.attrs["divisor"]
     assert misfit(best) < min(misfit(best * 1.01), misfit(best / 1.01))
-
-
-def test_failed_members_and_points_before_the_peak_are_left_out():
-    slope = branch()
-    work, transfer = exact_transfer(4e3, 1e-4)
-    transfer[5] = np.nan
-    peak = int(np.argmin(np.abs(work / INITIATION - 20)))
-    transfer[peak] = 2 * np.nanmax(transfer)
-
-    found = align(work, transfer, INITIATION, 1e-4, slope)
-
-    energy = found["energy"].values
-    fitted = found["fitted"].values == 1
-
-    assert len(energy) == len(work) - 1
-    assert energy[fitted].min() == pytest.approx(work[peak] * GRAZING / INITIATION)
-
-
-def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
-    slope = branch()
-    work = INITIATION * np.array([0.1, 3.0, 30.0])
-    transfer = np.array([1e-4, 0.3, 0.1])
-
-    found = align(work, transfer, INITIATION, 1e-4, slope)
-    assert found["fitted"].values.sum() < LEAST_FITTED
-    assert not found.attrs
-
-    short = slope.isel(point=slope["branch/energy"].values < 1.5 * GRAZING)
-    with pytest.raises(ValueError, match="region III"):
-        align(work, transfer, INITIATION, 1e-4, short)
-
-
-def write_branch(folder, slope, kinds=None):
-    """Write ``branch-out-of-phase.h5`` with the quantities that the comparison reads; returns the file's path."""
-    folder.mkdir(exist_ok=True)
-    if kinds is None:
-        kinds = np.zeros(slope.sizes["point"], np.int8)
-    with h5py.File(folder / BRANCH, "w") as file:
-        for name in ("energy", "slope", "region"):
-            file[name] = slope[f"branch/{name}"].values
-        file["contacts"] = (slope["branch/region"].values > 1).astype(int)
-        file["kind"] = kinds
-        file.attrs["case"] = '[lattice]\nreading = "{reading}"\n[contacts]\nlaw = "{law}"\n'.format(**slope.attrs)
-    return folder / BRANCH
-
-
-def test_branch_is_read_at_its_regular_points(tmp_path):
-    slope = branch()
-    kinds = np.zeros(slope.sizes["point"], np.int8)
-    # The located grazing point is not one of the continuation's own.
-    kinds[9] = 6
-
-    found = read_slope(write_branch(tmp_path / "b", slope, kinds))
-
-    assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)
-    assert found.sizes["point"] == slope.sizes["point"] - 1
-    assert found.attrs == {"law": "hertz", "reading": "printed"}

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.dynamics import simulate
@@ -72,34 +71,6 @@ def test_the_guard_names_the_first_bad_sample_of_a_block():
     with pytest.raises(RunawayError, match="not finite") as not_finite:
         begun(Guard).observe(block(work, total))
     assert not_finite.value.sample == 3
-
-
-# 2e6 J is more than the meter's largest energy.
-@pytest.mark.parametrize(("work", "total"), [(np.nan, 1.0), (1.0, np.nan), (1.0, 2e6), (np.inf, 1.0)])
-def test_the_guard_refuses_what_is_not_finite(work, total):
-    with pytest.raises(RunawayError, match="not finite"):
-        begun(Guard).observe(block(work=[work], total=[total]))
-
-
-def test_the_ledger_of_a_resumed_run_goes_on_from_its_checkpoint():
-    """The ledger error of a run is its largest error over its largest work, kept through a checkpoint.
-
-    Here |4 - 2 - 1.5|/4 = 0.125 is larger than |3 - 2.75|/4.
-    """
-    ledger = begun(Ledger)
-    assert ledger.statistics() == {"ledger_error": 0.0}
-
-    ledger.observe(block(work=[4.0], total=[2.0], dissipated=1.5))
-    ledger.observe(block(work=[1.0, 3.0], total=[1.0, 2.75]))
-    expected = {"ledger_error": 0.125, "work": 3.0, "dissipated": 0.0}
-    assert ledger.statistics() == expected
-
-    resumed = begun(Ledger)
-    resumed.restore(ledger.checkpoint())
-    assert resumed.statistics() == expected
-
-    resumed.observe(block(work=[3.5], total=[3.5]))
-    assert resumed.statistics()["ledger_error"] == 0.125
 
 
 class Watch(Observer):
@@ -171,20 +142,3 @@ def test_a_loss_of_dashpots_that_falls_is_an_error_of_the_balance():
     resumed.restore(ledger.checkpoint())
     resumed.observe(damped_block([2.0, 4.0], [1.0, 1.0], first=3))
     assert resumed.statistics()["ledger_error"] == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize("cuts", [[7], [1, 6], [2, 5], [3, 1, 3], [1] * 7])
-def test_the_quadrature_of_dashpots_is_the_trapezoidal_rule_over_all_blocks(cuts):
-    """Its error is the largest distance from the rule over every other sample."""
-    powers = np.array([1.0, 4.0, 2.0, 0.0, 3.0, 5.0, 1.0])
-    ledger = begun(Ledger)
-    first = 0
-    for count in cuts:
-        part = powers[first : first + count]
-        ledger.observe(damped_block(np.zeros(count), part, first))
-        first += count
-
-    found = ledger.statistics()
-    assert found["damping_quadrature"] == trapezoid(powers)
-    distances = [trapezoid(powers[: n + 1]) - 2 * trapezoid(powers[: n + 1 : 2]) for n in (0, 2, 4, 6)]
-    assert found["damping_quadrature_error"] == np.abs(distances).max() > 0

@@ -1,14 +1,24 @@
-"""Arcs and orbits of the reduced model: an exact solution, conservation, sensitivities, other flows and maps."""
+"""Arcs, orbits and branches of the reduced model: exact solutions, conservation, sensitivities, tongues, limits."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 
-from tests.models import CLEARANCE, OUT_OF_PHASE, reduced_model
+from tests.models import CLEARANCE, GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_contact, reduced_model
 from tests.reference_flows import FiniteDifferences
+from tests.verify.conftest import follow
+from vipetsc.case.nnm import Guards
+from vipetsc.lattice import four_band
+from vipetsc.modes.branches.branch_checks import BranchMonitor
+from vipetsc.modes.continuation.arclength import locate
 from vipetsc.modes.flow import MAPS, Dop853Flow
-from vipetsc.modes.shooting import Shooting
+from vipetsc.modes.shooting import Shooting, linear_start, resonance
+from vipetsc.modes.stability import half_traces, multipliers
+from vipetsc.modes.stops import Stops
+from vipetsc.modes.system import SmoothSpring, System
 
 
 def superposed(stiffness, masses, centre, displacement, velocity, duration):
@@ -130,19 +140,175 @@ def test_short_contacts_inside_a_step_are_found(excess, changes):
     assert len(arc.events) == changes
 
 
-@pytest.mark.parametrize("law", ["bilinear", "hertz"])
-def test_states_at_uniform_times_are_those_of_arcs(law, request):
-    """States of an orbit, computed without variations, are the ends of arcs, also after changes of contact."""
-    branch = request.getfixturevalue(law)
-    flow = branch.problem.flow
-    point = branch.at_energy(10.0)
-    start = branch.problem.start(point.x)
-    count = 12
-    states = flow.states(start, point.period / count, count, point.period)
+def test_half_map_of_an_asymmetric_system():
+    """Orbits of x'' + x + a x^2 = 0 have the frequency 1 - 5/12 a^2 A^2 to second order (Nayfeh and Mook 1979)."""
+    a = 0.1
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=a)])
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
 
-    size = np.abs(states).max(axis=0)
-    assert states.shape == (count + 1, len(start))
-    assert np.array_equal(states[0], start)
-    for number in range(1, count + 1):
-        end = flow.arc(start, number * point.period / count, point.period).end
-        assert np.all(np.abs(states[number] - end) <= 1e-11 * size)
+    point = linear_start(problem, 0, 1e-3)
+
+    amplitude_squared = 2 * point.energy
+    # The next order of the expansion is (a A)^4, 4e-10.
+    assert 2 * np.pi * point.frequency == pytest.approx(1 - 5 / 12 * a**2 * amplitude_squared, abs=2e-9)
+    assert point.multiplier == 1
+
+
+def test_an_arc_that_ends_where_a_contact_just_closes_ends():
+    """An arc that ends within rounding of a contact's closing comes to an end, and an onset within rounding is none.
+
+    A search for the change in the remaining time, which is all rounding, must not return to its beginning for ever.
+    """
+    system = System.reduced(four_band("printed"), Stops.both(four_band_contact("hertz"), CLEARANCE))
+    flow = Dop853Flow(system)
+    start = np.array([7.732456897616884, 7.742513284851792, 0.0, 0.0])
+
+    arc = flow.arc(start, 0.0003398398033092859, 0.003147455285852897)
+
+    assert arc.episodes == 1
+    assert arc.events[:, 3].tolist() == [-1]
+    assert np.abs(system.gaps(arc.end[:2])) < 1e-14
+
+
+@pytest.mark.parametrize("cubic", [1e8, 1e12])
+def test_a_step_that_overflows_is_taken_again_shorter(cubic):
+    """A step that overflows is repeated shorter, until the flow keeps energy and volume.
+
+    The longest step is a radian of the linear system; the cubic spring oscillates thousands of times in it.
+    """
+    stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    spring = SmoothSpring.between(None, 0, cubic=cubic)
+    system = System(masses=np.ones(2), stiffness=stiffness, contacts=(), springs=(spring,))
+
+    arc = Dop853Flow(system).arc(np.array([1.0, 1.0, 0.0, 0.0]), 2e-3, 8e-3)
+
+    before, after = (system.energy(state[:2], state[2:]) for state in (arc.start, arc.end))
+    assert after == pytest.approx(before, rel=1e-9)
+    # The flow of a conservative system keeps volumes in phase space.
+    assert np.linalg.det(arc.sensitivity) == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["quarter", "half", "whole"])
+def test_multipliers_are_those_of_the_monodromy_matrix(name):
+    """At a linear orbit the multipliers are exp(+-i omega_1 T_2), whatever the map."""
+    system = reduced_model()
+    problem = Shooting(Dop853Flow(system), MAPS[name])
+    point = linear_start(problem, OUT_OF_PHASE, 1e-3)
+
+    traces = half_traces(system, problem.map, problem.arc(point.x, point.period))
+    mu = multipliers(traces, problem.map.quarter)
+
+    omega, _ = system.linear_modes()
+    assert mu.real == pytest.approx(np.cos(2 * np.pi * omega[0] / omega[1]), abs=1e-9)
+    assert np.abs(mu) == pytest.approx(1, abs=1e-9)
+
+
+def test_linear_modes_and_limits():
+    """The linear modes have the frequencies of the paper's two masses, and large motions those with closed contacts.
+
+    The numbers are the roots of the characteristic polynomials of the two stiffness matrices, in Hz.
+    """
+    system = reduced_model()
+
+    assert system.linear_modes()[0] / (2 * np.pi) == pytest.approx([135.1209897, 474.2501016], rel=1e-9)
+    assert system.closed_frequencies() / (2 * np.pi) == pytest.approx([318.1562921, 10252.6169369], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["bilinear", "hertz"])
+def test_out_of_phase_branch(name, request):
+    """The branch grazes once, at the energy of the linear mode that touches, and is stable above its folds."""
+    branch = request.getfixturevalue(name)
+    points = branch.points
+
+    # Steps grow with the energy, so that thirteen decades take few points.
+    assert len(points) <= 400
+    assert points[-1].energy >= 1e9
+    assert max(point.residual for point in points) <= 1e-12
+
+    (graze,) = branch.of_kind("grazing")
+    assert graze.energy == pytest.approx(GRAZING_ENERGY[OUT_OF_PHASE], rel=1e-10)
+    assert all(point.multiplier == pytest.approx(1, abs=1e-9) for point in points if point.energy > 0.1)
+
+
+def test_bilinear_folds_and_stability(bilinear):
+    """The energy folds back twice at grazing, and orbits are unstable between the folds and nowhere else."""
+    folds = bilinear.of_kind("fold-energy")
+
+    # A pair of multipliers is at +1 where the energy is stationary: their half-trace is 1.
+    assert len(folds) == 2
+    for fold in folds:
+        assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
+
+    first, second = (fold.index for fold in folds)
+    for point in bilinear.points:
+        if first < point.index < second:
+            assert point.multiplier > 1.01
+        elif not first <= point.index <= second:
+            assert point.multiplier == pytest.approx(1, abs=1e-6)
+
+
+def test_bilinear_approaches_its_limit(bilinear):
+    """The distance f_limit - f falls as E^(-1/2), as the clearance over the amplitude does."""
+    limit = bilinear.problem.system.closed_frequencies()[1] / (2 * np.pi)
+
+    lower = limit - bilinear.at_energy(1e6).frequency
+    upper = limit - bilinear.at_energy(1e8).frequency
+
+    # The next term of the expansion is smaller by D over the amplitude, 3e-3 at 1e6 J.
+    assert lower / upper == pytest.approx(10, rel=2e-3)
+
+
+def test_hertz_folds_only_at_200_mpa(hertz):
+    """Hertz contacts of the printed 100 MPa have no fold and no instability; those of 200 MPa have both."""
+    assert not hertz.of_kind("fold-energy")
+    assert max(point.multiplier for point in hertz.points) == pytest.approx(1, abs=1e-6)
+
+    stiffer = follow(reduced_model("hertz", modulus=2e8), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.1])
+    assert len(stiffer.of_kind("fold-energy")) == 2
+    assert max(point.multiplier for point in stiffer.points) > 1.01
+
+
+def test_in_phase_through_the_first_tongues(in_phase):
+    """The branch passes the grazing cascade and two resonances without a jump, and grazes at its own energy."""
+    problem = in_phase.problem
+    # The frequency first exceeds 333 Hz behind the tongues 7:1 and 5:1; checks of all points would take long.
+    points = list(itertools.takewhile(lambda point: point.frequency < 333, in_phase.points))
+    steps = list(itertools.pairwise(points))
+
+    special = (point for a, b in steps for point in locate(problem, a, b, grazing=True))
+    graze = next(point for point in special if point.kind == "grazing")
+    assert graze.energy == pytest.approx(GRAZING_ENERGY[IN_PHASE], rel=1e-10)
+
+    assert max(point.residual for point in points) <= 1e-11
+    assert max(abs(a.episodes - b.episodes) for a, b in steps) == 1
+
+    monitor = BranchMonitor(problem, Guards())
+    assert not any(monitor.check(point) for point in points)
+
+
+def test_in_phase_through_every_odd_tongue_towards_the_limit(in_phase):
+    """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
+    problem = in_phase.problem
+    points = in_phase.points
+    assert points[-1].energy > 25
+    assert max(point.residual for point in points) <= 3e-12
+    assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
+
+    limit = problem.system.closed_frequencies()[0] / (2 * np.pi)
+    tongues = set()
+    distances = []
+    for last, point in itertools.pairwise(points):
+        # The energy turns upwards at the inner end of a tongue.
+        if not (last.energy_tangent < 0 < point.energy_tangent and point.episodes > 0):
+            continue
+        order = resonance(problem, point)
+        if point.episodes == (order + 1) // 2:
+            tongues.add(order)
+        if order == 1 and point.energy > 0.02:
+            distances.append((limit - point.frequency) * np.sqrt(point.energy))
+
+    assert tongues - {1} == {3, 5, 7}
+    # f_limit - f falls as E^(-1/2): over these three energies the product changes little.
+    assert len(distances) == 3
+    assert min(distances) > 10
+    assert max(distances) < 14

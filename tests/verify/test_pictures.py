@@ -26,8 +26,8 @@ from tests.readable import complaints
 from tests.studies import compute
 from tests.unit.test_branch_figure import put_condensed_branch
 from tests.unit.test_figures import write_run
-from tests.verify.test_sections import IMPACT
-from tests.verify.test_transfer_figures import swept
+from tests.verify.test_measures_of_runs import IMPACT
+from tests.verify.test_paper_curves import swept
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.figures import style

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import vipetsc
-from vipetsc.modes.problem import ContinuationError
 
 
 def special(curve, kind):
@@ -83,15 +82,3 @@ def test_closed_branch_is_followed_once():
     (circle,) = others
     assert circle.attrs["ending"].startswith("closed")
     np.testing.assert_allclose(circle["x"].values[:, 0] ** 2 + (circle["p"].values - 0.5) ** 2, 0.04, atol=1e-7)
-
-
-def test_refusals():
-    """No solution, a wrong shape, an empty range and the user's own error are told apart."""
-    with pytest.raises(ContinuationError, match="p = 0"):
-        vipetsc.follow(lambda x, p: x**2 + 1 + p, [0.3], 0.0, 1.0)
-    with pytest.raises(ValueError, match="shape"):
-        vipetsc.follow(lambda x, p: np.append(x, p), [0.0], 0.0, 1.0)
-    with pytest.raises(ValueError, match="p0"):
-        vipetsc.follow(lambda x, p: x - p, [0.0], 1.0, 1.0)
-    with pytest.raises(KeyError, match="mine"):
-        vipetsc.follow(lambda x, p: {}["mine"], [0.0], 0.0, 1.0)

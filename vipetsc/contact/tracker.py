@@ -22,9 +22,9 @@ from vipetsc.contact.law import (
     RESTING,
     STUCK,
     UNSWITCHED,
-    contact_force,
     elastic_energy,
     elastic_force,
+    elastic_force_and_slope,
     gap_of,
     landed_side,
     side_of,
@@ -126,6 +126,16 @@ def hold_episode(episode: Any, start: np.ndarray, end: np.ndarray, h: float) -> 
 
 
 @kernel
+def _force_and_rate(site: Any, side: float, motion: np.ndarray) -> tuple[float, float]:
+    """Return the force in N of a ``site`` that touches at rest, and its rate in N/s, at its ``motion`` (3,)."""
+    x = side * motion[0] - gap_of(site, side)
+    if x <= 0.0:
+        return 0.0, 0.0
+    force, slope = elastic_force_and_slope(site.elastic, x)
+    return force, slope * side * motion[1]
+
+
+@kernel
 def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> bool:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3).
 
@@ -142,10 +152,11 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
             # extremes would cost as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
-            first = side * contact_force(contacts, i, start[i, 0], start[i, 1])[0]
-            last = side * contact_force(contacts, i, end[i, 0], end[i, 1])[0]
+            first, first_rate = _force_and_rate(contacts[i], side, start[i])
+            last, last_rate = _force_and_rate(contacts[i], side, end[i])
             episode.force = max(episode.force, last)
-            episode.impulse += 0.5 * h * (first + last)
+            # The integral of the cubic with these forces and rates.
+            episode.impulse += 0.5 * h * (first + last) + h * h / 12.0 * (first_rate - last_rate)
         elif in_episode(contacts[i].mode):
             reached = extremes(contacts, i, start, end, h)
             update_episode(contacts, tracks, i, reached)
