@@ -378,14 +378,13 @@ MIRRORED_SIDES = [
 
 
 @pytest.mark.parametrize(("sides", "halved", "stops"), MIRRORED_SIDES)
-@pytest.mark.parametrize("map_name", ["auto", "whole"])
-def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map_name):
+def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops):
     """Branches of mirror-symmetric modes pass the grazing of two contacts and reach the end of their range.
 
     The contacts begin at one instant, or half a period apart in the other mode. Where each mass moves as if alone, the
     period is that of one mass in closed form.
     """
-    found = branches(own_case(sides, map=map_name))
+    found = branches(own_case(sides))
     assert list(found) == list(HALF)
     for name, branch in found.items():
         assert "energy range" in branch.ended.sentence, branch.ended.sentence
