@@ -12,21 +12,8 @@ from tests.independent_lattice import CurvedSpring, ScipyLattice, Stop
 # What the equations below know. A case with another key is none that they describe.
 KNOWN = {
     "lattice": {"cells", "cell", "ends", "damping", "profiles"},
-    "contacts": {
-        *(
-            "law",
-            "exponent",
-            "stiffness",
-            "sites",
-            "clearance",
-            "clearance_minus",
-            "restitution",
-            "side",
-            "pair",
-            "next_cell",
-        ),
-        "each",
-    },
+    "contacts": {"law", "exponent", "stiffness", "sites", "clearance", "clearance_minus", "restitution", "side"}
+    | {"pair", "next_cell", "each"},
     "drive": {"cell", "mass", "end", "frequency", "amplitude", "cycles", "more"},
     "initial": {"kind", "cell", "mass", "velocity"},
     "time": {"end", "samples", "rtol", "engine"},
@@ -121,20 +108,19 @@ def stops_of(table: dict[str, Any], rows: Rows) -> Iterator[Stop]:
         return value[number] if is_list else value
 
     for number, cell in enumerate(contacts["sites"]):
-        default = table["lattice"]["cell"].get("contact")
-        host, resonator = of_site("pair", number, default)
+        host, resonator = of_site("pair", number, table["lattice"]["cell"].get("contact"))
         clearance = of_site("clearance", number, None)
         gaps = {"plus": clearance, "minus": of_site("clearance_minus", number, clearance)}
         for name, side in (("plus", 1), ("minus", -1)):
-            if contacts.get("side", "both") not in (name, "both"):
+            if of_site("side", number, "both") not in (name, "both"):
                 continue
             ground = rows.number(cell, host)
             yield Stop(
-                resonator=rows.number(cell + int(contacts.get("next_cell", False)), resonator),
+                resonator=rows.number(cell + int(of_site("next_cell", number, False)), resonator),
                 host=-1 if ground is None else ground,
                 gap=gaps[name],
                 stiffness=of_site("stiffness", number, None),
-                exponent=contacts.get("exponent", EXPONENTS[contacts["law"]]),
+                exponent=contacts.get("exponent", EXPONENTS[of_site("law", number, None)]),
                 restitution=of_site("restitution", number, 1.0),
                 side=side,
             )
@@ -174,11 +160,8 @@ def force_of(table: dict[str, Any], rows: Rows) -> Callable[[float], np.ndarray]
     return force
 
 
-def motion_by_scipy(name: str, table: dict[str, Any], samples: int) -> tuple[np.ndarray, int]:
-    """Return displacements (sample, cell, mass) in m of the case in ``table``, and the number of impacts in it.
-
-    Every tenth of the case's ``samples`` is returned, from the reference of that ``name``.
-    """
+def lattice_by_scipy(table: dict[str, Any]) -> ScipyLattice:
+    """Return the lattice of the case in ``table``, whose masses are numbered cell by cell."""
     rows = Rows(table)
     lattice = table["lattice"]
     masses = np.tile(np.array(lattice["cell"]["masses"], float), (rows.cells, 1))
@@ -198,15 +181,21 @@ def motion_by_scipy(name: str, table: dict[str, Any], samples: int) -> tuple[np.
         damping += (spring["damping"] + rayleigh.get("stiffness", 0.0) * spring["stiffness"]) * np.outer(row, row)
         if spring["quadratic"] or spring["cubic"]:
             curved.append(CurvedSpring(row, spring["quadratic"], spring["cubic"]))
+    return ScipyLattice(masses, stiffness, damping, tuple(stops_of(table, rows)), force_of(table, rows), tuple(curved))
 
-    by_scipy = ScipyLattice(
-        masses, stiffness, damping, tuple(stops_of(table, rows)), force_of(table, rows), tuple(curved)
-    )
-    velocity = np.zeros(len(masses))
+
+def motion_by_scipy(name: str, table: dict[str, Any], samples: int) -> tuple[np.ndarray, int]:
+    """Return displacements (sample, cell, mass) in m of the case in ``table``, and the number of impacts in it.
+
+    Every tenth of the case's ``samples`` is returned, from the reference of that ``name``.
+    """
+    rows = Rows(table)
+    size = rows.cells * rows.per_cell
+    velocity = np.zeros(size)
     if "initial" in table:
         initial = table["initial"]
         velocity[rows.number(initial["cell"], initial["mass"])] = initial["velocity"]
     times = np.linspace(0, table["time"]["end"], samples)[::10]
     reference = "zoo-" + name.replace(" ", "-")
-    motion, impacts = by_scipy.recorded_motion(reference, times, np.zeros(len(masses)), velocity, start=0.0)
+    motion, impacts = lattice_by_scipy(table).recorded_motion(reference, times, np.zeros(size), velocity, start=0.0)
     return motion[0].reshape(len(times), rows.cells, rows.per_cell), impacts

@@ -13,9 +13,11 @@ import pytest
 
 from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
 from tests.condensed_branches import condensed_branch, displacement
+from tests.conftest import with_sections
 from tests.models import CLEARANCE, four_band_contact, kerschen_system
 from tests.rigs import TWO_MASSES
-from tests.unlike_lattices import TABLE, independent_lattice
+from tests.unlike_lattices import TABLE
+from tests.zoo_by_scipy import lattice_by_scipy
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches import balance
@@ -168,18 +170,21 @@ def test_a_slow_motion_with_few_harmonics_has_the_multiplier_of_its_orbit():
 
 OF_MASS = 0.2
 OF_STIFFNESS = 1e-7
-RESTITUTION = 0.998
+
+
+LOSSY = with_sections(
+    TABLE,
+    {
+        "lattice": {"damping": {"mass": OF_MASS, "stiffness": OF_STIFFNESS}},
+        "contacts": {"each": TABLE["contacts"]["each"] | {"restitution": [0.998] * 3}},
+        "nnm": {"forced": [2, 1]},
+    },
+)
 
 
 def lossy_case(**nnm: Any) -> NnmCase:
     """The lattice whose cells all differ, with Rayleigh damping and slightly lossy contacts; ``nnm`` updates [nnm]."""
-    each = TABLE["contacts"]["each"] | {"restitution": [RESTITUTION] * 3}
-    changes = {
-        "lattice": TABLE["lattice"] | {"damping": {"mass": OF_MASS, "stiffness": OF_STIFFNESS}},
-        "contacts": TABLE["contacts"] | {"each": each},
-        "nnm": TABLE["nnm"] | {"forced": [2, 1]} | nnm,
-    }
-    return NnmCase.from_table(TABLE | changes)
+    return NnmCase.from_table(with_sections(LOSSY, {"nnm": nnm}))
 
 
 @pytest.fixture(scope="module")
@@ -205,19 +210,12 @@ def test_free_decay_takes_the_loss(shot):
     """A free motion that SciPy integrates with dashpots and restitutions loses the branch's loss over one period."""
     branch, _ = shot
     shooting = ShootingMethod(lossy_case()).shooting
-    lattice = independent_lattice()
-    # The branch's motion is conservative; the independent lattice gets the dashpots and restitutions.
-    damped = replace(
-        lattice,
-        damping=OF_MASS * np.diag(lattice.masses) + OF_STIFFNESS * lattice.stiffness,
-        stops=tuple(replace(stop, restitution=RESTITUTION) for stop in lattice.stops),
-    )
     point = branch.regular()[-1]
     u, v = sample_orbit(shooting, point, samples=40)
     # The comparison begins where all contacts are open.
     begin = int(np.flatnonzero(np.all(shooting.system.gaps(u) < 0, axis=1))[0])
 
-    motion, impacts = damped.motion(np.array([point.period]), u[begin], v[begin], 0.0)
+    motion, impacts = lattice_by_scipy(LOSSY).motion(np.array([point.period]), u[begin], v[begin], 0.0)
 
     lost = point.energy - shooting.system.energy(motion[0, -1], motion[1, -1])
     assert impacts >= 3

@@ -15,7 +15,9 @@ from scipy.special import ellipk
 from tests.breathers import breather_chain
 from tests.condensed_branches import condensed_branch
 from tests.models import CLEARANCE, four_band_contact
-from tests.unlike_lattices import independent_lattice, unlike_case
+from tests.unlike_lattices import TABLE as UNLIKE
+from tests.unlike_lattices import unlike_case
+from tests.zoo_by_scipy import lattice_by_scipy
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.endings import Ending
@@ -235,7 +237,7 @@ def unlike_branch(tmp_path_factory):
 def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_branch):
     """An orbit returns after its period when SciPy integrates independent equations of the lattice."""
     problem, branch = unlike_branch
-    lattice = independent_lattice()
+    lattice = lattice_by_scipy(UNLIKE)
     # The orbits are one near the first contacts, and the last one.
     for number in (40, 60):
         point = branch.regular()[number]

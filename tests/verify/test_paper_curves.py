@@ -12,20 +12,18 @@ from matplotlib.colors import to_rgba
 from scipy.integrate import trapezoid
 
 from tests.hertz_branch import GRAZING, write_branch
-from vipetsc.case import Case, Sweep
+from vipetsc.case import Sweep
 from vipetsc.figures import style as house
-from vipetsc.figures import transfer_curves
 from vipetsc.figures.registry import FIGURES
-from vipetsc.figures.scattering import KC
 from vipetsc.figures.style import GREY, rc_style
-from vipetsc.figures.sweep_members import DrivenWave, Files, MemberRun, Sweeps, series_of
+from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.read import curves as curves_of
-from vipetsc.io.read import field_time, member_folder, open_ensemble, open_run, select, whole_members
+from vipetsc.io.read import open_ensemble, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.paper.entropy_pages import AVERAGES
 from vipetsc.paper.paper_figures import PAGES
-from vipetsc.spectra import normalised, transform
+from vipetsc.spectra import normalised
 from vipetsc.studies.backbone import initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 
@@ -65,12 +63,6 @@ def whole(tmp_path_factory):
     """The folder of a sweep with two Hertz members with full fields, one without contact and one with it."""
     table = {"contacts": {"law": ["hertz"]}, "drive": {"amplitude": [1.0, 60.0]}, "fields": True}
     return swept(tmp_path_factory.mktemp("whole"), **table)
-
-
-def contact_motion(folder):
-    """The motion of the contact cell's two masses, as phase portraits show it."""
-    with MemberRun.open(folder) as member:
-        return transfer_curves.ContactMotion.of(member)
 
 
 def offered_figures(name, *folders):
@@ -203,35 +195,6 @@ def test_closing_error_is_exact_for_parts_in_quadrature():
     assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
 
 
-def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
-    """The figure has two points on the curve of transfer, and for each the phase portrait of host and resonator."""
-    (figure,) = offered_figures("phase_regimes", whole, reduced).values()
-    curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
-    grey = curve.lines[0].get_xydata().T
-    np.testing.assert_array_equal(grey[1], select(open_ensemble(reduced), law="hertz")["ibtet"])
-
-    ensemble = open_ensemble(whole)
-    points = np.array([line.get_xydata()[0] for line in curve.lines[1:]])
-    np.testing.assert_array_equal(points[:, 0], ensemble["amplitude"])
-    np.testing.assert_array_equal(points[:, 1], ensemble["ibtet"].values.ravel())
-
-    folder = member_folder(ensemble.isel(law=0, amplitude=1))
-    motion = contact_motion(folder)
-    with open_run(folder / "run.h5") as run:
-        u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
-        w = u[:, 2] - u[:, 1]
-        clearance = run["sites/clearance"].values[0]
-
-    assert [a.get_title(loc="left") for a in (first, second)] == ["(b.1) 1 N", "(b.2) 60 N"]
-
-    shown = np.diff(motion.displacement, axis=1)
-    assert np.abs(shown).max() >= np.abs(w).max() > clearance
-
-    resonator, host = (line.get_xydata().T for line in second.lines)
-    np.testing.assert_array_equal(resonator[0], 1e3 * motion.displacement[:, 1])
-    np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
-
-
 CELLS = 40
 BASE = {
     "lattice": {"preset": "diatomic", "cells": CELLS},
@@ -354,36 +317,6 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole_entropie
     for axes in panels[:3]:
         marks = next(line for line in axes.lines if line.get_marker() == ">")
         assert list(marks.get_ydata()) == case.contacts.sites
-
-
-def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole_entropies):
-    """Panels show the transform of the host's velocity over the amplitude, at four times for three amplitudes."""
-    figure = only("wavelets", [whole_entropies])
-    panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
-    assert len(limits([axes.images[0] for axes in panels.flat])) == 1
-
-    for axes in panels.flat:
-        black = next(line for line in axes.lines if to_rgba(line.get_color()) == (0, 0, 0, 1))
-        # The wavenumber is in units of pi per cell.
-        np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
-    for row in panels:
-        assert len({axes.texts[0].get_text() for axes in row}) == 1
-
-    (series,) = series_of(Sweeps([whole_entropies], Files()))
-    times = series.snapshot_times()
-    assert np.all(np.diff(times) > 0)
-
-    with open_run(members(whole_entropies)[2] / "run.h5") as run:
-        site = np.min(run["sites/cell"].values)
-        wave = DrivenWave.of(Case.of(run))
-        # The second snapshot is taken when the packet is halfway to the first site.
-        assert times[1] - times[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
-        snapshot = int(np.argmin(np.abs(field_time(run) - times[1])))
-        # The diatomic cell's first mass is the host.
-        host = run["velocity"][snapshot, :, 0].values
-    kappa = np.pi * np.arange(1, 121) / 120
-    expected = np.abs(transform(host, kappa, KC)[:, :CELLS]) / 20.0
-    np.testing.assert_allclose(panels[1, 2].images[0].get_array(), expected, rtol=1e-12)
 
 
 def test_reconstruction_shows_energies_error_and_cross_terms(whole_entropies):
