@@ -175,10 +175,7 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
 
 @pytest.mark.parallel([1])
 def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
-    """A pressed Hertzian contact is a spring of the slope 3/2 k d^(1/2) at the indentation d; an open one is none.
-
-    Pressed contacts lie within a cell, between a mass and the ground, and across the joint of the ring.
-    """
+    """A pressed Hertzian contact is a spring of the slope 3/2 k d^(1/2) at the indentation d; an open one is none."""
     pressed = 1e-4
     contacts = {
         "sites": [3, 7, 12, 9],

@@ -51,11 +51,7 @@ def test_a_run_that_stopped_during_contacts_goes_on(folder, create, engine, look
     ("engine", "looks", "damping"), [("ts", (500, 150), None), ("propagator", (14, 3), {"mass": 10.0})]
 )
 def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, engine, looks, damping):
-    """A run begins on one rank, continues on all and ends on all but one, with the bits of an uninterrupted run.
-
-    Some contacts are closed at both checkpoints. The propagator's run has dashpots, whose losses checkpoints keep cell
-    by cell.
-    """
+    """A run begins on one rank, continues on all and ends on all but one, with the bits of an uninterrupted run."""
     sections = {
         "lattice": {"damping": damping},
         "contacts": {"sites": [12, 8, 1, 13, 24], "restitution": 0.7},

@@ -205,10 +205,7 @@ def whole(tmp_path_factory):
     [(2, "analyse", "exception"), (2, "append", "full-disk"), (1, "append", "full-disk"), (1, "step", "memory")],
 )
 def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, injector, whole, team, phase, kind):
-    """An error within a member is recorded and the sweep goes on; a full disk ends the sweep.
-
-    In both cases the same command then completes the sweep with the bits of an undisturbed one.
-    """
+    """An error within a member is recorded and the sweep goes on; a full disk ends the sweep."""
     plan = sweep(f"sweep.ranks={team}")
     # Rank 0 of a team measures and writes for the team. Without teams the fault meets rank 1.
     failing = 0 if team == 2 else 1
@@ -240,10 +237,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
 
 @pytest.mark.parallel([2])
 def test_a_linear_run_that_fails_on_one_rank_of_a_team_fails_on_all(folder, monkeypatch):
-    """Where memory is short on the first rank alone, all members have the reason, and no rank waits for another.
-
-    The first rank alone has the motion of the linear run, of which it takes the envelope.
-    """
+    """Where memory is short on the first rank alone, all members have the reason, and no rank waits for another."""
 
     def fail(*arguments):
         raise MemoryError("Unable to allocate 1.00 TiB")

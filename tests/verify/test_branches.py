@@ -285,10 +285,7 @@ PAIRS = {
 
 @pytest.mark.parametrize("kind", PAIRS)
 def test_two_special_points_within_a_step_are_found(kind):
-    """Two special points within one step are found by means of the step before.
-
-    Their test function passes zero twice, and has the same sign at both ends of the step.
-    """
+    """Two special points within one step are found by means of the step before."""
     problem = Shooting(Dop853Flow(reduced_model("hertz")), MAPS["quarter"])
     before, left, right = (rounded.on_branch(problem) for rounded in PAIRS[kind])
 
@@ -315,10 +312,7 @@ def first_doubling(problem: Shooting, points: list[Point]) -> Point:
 
 
 def test_a_period_doubled_orbit_is_off_its_parent(short_branch):
-    """The switch at a period doubling ends on an orbit of the doubled period, not on the parent passed twice.
-
-    Near grazing the first attempt ends on the linear mode passed twice, and the switch tries a smaller amplitude.
-    """
+    """The switch at a period doubling ends on an orbit of the doubled period, not on the parent passed twice."""
     problem = short_branch.problem
     point = first_doubling(problem, short_branch.points)
 

@@ -129,10 +129,7 @@ def test_a_breather_and_its_multiplier_are_those_of_shooting():
 
 @pytest.mark.parametrize("sites", [[1], [1, -2]])
 def test_sensitivities_of_all_masses_and_hills_determinant_agree(monkeypatch, sites):
-    """Multipliers by sensitivities of all masses and by Hill's determinant agree, in a lattice of cubic springs.
-
-    A breather of one site is stable, and one of two sites that move against each other is unstable.
-    """
+    """Multipliers by sensitivities of all masses and by Hill's determinant agree, in a lattice of cubic springs."""
     springs = [
         {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
         {"start": 1, "end": 2, "stiffness": 5e3, "cubic": 1e9},

@@ -255,10 +255,7 @@ OTHER = {"plus": "minus", "minus": "plus", "both": "both"}
 
 @pytest.mark.parametrize("name", [name for name, kind in ZOO.items() if "side" in str(kind.contacts)])
 def test_stops_on_the_other_sides_have_the_same_branch(name):
-    """A system seen from the other side has the mirrored motions, with the same energies and periods.
-
-    Steps by harmonics are the same; orbits that are shot begin at their other rest, where steps are others.
-    """
+    """A system seen from the other side has the mirrored motions, with the same energies and periods."""
     method = "balance"
     kind = ZOO[name]
     contacts = dict(kind.contacts)

@@ -161,10 +161,7 @@ def test_no_onset_is_missed(coefficients, length, clearance):
 
 
 def test_a_run_that_stalls_ends_with_its_last_sample_and_the_contact_of_the_stall():
-    """The energies of the last sample before a stall balance: they leave out the work of forces in the stalled step.
-
-    The log has the contact that begins in that step.
-    """
+    """The energies of the last sample before a stall balance: they leave out the work of forces in the stalled step."""
     case = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}, time={"engine": "propagator"})
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
@@ -199,10 +196,7 @@ def test_every_method_samples_exactly(exact, method, rtol):
 
 
 def test_fixed_steps_converge_with_the_order_of_the_method(petsc_options):
-    """With fixed steps (-ts_adapt_type none -ts_dt H) halving H divides the error of the method 3bs by about 2^3.
-
-    The run has bilinear contacts.
-    """
+    """With fixed steps (-ts_adapt_type none -ts_dt H) halving H divides the error of the method 3bs by about 2^3."""
     exact = run_of(small_case(contacts={"law": "bilinear"}, time={"rtol": 1e-13, "end": 0.022}))
     velocity = exact["velocity"].values
 

@@ -109,10 +109,7 @@ def test_a_pressed_mass_has_its_exact_period(law):
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_a_branch_that_begins_beside_its_range_of_energies_comes_into_it(direction):
-    """A branch whose first motion has too little energy goes on up, and one with too much goes on down.
-
-    A Hertz contact softens as it opens: a motion that has the lowest energy by its linear mode has less.
-    """
+    """A branch whose first motion has too little energy goes on up, and one with too much goes on down."""
     own = {
         "masses": [MASS],
         "springs": [{"start": 0, "end": 1, "stiffness": SPRING}],
@@ -284,10 +281,7 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
 
 
 def test_a_breather_begins_at_the_site_that_is_asked_for():
-    """A breather begins at the site asked for: twice as large at twice the clearance, negative on the other side.
-
-    The stops are linear, so that motions are proportional to the clearance.
-    """
+    """A breather begins at the site asked for: twice as large at twice the clearance, negative on the other side."""
     cell = breather_chain().cell
     chain = Chain(cell, 18, "fixed", sites_at([4, 13], cell.pair, clearances=[CLEARANCE, 2 * CLEARANCE]))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.sites.clearances]
@@ -381,11 +375,7 @@ MIRRORED_SIDES = [
 
 @pytest.mark.parametrize(("sides", "halved", "stops"), MIRRORED_SIDES)
 def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops):
-    """Branches of mirror-symmetric modes pass the grazing of two contacts and reach the end of their range.
-
-    The contacts begin at one instant, or half a period apart in the other mode. Where each mass moves as if alone, the
-    period is that of one mass in closed form.
-    """
+    """Branches of mirror-symmetric modes pass the grazing of two contacts and reach the end of their range."""
     found = branches(own_case(sides))
     assert list(found) == list(HALF)
     for name, branch in found.items():

@@ -89,10 +89,7 @@ def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> 
 
 
 def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path):
-    """Derivatives by parameters of every kind, through lossy contacts, are central differences of engines' runs.
-
-    The engines take turns: each differentiates half of the parameters.
-    """
+    """Derivatives by parameters of every kind, through lossy contacts, are central differences of engines' runs."""
     table = lattice_table(contacts=POWER, time={"rtol": 1e-13, "end": 0.022})
     plan_table = identify_table(table, measured_table(tmp_path, table), unknowns=UNKNOWNS)
     work = fits_of(plan_table)
@@ -677,10 +674,7 @@ def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
 
 
 def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
-    """At the last value of a profile the misfit is the least one with that parameter held.
-
-    SciPy's ``least_squares`` fits the other parameters, with differences for derivatives.
-    """
+    """At the last value of a profile the misfit is the least one with that parameter held."""
     plan, z, results = identified
     misfit = Identification(plan, read_measured_records(plan), StopRequest()).windows().misfit
     ends = [float(misfit.records[0].times[-1])]

@@ -445,10 +445,7 @@ def run_complete(case: Case) -> xr.Dataset:
 
 
 def test_the_front_of_a_wave_is_no_impact_on_a_stop_with_loss():
-    """Both engines log one impact, from rest: the front of a strike 6 and 16 cells away, 1e-26 m/s or less, is none.
-
-    The site near the strike is pressed later, the other one never.
-    """
+    """Both engines log one impact, from rest: the front of a strike 6 and 16 cells away, 1e-26 m/s or less, is none."""
     runs = []
     for engine in ("ts", "propagator"):
         case = sprung_case(engine, restitution=0.6, approach_floor=1e-3, stiffness=1e7, sites=[3, 13])
@@ -573,10 +570,7 @@ def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, eng
 
 @pytest.mark.parametrize(("ends", "turns"), [("periodic", 2), ("free", 1)])
 def test_a_pressed_chain_has_the_dispersion_of_its_linearised_contacts(tmp_path, ends, turns):
-    """A small wave has omega = 2 sqrt(k/m) sin(kappa/2) with k = (3/2) A d^(1/2) (Nesterenko 2001, sec. 1.2).
-
-    The contacts are pressed by d at rest; static loads hold the free ends.
-    """
+    """A small wave has omega = 2 sqrt(k/m) sin(kappa/2) with k = (3/2) A d^(1/2) (Nesterenko 2001, sec. 1.2)."""
     n = 12
     depth = 1e-5
     # The amplitude is so small that the contacts are linear to 1e-6.

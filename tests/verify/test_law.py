@@ -306,11 +306,7 @@ def test_the_wave_decays_over_the_distance_as_by_dashpots_to_ground(tmp_path):
 
 
 def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
-    """The energy through a spring three cells from the site is that of the waves, with their decay over three cells.
-
-    Behind the site it is the transmitted energy; before the site it is the arriving energy less the reflected one, as
-    the two waves interfere little.
-    """
+    """The energy through a spring three cells from the site is that of the waves, with their decay over three cells."""
     away = 3
     runs = make_runs(tmp_path, damped_case({"stiffness": 5e-6}, settle=3.0))
     ring = runs.ring

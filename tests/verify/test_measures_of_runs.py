@@ -116,10 +116,7 @@ def test_what_contacts_that_are_closed_at_first_and_last_dissipate_is_that_of_th
 
 
 def test_work_of_the_drive_is_no_transfer():
-    """The work that the drive does during a cluster of contacts is not part of the cluster's transfers.
-
-    The burst still lasts when waves reach the sites.
-    """
+    """The work that the drive does during a cluster of contacts is not part of the cluster's transfers."""
     run = run_of(small_case(time={"engine": "propagator", "end": 0.08}))
     model = Case.of(run).model()
     analysis = analyse(run, ["bands/transfer"])
@@ -215,10 +212,7 @@ def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
 
 
 def test_transmission_by_part_is_that_of_each_frequency():
-    """Transmission by part is the ratio of receiver and source in each part of the spectrum, NaN without a source.
-
-    Cosines of the cosine transform itself fall into one part each.
-    """
+    """Transmission by part is the ratio of receiver and source in each part of the spectrum, NaN without a source."""
     count = 400
     # The cosine transform has its nodes at the middles of samples.
     phase = np.pi * (np.arange(count) + 0.5) / count

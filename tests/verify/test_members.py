@@ -73,10 +73,7 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
 
 
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
-    """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples.
-
-    A file that is damaged is computed again.
-    """
+    """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples."""
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
     thin = {"fields": ["velocity"], "window": [5, 9], "every": 4, "stride": 3}
     assert run_sweep(Sweep.from_table(table), tmp_path / "all").complete

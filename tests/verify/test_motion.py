@@ -499,11 +499,7 @@ def creeping(cells: int, coupling: float, ground: float, short: float) -> tuple[
 @SHORTS
 @pytest.mark.parametrize(("cells", "coupling", "ground"), [(1, 0.5, 3.0), (7, 2.0, 6.0)])
 def test_a_mass_that_creeps_onto_a_stop_comes_to_rest_on_it(cells, coupling, ground, short):
-    """The force presses the mass onto its stop in the end, by either engine, however little is left to press.
-
-    Impacts that are not resolved beside the clearance took steps of microseconds for ever: the damping of an impact is
-    divided by its speed, and contacts less deep than the tolerance of a landing opened and closed without an end.
-    """
+    """The force presses the mass onto its stop in the end, by either engine, however little is left to press."""
     case, rest = creeping(cells, coupling, ground, short)
     run, result = simulated(case)
     statistics = result.statistics
@@ -603,10 +599,7 @@ def test_the_system_of_normal_modes_has_the_springs():
     ],
 )
 def test_a_run_that_tears_a_spring_off_names_it(cell, number, name, initial):
-    """A run stops and names the spring when a softening one passes z = -k/q, or |z| = (k/|c|)^(1/2) for a cubic one.
-
-    Beyond that elongation the spring's force has the wrong sign and drives its masses apart for ever.
-    """
+    """A run stops and names the spring when a softening one passes z = -k/q, or |z| = (k/|c|)^(1/2) for a cubic one."""
     k = STIFFNESS[number - 1]
     value = {"quadratic": -1e4 * k, "cubic": -1e8 * k}[name]
     if initial == CELLS:

@@ -183,10 +183,7 @@ def source_and_sections(of):
 
 @pytest.mark.parametrize(("cell", "mass"), [(5, 2)])
 def test_what_a_drive_sends_is_its_work(cell, mass):
-    """The energy of the waves that a force sends, an integral over its spectrum, is the work it does in a run.
-
-    The force acts at a wall, near to it, where it meets the waves that the wall reflects, and far from it.
-    """
+    """The energy of the waves that a force sends, an integral over its spectrum, is the work it does in a run."""
     end = {"cells": 20, "strength": 200.0}
     of = case({"cells": 300, "absorbing": end}, BURST | {"cell": cell, "mass": mass}, end=0.105)
     work = run(of)["energy/work"].values[-1]
@@ -340,10 +337,7 @@ def test_overdamped_waves_are_the_slow_ones():
 
 @pytest.mark.parametrize("number", [1, 3])
 def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
-    """The engine ``ts`` moves each wave as u = Re(phi exp(i kappa n + s t)), to 1e-8.
-
-    The damping of the cell is not proportional, so that the shapes phi are complex.
-    """
+    """The engine ``ts`` moves each wave as u = Re(phi exp(i kappa n + s t)), to 1e-8."""
     cells = 8
     half = 4 * cells
     cell = damped(four_band(), 30.0, 1e-5, (0.3, 0.0, 0.1, 0.02))
@@ -371,10 +365,7 @@ def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
 
 
 def test_a_packet_comes_back_as_computed():
-    """A weak absorbing end leaves the predicted fraction of a packet's energy, within ten per cent.
-
-    The prediction is that of the packet's middle frequency; the end reflects its other frequencies differently.
-    """
+    """A weak absorbing end leaves the predicted fraction of a packet's energy, within ten per cent."""
     cell = four_band("calibrated")
     kappa = 1.8
     table = {

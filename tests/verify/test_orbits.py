@@ -41,10 +41,7 @@ def superposed(stiffness, masses, centre, displacement, velocity, duration):
 
 
 def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
-    """A quarter period of a bilinear orbit is modal superposition with the contact closed, and then with it open.
-
-    At the end of the quarter all displacements are zero.
-    """
+    """A quarter period of a bilinear orbit is modal superposition with the contact closed, and then with it open."""
     problem = bilinear.problem
     system = problem.system
     point = bilinear.at_energy(1.0)
@@ -155,10 +152,7 @@ def test_half_map_of_an_asymmetric_system():
 
 
 def test_an_arc_that_ends_where_a_contact_just_closes_ends():
-    """An arc that ends within rounding of a contact's closing comes to an end, and an onset within rounding is none.
-
-    A search for the change in the remaining time, which is all rounding, must not return to its beginning for ever.
-    """
+    """An arc that ends within rounding of a contact's closing comes to an end, and an onset within rounding is none."""
     system = System.reduced(four_band("printed"), Stops.both(four_band_contact("hertz"), CLEARANCE))
     flow = Dop853Flow(system)
     start = np.array([7.732456897616884, 7.742513284851792, 0.0, 0.0])
@@ -172,10 +166,7 @@ def test_an_arc_that_ends_where_a_contact_just_closes_ends():
 
 @pytest.mark.parametrize("cubic", [1e8, 1e12])
 def test_a_step_that_overflows_is_taken_again_shorter(cubic):
-    """A step that overflows is repeated shorter, until the flow keeps energy and volume.
-
-    The longest step is a radian of the linear system; the cubic spring oscillates thousands of times in it.
-    """
+    """A step that overflows is repeated shorter, until the flow keeps energy and volume."""
     stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
     spring = SmoothSpring.between(None, 0, cubic=cubic)
     system = System(masses=np.ones(2), stiffness=stiffness, contacts=(), springs=(spring,))
@@ -204,10 +195,7 @@ def test_multipliers_are_those_of_the_monodromy_matrix(name):
 
 
 def test_linear_modes_and_limits():
-    """The linear modes have the frequencies of the paper's two masses, and large motions those with closed contacts.
-
-    The numbers are the roots of the characteristic polynomials of the two stiffness matrices, in Hz.
-    """
+    """The linear modes have the frequencies of the paper's two masses, and large motions those with closed contacts."""
     system = reduced_model()
 
     assert system.linear_modes()[0] / (2 * np.pi) == pytest.approx([135.1209897, 474.2501016], rel=1e-9)

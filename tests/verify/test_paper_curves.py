@@ -165,10 +165,7 @@ def test_backbone_is_aligned_exactly(reduced):
 
 
 def test_band_energies_sum_to_the_total(whole):
-    """Energies of the parts sum to the total over the whole record, in which parts are orthogonal.
-
-    Running means differ from the total by cross terms.
-    """
+    """Energies of the parts sum to the total over the whole record, in which parts are orthogonal."""
     figures = offered_figures("band_energies", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
 
@@ -281,10 +278,7 @@ def members(ensemble):
 
 
 def test_amplitudes_have_common_scales_and_show_what_was_measured(whole_entropies):
-    """Panels show energies divided by the square of the amplitude, each row on one scale, with branches and sites.
-
-    The three rows are energies over cells, over wavenumbers and on the dispersion.
-    """
+    """Panels show energies divided by the square of the amplitude, each row on one scale, with branches and sites."""
     figure = only("amplitudes", [whole_entropies])
     assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
 

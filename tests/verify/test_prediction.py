@@ -247,10 +247,7 @@ EVEN = np.full((4, BINS), 1 / BINS)
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_elimination_agrees_with_waves_and_with_modes(ends):
-    """Compliances by elimination are those of Bloch waves, and with an absorbing end those of damped modes.
-
-    One of the two contacts is with the ground.
-    """
+    """Compliances by elimination are those of Bloch waves, and with an absorbing end those of damped modes."""
     cell = prediction_case().lattice.unit_cell()
     pairs = (Pair(1, 2), Pair(-1, 2))
     omega = np.linspace(400, 3000, 7) - 4j
@@ -282,10 +279,7 @@ def test_rays_fade_at_the_rate_of_dashpots_to_ground():
 
 
 def test_a_wave_is_absorbed_once_it_reaches_the_end():
-    """A wave loses its energy when it reaches the absorbing end at the group velocity.
-
-    Half of the energy goes there directly, the other half after a reflection at the wall on the other side.
-    """
+    """A wave loses its energy when it reaches the absorbing end at the group velocity."""
     model = prediction_case(lattice={"absorbing": ABSORBING}, time={"end": 2.0}).model()
     kappa = 1.3
     speed = abs(float(bloch(model.chain.cell, kappa).group_velocity[BAND]))

@@ -365,10 +365,7 @@ def test_the_curve_meets_special_points_of_other_amplitudes(changes, kind):
     ids=["symmetry", "period"],
 )
 def test_the_curve_that_leaves(changes, kind, multiplier, curves, odd_one, tmp_path):
-    """It begins where a multiplier is +1 or -1; its motions are periodic, and grow as the root of the distance.
-
-    ``odd_one`` is the harmonic that the first curve lacks. A curve that meets the first one twice is followed once.
-    """
+    """It begins where a multiplier is +1 or -1; its motions are periodic, and grow as the root of the distance."""
     case = case_of(changes, switch=[kind], harmonics=21, points=60)
     followed = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert len(followed) == curves

@@ -377,10 +377,7 @@ def test_walls_hold_the_masses_that_are_tied_to_them():
 
 
 def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
-    """Below contact named masses of an infinite lattice move as the Bloch wave does.
-
-    At the site resonator and host differ by the wave's amplitude; masses of other cells differ by its phase.
-    """
+    """Below contact named masses of an infinite lattice move as the Bloch wave does."""
     case = nfrc_case(harmonics=3, range=[0.9, 0.95])
     names = [("host", 10, 1), ("resonator", 10, 2), ("later", 14, 2)]
     points = [{"name": name, "cell": cell, "mass": mass} for name, cell, mass in names]
@@ -436,10 +433,7 @@ def touching(table: dict[str, Any] = ONE_MASS, contacts: dict[str, Any] | None =
 
 
 def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
-    """The resonance is that of a bilinear oscillator, 2 w1 w2/(w1 + w2) with w1 = sqrt(1.5), w2 = sqrt(21.5) rad/s.
-
-    The oscillator swings half a cycle at each of the two frequencies, whatever the amplitude.
-    """
+    """The resonance is that of a bilinear oscillator, 2 w1 w2/(w1 + w2) with w1 = sqrt(1.5), w2 = sqrt(21.5) rad/s."""
     _, points = followed(touching(range=[1.92, 1.96]), tmp_path / "one")
     soft, stiff = np.sqrt([1.5, 21.5])
     resonance = 2 * soft * stiff / (soft + stiff)
@@ -459,10 +453,7 @@ def test_it_is_proportional_to_the_drive(tmp_path):
 
 
 def test_a_lattice_without_damping_has_a_state_between_its_resonances():
-    """A first state of an undamped lattice between its resonances is found, and contains no dashpots.
-
-    The search for it uses temporary dashpots, which keep it from the resonance that a growing force passes.
-    """
+    """A first state of an undamped lattice between its resonances is found, and contains no dashpots."""
     cell = {
         "masses": [0.004, 0.002],
         "springs": [

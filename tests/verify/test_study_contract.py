@@ -90,10 +90,7 @@ def test_results_are_resumed_only_where_there_are_some(name, tmp_path):
 
 
 def test_a_stop_at_any_look_is_gone_on_with(name, whole, tmp_path):
-    """A request is granted at the first look, or at one in the middle; the next call leaves the same files.
-
-    Both calls together write as many records as one undisturbed call: what is recorded is not computed again.
-    """
+    """A request is granted at the first look, or at one in the middle; the next call leaves the same files."""
     for looks in some(range(whole.looks), 3)[:2]:
         out = tmp_path / str(looks)
         passed: list[str] = []

@@ -110,10 +110,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
 
 @pytest.mark.parametrize("nfrc", [{"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
 def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
-    """The shares satisfy T + R + U + L = 1, and a wave from the other side of mirrored sites has the same curve.
-
-    The four-band cell is its own mirror image.
-    """
+    """The shares satisfy T + R + U + L = 1, and a wave from the other side of mirrored sites has the same curve."""
     nfrc = {"range": [0.89, 0.94], "harmonics": 5, "points": 6, "first_step": 0.1, "largest_step": 0.5} | nfrc
     mirrored = THREE | {"sites": [21, 19, 16]}
     forward = curve_of(nfrc_case(contacts=THREE, **nfrc, direction="forward"), tmp_path / "forward")
@@ -193,10 +190,7 @@ def rows_of(chain: Chain) -> np.ndarray:
 
 @pytest.mark.parametrize("omega", [400.0 - 40j, 1000.0 - 40j, 3000.0 - 90j])
 def test_compliances_are_those_of_a_long_damped_lattice(omega):
-    """Compliances of an infinite lattice are those of a long one, at complex frequencies.
-
-    Waves of these frequencies decay before they reach an end of the long lattice.
-    """
+    """Compliances of an infinite lattice are those of a long one, at complex frequencies."""
     chain = Chain(CELL, 1000, "free", sites_at(SITES, PAIRS))
     dynamic = chain.stiffness_matrix().tocsc() - omega**2 * diags(chain.masses(), format="csc")
     rows = rows_of(chain)
