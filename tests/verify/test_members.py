@@ -60,18 +60,6 @@ def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(s
     assert (ensemble["dissipated_fraction"].values[touching] > 0).all()
 
 
-def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
-    """The work of members without contact is proportional to the square of the amplitude; their fractions are equal."""
-    _, ensemble, _ = sweep
-    amplitude = ensemble["amplitude"].values[:2]
-    work = ensemble["work"].values[:2]
-    assert work[0] > 0
-    assert work[1] / work[0] == pytest.approx((amplitude[1] / amplitude[0]) ** 2, rel=1e-13)
-    for name in ("ibtet", "bands/share", "entropy/history", "entropy/masked"):
-        np.testing.assert_array_equal(*ensemble[name].values[:2], name)
-    assert not ensemble["dissipated_fraction"].values[:2].any()
-
-
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples."""
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}

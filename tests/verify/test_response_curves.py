@@ -204,19 +204,6 @@ def other_physics() -> NfrcCase:
     return family_case({"contacts": {"clearance": [0.8, 0.6]}, MASS: [1.0, 1.1]}).physics()
 
 
-def test_what_follows_from_a_key_is_that_of_each_member():
-    """Options that follow from a key follow from each member's value: symmetry from sides, dashpots from a loss."""
-    sides = family_case({"contacts": {"side": ["plus", "both"]}})
-    assert [curve.case.nfrc.symmetric for curve in sides.every_curve()] == [False, True]
-    assert [curve.name for curve in sides.every_curve()] == ["side-plus-r1-0.2", "side-both-r1-0.2"]
-    drive = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "cell": 1, "mass": 1}
-    losses = family_case({"lattice": {"damping": [{"mass": 0.1}, {"loss": {"1": 0.02}}]}}, drive)
-    first, second = (curve.case.model().chain.cell.grounding[0] for curve in losses.every_curve())
-    assert first == pytest.approx(0.1)
-    assert 0 < second < 0.1
-    assert [curve.name for curve in losses.every_curve()] == ["damping-no-1-r1-0.2", "damping-no-2-r1-0.2"]
-
-
 # Changes of the rig of two masses with a stop, with the ranges in rad/s in which a complex pair of multipliers passes
 # the unit circle, one passes -1, and one passes +1, beyond which the motion is asymmetric.
 PAIR = {"nfrc": {"range": [1.12, 1.24]}}
@@ -274,16 +261,6 @@ def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tm
     for place in places:
         around = sorted(points[near].measured.unstable for near in (place - 1, place + 1))
         assert around == [0, 2 if kind == "neimark-sacker" else 1]
-
-
-def test_folds_are_no_branch_points(tmp_path):
-    """Folds are not reported as branch points, although a multiplier is 1 at them as well."""
-    states, points = followed(case_of({"nfrc": {"range": [1.2, 1.45]}}, harmonics=31, special_points="all"), tmp_path)
-    kinds = [point.kind for point in points if point.kind != "regular"]
-    assert kinds.count("fold") == 2
-    assert "branch-point" not in kinds
-    fold = next(point for point in points if point.kind == "fold")
-    assert np.abs(multipliers_at(states, fold) - 1).min() < 5e-3
 
 
 DAMPING = 0.1

@@ -21,7 +21,7 @@ import xarray
 import xarray as xr
 
 import vipetsc as package
-from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
+from tests.conftest import assert_same_bits, datasets, run_of, small_case
 from vipetsc.case import Case, Sweep
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.cli.main import main
@@ -191,21 +191,6 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     write_netcdf(folder / "saved.h5", held)
 
     assert_same_bits(datasets(folder / "run" / "run.h5"), datasets(folder / "saved.h5"))
-
-
-def test_chunks_of_other_sources_are_not_continued(folder, monkeypatch):
-    """A run that other sources of the program have begun begins again, and its checkpoints are not read."""
-    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 16)
-    case = small_case(time={"end": 0.02})
-    assert simulate(case, folder / "run", stop=StopAt(120)).resumable
-    parts = folder / "run" / "parts"
-    assert any(parts.glob("state-*"))
-    for path in parts.iterdir():
-        path.write_text("of other sources")
-
-    assert simulate(case, folder / "run").complete
-    simulate(case, folder / "straight")
-    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(folder / "run" / "run.h5"))
 
 
 def test_contacts_that_still_last_at_the_end_are_logged(folder):
