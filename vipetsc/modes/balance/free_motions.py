@@ -14,12 +14,14 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from vipetsc.case.nnm import NnmTable
+from vipetsc.lattice import Contact
 from vipetsc.modes.balance.damped import DampedBalance
 from vipetsc.modes.balance.harmonic_balance import MORE, BalanceFrame, HarmonicBalance, check_frequency, order_needed
 from vipetsc.modes.balance.harmonics import Episode, ForceSeries, SiteForces
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import OrbitProblem, Point
 from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
+from vipetsc.modes.system import System
 
 E = TypeVar("E", HarmonicBalance, DampedBalance)
 
@@ -301,6 +303,18 @@ class FreeMotions(OrbitProblem, Generic[E]):
                     return point
                 continue
             raise ContinuationError(f"no motion at f = {point.frequency:.9g} Hz ({why}): choose another start")
+
+
+def forces_of_system(system: System, laws: Sequence[Contact] | None = None) -> SiteForces:
+    """Return the forces of contacts and nonlinear springs of a ``system``; ``laws`` may take the place of its own.
+
+    A contact that is pressed at rest is a spring of the linear system: without it a chain of grains would have no
+    stiffness.
+    """
+    stops = [pair.stops._replace(spring=pair.stops.slope_at_rest) for pair in system.contacts]
+    if laws is not None:
+        stops = [of_pair._replace(law=law) for of_pair, law in zip(stops, laws, strict=True)]
+    return SiteForces(stops, [spring.law for spring in system.springs])
 
 
 def solution(xi: np.ndarray) -> Attempt:

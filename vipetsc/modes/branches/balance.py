@@ -13,16 +13,16 @@ from vipetsc.io.branch_kinds import BALANCE
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
 from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.free_motions import forces_of_system
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import stored_states
 from vipetsc.modes.branches.losses import dissipation_of, with_loss
-from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, map_of, start_energy
+from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, map_of
 from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.flow import Dop853Flow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
-from vipetsc.modes.shared_frequencies import check_start
+from vipetsc.modes.problem import FlowError, PeriodicProblem
 from vipetsc.modes.shooting import Shooting
 from vipetsc.modes.stability import Hill
 from vipetsc.modes.system import System, elastic_stops
@@ -41,15 +41,10 @@ MOST_OF_HILL = 4
 
 
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
-    """Return the motions of a ``system`` condensed onto its contacts and springs.
-
-    A contact that is pressed at rest is a spring of the linear system: without it a chain of grains would have no
-    stiffness.
-    """
+    """Return the motions of a ``system`` condensed onto its contacts and springs."""
     rows = np.vstack([system.contact_rows, system.spring_rows])
-    stops = [pair.stops._replace(spring=pair.stops.slope_at_rest) for pair in system.contacts]
-    forces = SiteForces(stops, [spring.law for spring in system.springs])
-    return ConservativeMotions(DenseCompliance(system.masses, system.stiffness_at_rest, rows), forces, options)
+    compliance = DenseCompliance(system.masses, system.stiffness_at_rest, rows)
+    return ConservativeMotions(compliance, forces_of_system(system), options)
 
 
 def _condensed_lattice(case: NnmCase, chain: Chain) -> ConservativeMotions:
@@ -98,17 +93,9 @@ class BalanceMethod(NnmMethod):
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """Return motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
         if self.system is not None and not self.options.start_frequency:
-            system = self.system
-            elongations = system.moves(job)
-            if not elongations.any():
-                raise ContinuationError(
-                    f"mode {job + 1} has a node at every contact and nonlinear spring, and is linear at all energies: "
-                    'choose another one (nnm.modes), or nnm.method = "shooting"'
-                )
-            omega = float(system.linear_modes()[0][job])
-            energy = start_energy(self.options, system, job)
-            check_start(system, job, energy)
-            return self.motions.from_mode(elongations * np.sqrt(2 * energy) / omega, omega)
+            omega = float(self.system.linear_modes()[0][job])
+            amplitude = np.sqrt(2 * self.energy_of_mode(job)) / omega
+            return self.motions.from_mode(self.system.moves(job) * amplitude, omega)
         signs = np.zeros(self.motions.forces.pairs)
         numbers = self.options.start_sites or [1]
         signs[np.abs(numbers) - 1] = np.sign(numbers)

@@ -8,13 +8,12 @@ from vipetsc.case import NnmCase
 from vipetsc.case.nnm import MOST_OF_DAMPED, NnmTable
 from vipetsc.io.branch_kinds import DAMPED
 from vipetsc.modes.balance.damped import DampedBalance
-from vipetsc.modes.balance.free_motions import FEWEST, FreeMotions
+from vipetsc.modes.balance.free_motions import FEWEST, FreeMotions, forces_of_system
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.branches.losses import dissipation_of
-from vipetsc.modes.branches.orbits import NnmMethod, start_energy
+from vipetsc.modes.branches.orbits import NnmMethod
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, PeriodicProblem
-from vipetsc.modes.shared_frequencies import check_start
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
 
@@ -60,23 +59,14 @@ class DampedMethod(NnmMethod):
         damping = np.zeros((self.system.dofs, self.system.dofs))
         if dissipation.damping.nnz:
             damping = dissipation.damping.toarray()
-        pairs = zip(self.system.contacts, dissipation.laws, strict=True)
-        stops = [pair.stops._replace(law=law, spring=pair.stops.slope_at_rest) for pair, law in pairs]
-        forces = SiteForces(stops, [spring.law for spring in self.system.springs])
+        forces = forces_of_system(self.system, dissipation.laws)
         most = min(self.options.harmonics, MOST_OF_DAMPED)
         return DampedModes(self.system, damping, forces, self.options.model_copy(update={"harmonics": most}), mode=job)
 
     def start(self, problem: PeriodicProblem[Point], job: int, stop: StopRequest | None = None) -> Point:
         """Return the motion of a linear mode at a small energy."""
-        if not self.system.moves(job).any():
-            raise ContinuationError(
-                f"mode {job + 1} has a node at every contact and nonlinear spring: its frequency and damping are those "
-                "of the linear mode at all energies; choose another one (nnm.modes)"
-            )
-        energy = start_energy(self.options, self.system, job)
-        check_start(self.system, job, energy)
         assert isinstance(problem, DampedModes)
-        return problem.start(energy)
+        return problem.start(self.energy_of_mode(job))
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
         """Return the point with its damping ratio and its loss."""

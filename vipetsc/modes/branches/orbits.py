@@ -20,7 +20,8 @@ from vipetsc.modes.continuation.arclength import GuardedSteps, OrbitProblem, Ste
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.flow import MAPS, Dop853Flow, ShootingMap, map_between_impacts
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import NoMotionError, PeriodicProblem, SpecialKind
+from vipetsc.modes.problem import ContinuationError, NoMotionError, PeriodicProblem, SpecialKind
+from vipetsc.modes.shared_frequencies import check_start
 from vipetsc.modes.shooting import Shooting, linear_start
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest
@@ -58,6 +59,19 @@ class NnmMethod(Method[Point]):
         """Return the name of the branch of a mode."""
         assert self.system is not None
         return self.system.branch_name(job)
+
+    def energy_of_mode(self, job: int) -> float:
+        """Return the energy in J at which a branch by harmonics begins; raises ContinuationError for a linear mode."""
+        system = self.system
+        assert system is not None
+        if not system.moves(job).any():
+            raise ContinuationError(
+                f"mode {job + 1} has a node at every contact and nonlinear spring, and is linear at all energies: "
+                "choose another one (nnm.modes)"
+            )
+        energy = start_energy(self.options, system, job)
+        check_start(system, job, energy)
+        return energy
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Return guarded steps to the end of the ranges."""

@@ -3,13 +3,9 @@
 Everything else in the lattice is linear: M u'' + C u' + K u = p - b f. The forces f (pair,) are those of contacts and
 what nonlinear springs have beyond their linear part; they pull the masses of their pair together. The forces p (mass,)
 are those of the drive. The columns b pick the elongations z = b^T u, of a contact its relative displacement. At each
-multiple omega of the drive's frequency the harmonics of z and f obey
-
-    z = w - G(omega) f,    G(omega) = b^T (K + i omega C - omega^2 M)^-1 b,
-
-G is the compliance in m/N, and w the motion without f: b^T (K + i omega C - omega^2 M)^-1 p, or that by the incident
-wave. These are the equations of steady states (``steady``), in which f follows from z: the motions of all other masses
-are eliminated, and z alone is unknown.
+multiple omega of the drive's frequency the harmonics of z and f obey z = w - G(omega) f (``balance.harmonic_balance``),
+G being b^T (K + i omega C - omega^2 M)^-1 b in m/N, and w the motion without f: b^T (K + i omega C - omega^2 M)^-1 p,
+or that by the incident wave.
 
 **Contacts as springs.** A mean force f moves masses without bound if no wall holds them and no spring joins them: G(0)
 is then infinite. If contacts that are pressed at rest hold them (``NfrcCase.are_contacts_springs``), these contacts are

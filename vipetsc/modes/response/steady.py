@@ -1,13 +1,7 @@
 r"""Steady states of a lattice's sites under a harmonic force or an incident Bloch wave, followed over a parameter.
 
-With the contacts condensed (``balance``) the harmonics Z_k in m of the relative displacements obey
-
-    Z_k + G(k Om) F_k(Z) = a delta_k1 w(Om),    k = 0..K,
-
-with the compliance G in m/N of the linear lattice and the harmonics F_k in N of the contact forces. Here w is the
-motion of the sites by the force (1 N), the wall (1 m) or the wave (1 clearance of the first site) alone, and a is the
-amplitude. Unknowns are Z over that clearance and the parameter, the amplitude a or the frequency Om over a scale; a
-curve of solutions is followed by pseudo-arclength (``continuation``), folds in the parameter are located on it.
+These are the equations of ``equations`` with the compliance, the forces and the drive of a case: the motion w by the
+drive alone is that by the force (1 N), the wall (1 m) or the wave (1 clearance of the first site).
 
 **Energy.** A wave of the flux P a^2 in W comes in. What leaves at Om on the side that it goes to is transmitted (T), on
 the other reflected (R); what leaves at k Om, k > 1, on both sides is U; contacts lose L. T + R + U + L = 1 for any
