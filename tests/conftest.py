@@ -48,7 +48,8 @@ from vipetsc.sources import source_key
 gc.set_threshold(500_000)
 
 ROOT = Path(__file__).parents[1]
-# Tests that scripts/test --quick leaves out, by file and name: ``scripts/test --durations`` writes this table.
+# Test functions that scripts/test --quick leaves out, by name alone, since tests may move; ``scripts/test --durations``
+# writes this table.
 SLOW = {*(ROOT / "tests/slow_tests.txt").read_text(encoding="utf-8").split()}
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
 
@@ -66,7 +67,7 @@ hypothesis.settings.load_profile("vipetsc")
 
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that is slow; a test that the table does not know is quick."""
-    if item.nodeid.partition("[")[0] in SLOW:
+    if getattr(item, "originalname", "") in SLOW:
         item.add_marker(pytest.mark.slow)
 
 

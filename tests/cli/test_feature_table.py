@@ -11,7 +11,6 @@ That engines agree on what a run computes is tested with the lattices of ``tests
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scripts.feature_table import (
-    BASE,
-    CHAPTER,
-    COLUMNS,
-    FEATURES,
-    UNREAD,
-    YES,
-    Column,
-    Feature,
-    answers,
-    chapter,
-    merged,
-)
+from scripts.feature_table import BASE, CHAPTER, COLUMNS, FEATURES, YES, Column, Feature, answers, chapter, merged
 from vipetsc.figures import registry
 from vipetsc.lattice import UnitCell
 
@@ -140,27 +127,6 @@ def test_every_yes_is_computed(column, tmp_path, in_process):
         )
         has_no_influence = feature is PLAIN or feature.name in WITHOUT_INFLUENCE.get(column.heading, ())
         assert is_same == has_no_influence, feature.name
-
-
-@pytest.mark.parametrize("column", COLUMNS, ids=lambda column: column.heading)
-def test_every_no_is_what_the_program_says(column, tmp_path, in_process):
-    """A verb that refuses a feature writes nothing, and its message has the sentences of the table."""
-    for feature in FEATURES:
-        refusal = answer(column, feature)
-        if refusal in (YES, UNREAD) or not is_in_turn(column, feature):
-            continue
-        case = put_case(column, feature, tmp_path / feature.name)
-        folder = case.parent / "out"
-        ended = in_process(*words_of(column, case), "--out", folder)
-
-        if column.heading == "propagator":
-            # The run uses the other engine, and says why.
-            assert ended.returncode == 0, feature.name
-            assert refusal in ended.stdout + ended.stderr
-        else:
-            assert ended.returncode == 2, feature.name
-            assert all(sentence in ended.stderr for sentence in re.split("; |\n", refusal)), feature.name
-            assert not list(folder.glob("*.h5"))
 
 
 def test_the_chapter_is_that_of_the_program():

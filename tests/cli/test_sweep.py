@@ -40,35 +40,6 @@ def case(tmp_path) -> Path:
     return path
 
 
-def test_a_sweep_leaves_members_and_an_ensemble(in_process, case, tmp_path):
-    """Twelve members leave an ensemble over both axes; members without contact scale one linear run."""
-    out = tmp_path / "out"
-    ended = in_process("sweep", case, "--out", out)
-    assert ended.returncode == 0, ended.stderr
-
-    with h5py.File(out / "ensemble.h5") as file:
-        assert json.loads(file.attrs["failed"]) == []
-        amplitude = file["amplitude"][...]
-        status = file["status"][...]
-        episodes = file["contact_episodes"][...]
-        work = file["work"][...]
-        entropy = file["entropy/energy_weighted"][...]
-        assert [d.label or d[0].name for d in file["work"].dims] == ["/sites", "/amplitude"]
-    # The status 1 is that of a member that was scaled from another one.
-    assert status.shape == (2, 6)
-    assert np.array_equal(status == 1, episodes == 0)
-    assert (status[:, 0] == 1).all()
-    assert (status[:, -1] == 0).all()
-
-    # Without contact the motion is linear: work grows as the square of the amplitude, entropy does not depend on it.
-    quiet = status[0] == 1
-    assert work[0, quiet] / amplitude[quiet] ** 2 == pytest.approx(work[0, 0] / amplitude[0] ** 2, rel=1e-14)
-    assert np.ptp(entropy[0, quiet]) == 0
-
-    visible = {path.name for path in out.iterdir() if path.name[0] != "."}
-    assert visible == {"case.toml", "members.jsonl", "ensemble.h5"}
-
-
 def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp_path):
     """The run of a member, simulated or scaled, has the work and entropy that the sweep has recorded for it."""
     out = tmp_path / "out"

@@ -14,7 +14,6 @@ import xarray as xr
 
 import vipetsc
 from tests.cli.test_python import my_lattice
-from tests.faults.scenarios import NFRC
 from vipetsc.case import Case
 
 # These sections follow the README's lattice: the fastest engine that can compute it, and no pictures.
@@ -142,29 +141,6 @@ def table(path: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV file."""
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
-
-
-def test_an_own_lattice_with_pictures(typed, put, tmp_path):
-    """Bands, check and run of the README's lattice: no warning, an energy balance within 1e-8, seven pictures."""
-    put("my-lattice.toml", my_lattice())
-    printed = typed("bands my-lattice.toml\nvalidate my-lattice.toml\nrun my-lattice.toml --set time.engine=auto")
-    assert "warning" not in printed
-
-    # At the upper edge of band 3, qa = pi, neighbouring cells move in antiphase: the springs between hosts, of 2e4 N/m,
-    # add 2 k (1 - cos qa) = 4 k to the hosts' stiffness.
-    masses = np.diag([0.010, 0.004, 0.002])
-    stiffness = np.array([[8.6e4, -6e3, 0], [-6e3, 7e3, -1e3], [0, -1e3, 1e3]])
-    top = np.sqrt(np.linalg.eigvals(np.linalg.solve(masses, stiffness)).max())
-    assert f"{top:.2f}" in printed
-
-    with vipetsc.open(tmp_path / "runs/my-lattice") as run:
-        work = run["energy/work"][-1]
-        lost = run["energy/dissipated"][-1]
-        kept = run["energy/kinetic"][-1] + run["energy/spring"][-1] + run["energy/contact"][-1]
-        assert float(kept + lost) == pytest.approx(float(work), rel=1e-8)
-    assert pages(tmp_path / "runs/my-lattice") == {
-        "dispersion", "impacts", "ledger", "modal_energies", "phase", "spacetime", "unit_cell"
-    }  # fmt: skip
 
 
 def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put, in_process, tmp_path):
@@ -313,28 +289,6 @@ def test_a_breather(typed, put, tmp_path):
     # In the gap between bands 2 and 3 the breather decays as exp(-0.2 n) with the distance of n cells from its site:
     # to exp(-4) = 0.018 at 20 cells.
     assert speed[np.abs(cells - 100) > 20].max() < 0.03 * speed.max()
-
-
-def test_a_frequency_response(typed, put, tmp_path):
-    """Curves of steady states over the amplitude, with conservative and with lossy stops, fold and turn back."""
-    put("response.toml", NFRC)
-    # The case allows so few points that its curves would end before they turn back.
-    command = "nfrc response.toml --set nfrc.points=200 --set output.figures=false"
-    typed(f"{command}\nexport runs/response-nfrc")
-    curves = {
-        restitution: table(tmp_path / f"runs/response-nfrc/curves/branch-r{restitution}-1023.27-point.csv")
-        for restitution in ("1", "0.7")
-    }
-    for rows in curves.values():
-        amplitude = np.array([float(row["amplitude"]) for row in rows])
-        largest = np.array([float(row["largest/100 (m)"]) for row in rows])
-        touching = np.array([float(row["episodes"]) for row in rows]) > 0
-        # Waves of a smaller amplitude than the clearance need not touch; the curve folds where contact begins.
-        assert not touching[0]
-        assert amplitude[~touching].max() == pytest.approx(1.0, abs=0.01)
-        assert largest[~touching].max() == pytest.approx(1.8e-3, rel=0.01)
-        assert amplitude[touching].min() < 0.98
-    assert curves["1"] != curves["0.7"]
 
 
 def test_the_best_clearances(typed, put, tmp_path):
