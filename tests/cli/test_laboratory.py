@@ -87,5 +87,7 @@ def test_points_of_two_runs_with_a_record_in_the_units_of_a_thesis(typed, tmp_pa
         ended = typed(f"plot a b {wrong}")
         assert ended.returncode == 2, wrong
         assert telling in ended.stderr
-    gone = typed("plot a elsewhere --fig points")
-    assert gone.returncode == 2 and "elsewhere: no such folder" in gone.stderr
+    (tmp_path / "begun").mkdir()
+    for folder, telling in (("elsewhere", "elsewhere: no such folder"), ("begun", "begun: contains no finished")):
+        ended = typed(f"plot a {folder} --fig points")
+        assert ended.returncode == 2 and telling in ended.stderr

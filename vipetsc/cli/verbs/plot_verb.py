@@ -204,6 +204,9 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     if missing := [str(path) for path in paths if not path.exists()]:
         raise FolderError(f"{', '.join(missing)}: no such folder")
     if len(folders) > 1:
+        for folder in folders:
+            if not any(pictures.are_of([folder]) for pictures in by_source.values()):
+                raise FolderError(f"{folder}: contains no finished results")
         raise FolderError(
             f"{' '.join(map(str, paths))}: only runs, or sweeps and folders of branches, can be drawn on one page"
         )
