@@ -309,11 +309,7 @@ def test_folds_of_the_duffing_oscillator(tmp_path):
     assert [point.kind for point in stored.points] == [point.kind for point in special[1].points]
 
 
-@pytest.mark.parametrize(
-    "changes, kind",
-    [(FLIP, "period-doubling"), (PAIR, "neimark-sacker"), (UNEVEN, "branch-point")],
-    ids=["flip", "pair", "uneven"],
-)
+@pytest.mark.parametrize("changes, kind", [(FLIP, "period-doubling"), (PAIR, "neimark-sacker")], ids=["flip", "pair"])
 def test_the_curve_meets_special_points_of_other_amplitudes(changes, kind):
     """A special point that a curve over the frequency has at another amplitude lies on the curve of special points."""
     options = {"harmonics": 21, "isola_reach": 1.03, "points": 300}

@@ -297,11 +297,13 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
 
 
 ALLOWED = 1e-4
+# The amplitude over the clearance at the fold, with 61 harmonics at every state.
+FOLD = 1.00145038
 CURVES = {
     "amplitude": {},
     "contacts.restitution": {
         "over": "contacts.restitution",
-        "range": [0.97, 1.0],
+        "range": [0.985, 1.0],
         "fixed": [1.05],
         "largest_step": 0.5,
     },
@@ -341,10 +343,7 @@ def test_states_have_as_many_harmonics_as_the_truncation_needs(tmp_path, over, o
         assert np.abs(of_point.residual(inner, of_point.shift_near(inner))).max() < 1e-10
 
     if over == "amplitude":
-        whole = curve_of(nfrc_case(**options), tmp_path / "all")
-        folds = [[p.xi[-1] for p in c.points if p.kind == "fold"] for c in (curve, whole)]
-        assert folds[0]
-        np.testing.assert_allclose(*folds, rtol=3e-4)
+        assert [point.xi[-1] for point in curve.points if point.kind == "fold"] == pytest.approx([FOLD], abs=3e-5)
 
         # A state may have too few harmonics for its perturbations: the summary says which key gives it more.
         first = curve.points[0]
@@ -353,8 +352,10 @@ def test_states_have_as_many_harmonics_as_the_truncation_needs(tmp_path, over, o
 
 
 def test_a_stopped_curve_goes_on_to_the_same_bits(tmp_path, over_amplitude):
-    case, whole = over_amplitude
+    _, whole = over_amplitude
     parts = tmp_path / "parts"
     curve_of(nfrc_case(truncation=ALLOWED, harmonics=61, points=12), parts)
+    case = nfrc_case(truncation=ALLOWED, harmonics=61, points=18)
     (resumed,) = follow_all(case, parts, MPI.COMM_SELF, resume=True)
-    assert [p.xi.tolist() for p in resumed.points] == [p.xi.tolist() for p in whole.points]
+    assert len(resumed.points) >= 18
+    assert [p.xi.tolist() for p in resumed.points] == [p.xi.tolist() for p in whole.points[: len(resumed.points)]]
