@@ -67,7 +67,7 @@ QUICK = {
 
 
 def options_from(arguments: list[str]) -> argparse.Namespace:
-    """The options of the command line; those not given have the values of ``QUICK`` or ``FULL``."""
+    """Return the options of the command line; those not given have the values of ``QUICK`` or ``FULL``."""
     parser = argparse.ArgumentParser(
         "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -137,7 +137,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
 
 
 def measured_programs(options: argparse.Namespace) -> list[dict]:
-    """The rows of whole programs; none, with a message, where the earlier version is not in the repository."""
+    """Return the rows of whole programs; none, with a message, where the earlier version is not in the repository."""
     names = [name for name, program in PROGRAMS.items() if not (options.quick and program.compiles)]
     try:
         return programs(options.out.absolute(), options.rounds, options.baseline, names)

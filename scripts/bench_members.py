@@ -50,7 +50,7 @@ KINDS = {
 
 
 def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
-    """CPU seconds of a whole sweep of so many ``members``, in ``folder``; raises RuntimeError if a member fails."""
+    """Return CPU seconds of a sweep of so many ``members``, in ``folder``; raises RuntimeError if a member fails."""
     table = tomllib.loads((EXAMPLES / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
     for section, changes in kind.changes.items():
         table[section] = table.get(section, {}) | changes
@@ -68,7 +68,7 @@ def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
 
 
 def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
-    """CPU seconds of one more member of a sweep, by the names in ``KINDS``, as the median of ``rounds``.
+    """Return CPU seconds of one more member of a sweep, by the names in ``KINDS``, as the median of ``rounds``.
 
     It is the difference between sweeps of ``1 + MEMBERS`` members and of one, over ``MEMBERS``.
     """
@@ -85,7 +85,7 @@ def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
 
 
 def paper_budget(folder: Path) -> dict[str, float]:
-    """CPU seconds of the paper by stage, from what ``paper`` left in ``folder``; empty if it left nothing."""
+    """Return CPU seconds of the paper by stage, from what ``paper`` left in ``folder``; empty if it left nothing."""
     record = folder / "made.json"
     if not record.exists():
         return {}

@@ -22,7 +22,7 @@ from vipetsc.io.store import RunMemory
 
 
 def engines() -> tuple[str, ...]:
-    """Names of the engines that a case file's ``time.engine`` may choose."""
+    """Return names of the engines that a case file's ``time.engine`` may choose."""
     return tuple(name for name in get_args(TimeTable.model_fields["engine"].annotation) if name != "auto")
 
 
@@ -92,12 +92,12 @@ def solve(case: Case) -> Solution:
 
 
 def _by_engine(case: Case, name: str) -> Case:
-    """A copy of ``case`` that asks for the engine ``name``."""
+    """Return a copy of ``case`` that asks for the engine ``name``."""
     return case.model_copy(update={"time": case.time.model_copy(update={"engine": name})})
 
 
 def own_solvers() -> dict[str, Solver]:
-    """A solver for each engine, by name; it uses this engine whichever the case asks for."""
+    """Return a solver for each engine, by name; it uses this engine whichever the case asks for."""
 
     def with_engine(name: str) -> Solver:
         return lambda case: solve(_by_engine(case, name))
@@ -106,7 +106,7 @@ def own_solvers() -> dict[str, Solver]:
 
 
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
-    """Microseconds of CPU time that one right-hand side of the case takes through PETSc; mean over ``evaluations``.
+    """Return microseconds of CPU time of one right-hand side of the case through PETSc; mean of ``evaluations``.
 
     Evaluations take some microseconds each, so that 20,000 of them are far above the resolution of the clock.
     """

@@ -52,7 +52,7 @@ Solver = Callable[[Case], Solution]
 
 
 def parameters(model: Model) -> str:
-    """The lattice of ``model`` as text that the peers read; raises ValueError for what they do not know."""
+    """Return the lattice of ``model`` as text that the peers read; raises ValueError for what they do not know."""
     chain = model.chain
     contact = model.chain.sites[0].law
     drive = model.drive
@@ -79,7 +79,7 @@ def parameters(model: Model) -> str:
 
 
 def petsc_flags() -> list[str]:
-    """Compiler flags for the PETSc of petsc4py; empty if pkg-config knows no PETSc, or another version."""
+    """Return compiler flags for the PETSc of petsc4py; empty if pkg-config knows no PETSc, or another version."""
     if not which("pkg-config"):
         return []
 
@@ -112,7 +112,7 @@ def compile_peers(folder: Path) -> dict[str, Path]:
 
 
 def compiled(program: Path, method: str, folder: Path) -> Solver:
-    """A C++ peer as a solver, which exchanges files with it in ``folder`` and raises RuntimeError if it fails."""
+    """Return a C++ peer as a solver that exchanges files in ``folder``; raises RuntimeError if it fails."""
 
     def solve(case: Case) -> Solution:
         model = case.model()
@@ -134,13 +134,13 @@ def compiled(program: Path, method: str, folder: Path) -> Solver:
 
 
 def _solution(output: Path, model: Model, seconds: float) -> Solution:
-    """The solution in the file ``output`` of a peer, doubles (sample, mass, cell)."""
+    """Return the solution in the file ``output`` of a peer, doubles (sample, mass, cell)."""
     sampled = np.fromfile(output).reshape(model.samples, model.chain.cell.dofs, model.chain.cells)
     return Solution(sampled.transpose(0, 2, 1).reshape(model.samples, -1), seconds)
 
 
 def diffrax(folder: Path) -> Solver:
-    """diffrax's Dopri8 as a solver, by a process of its own that exchanges files in ``folder``.
+    """Return diffrax's Dopri8 as a solver, by a process of its own that exchanges files in ``folder``.
 
     The process starts with the first case, so that it compiles only once, and ends when its input is closed.
     """
@@ -183,7 +183,7 @@ def diffrax(folder: Path) -> Solver:
 
 
 def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
-    """SciPy's DOP853 as a solver; ``right_hand_side`` makes the right-hand side of a model."""
+    """Return SciPy's DOP853 as a solver; ``right_hand_side`` makes the right-hand side of a model."""
 
     def solve(case: Case) -> Solution:
         model = case.model()
@@ -203,13 +203,13 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
 
 
 def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hosts and resonators (site,) as indices of masses, and the clearances (site,) in m."""
+    """Return hosts and resonators (site,) as indices of masses, and the clearances (site,) in m."""
     first = chain.sites.cells * chain.cell.dofs
     return first + chain.cell.host, first + chain.cell.resonator, chain.sites.clearances
 
 
 def plain_right_hand_side(model: Model) -> RightHandSide:
-    """The right-hand side of ``model`` in numpy, with the stiffness as a sparse matrix."""
+    """Return the right-hand side of ``model`` in numpy, with the stiffness as a sparse matrix."""
     stiffness = model.chain.stiffness_matrix().tocsr()
     inverse_mass = 1 / model.chain.masses()
     n = inverse_mass.size
@@ -231,14 +231,14 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
 
 
 def compiled_right_hand_side(model: Model) -> RightHandSide:
-    """The right-hand side of ``model``, compiled by numba."""
+    """Return the right-hand side of ``model``, compiled by numba."""
     driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
     return _compile(model.chain, model.chain.sites[0].law, model.drive, driven)
 
 
 @cache
 def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
-    """The compiled right-hand side; ``driven`` is the number of the driven mass among all."""
+    """Return the compiled right-hand side; ``driven`` is the number of the driven mass among all."""
     # numba takes the arrays and numbers of this function as constants: the kernel is compiled for one lattice.
     stiffness = chain.stiffness_matrix().tocsr()
     first = stiffness.indptr
@@ -287,7 +287,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
 
 
 def peers(folder: Path) -> dict[str, Solver]:
-    """The solvers of all peers that this machine has, by name; ``folder`` is for their programs and files."""
+    """Return the solvers of all peers that this machine has, by name; ``folder`` is for their programs and files."""
     programs = compile_peers(folder)
     # The program of each peer, and the name of the method in it.
     methods = {

@@ -20,7 +20,7 @@ ERRORS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 
 
 def lattice_case(overrides: Iterable[str] = ()) -> Case:
-    """The case that all solvers solve: the four-band lattice, A = 30 N, conservative, to 0.3 s; with ``overrides``."""
+    """Return the case of all solvers, with ``overrides``: the four-band lattice, A = 30 N, conservative, to 0.3 s."""
     # Conservative, because the peers' laws are. It ends early after the first contacts: each further one multiplies
     # rounding errors, by which solvers would soon differ more than by their own errors.
     given = ("drive.amplitude=30.0", "contacts.restitution=1.0", "time.sample_interval=2e-4", "time.end=0.3")
@@ -28,17 +28,17 @@ def lattice_case(overrides: Iterable[str] = ()) -> Case:
 
 
 def at_tolerance(case: Case, rtol: float) -> Case:
-    """A copy of ``case`` at the relative tolerance ``rtol``."""
+    """Return a copy of ``case`` at the relative tolerance ``rtol``."""
     return case.model_copy(update={"time": case.time.model_copy(update={"rtol": rtol})})
 
 
 def error(sampled: np.ndarray, exact: np.ndarray) -> float:
-    """Relative l2 error of all samples ``sampled`` (sample, mass)."""
+    """Return relative l2 error of all samples ``sampled`` (sample, mass)."""
     return float(np.linalg.norm(sampled - exact) / np.linalg.norm(exact))
 
 
 def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, dict[str, Any]]:
-    """Velocities by the engine ``ts`` at a tolerance of 1e-13, and the distances from them of other tight solutions."""
+    """Return velocities by ``ts`` at the tolerance 1e-13, and the distances from them of other tight solutions."""
     # The reference is by ts, whose error falls with the tolerance down to rounding errors. The propagator takes other
     # steps, and is compared with the reference as the peers are.
     exact = solvers["vipetsc ts"](at_tolerance(case, 1e-13)).velocity
@@ -91,7 +91,7 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
 
 
 def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: bool = False) -> float | None:
-    """CPU seconds of a solver at the error ``wanted``, interpolated in logarithms between its ``points``.
+    """Return CPU seconds of a solver at the error ``wanted``, interpolated in logarithms between its ``points``.
 
     Points (error, seconds) that another one beats in both are left out, which favours a solver whose error falls
     unevenly. Returns None if ``wanted`` is outside the range of the points; with ``bound``, an error larger than all of
@@ -109,7 +109,7 @@ def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: 
 
 
 def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """CPU times of all other solvers over that of each engine of this package, at the errors ``wanted``.
+    """Return CPU times of all other solvers over that of each engine of this package, at the errors ``wanted``.
 
     Returns medians over the rounds, and their smallest and largest values, by names "solver / engine at error".
     """

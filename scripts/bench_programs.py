@@ -83,7 +83,7 @@ class Version:
     folder: Path
 
     def seconds(self, program: Program) -> tuple[float, float]:
-        """Wall and CPU time in s of one call of ``program``; raises RuntimeError if the call fails."""
+        """Return wall and CPU time in s of one call of ``program``; raises RuntimeError if the call fails."""
         # This process has initialised MPI: with its variables, a process that it starts would take itself for a rank.
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
         environment["PYTHONPATH"] = str(self.source)
@@ -111,7 +111,7 @@ class Version:
 
 
 def _cpu_seconds_of_children() -> float:
-    """CPU seconds of all processes that this one has started and that have ended."""
+    """Return CPU seconds of all processes that this one has started and that have ended."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
@@ -178,7 +178,7 @@ def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> li
 
 
 def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
-    """Medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
+    """Return medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
     before = np.array(measured["before"])
     now = np.array(measured["now"])
     # The speed of the machine changes during a bench, but cancels in ratios of calls that follow each other.
@@ -193,7 +193,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
 
 
 def programs_table(rows: list[dict]) -> str:
-    """The rows in Markdown."""
+    """Return the rows in Markdown."""
     # All rows have the same baseline, but rows of failures have none.
     commit = next((row["baseline"] for row in rows if "baseline" in row), BASELINE)
     lines = [

@@ -33,17 +33,17 @@ _OTHER = (style.GREY, "v", "-")
 
 
 def solver_names(found: dict[str, Any]) -> list[str]:
-    """The solvers in ``found``, in the order in which they were measured."""
+    """Return the solvers in ``found``, in the order in which they were measured."""
     return list(dict.fromkeys(row["solver"] for row in found["rows"]))
 
 
 def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
-    """Errors and CPU seconds of one solver by falling tolerance, without failures and without the reference itself."""
+    """Return errors and CPU seconds of one solver by falling tolerance, without failures and the reference."""
     return [(r["error"], r["seconds"]) for r in found["rows"] if r["solver"] == solver and r["error"]]
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """All tables for which ``found`` has numbers, as Markdown: CPU time at equal error, programs, scaling."""
+    """Return all tables for which ``found`` has numbers, as Markdown: CPU time at equal error, programs, scaling."""
     parts = {
         "provenance": _origin_table,
         "rows": _precision_table,
@@ -61,7 +61,7 @@ def markdown(found: dict[str, Any]) -> str:
 
 
 def _origin_table(found: dict[str, Any]) -> str:
-    """When the bench was made, of which version, on which machine and with which libraries."""
+    """Return when the bench was made, of which version, on which machine and with which libraries."""
     origin = found["provenance"]
     rows = {
         "date": origin["date"][:10],
@@ -75,7 +75,7 @@ def _origin_table(found: dict[str, Any]) -> str:
 
 
 def processor() -> str:
-    """The name of the processor, on Linux; elsewhere that of the architecture."""
+    """Return the name of the processor, on Linux; elsewhere that of the architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -85,7 +85,7 @@ def processor() -> str:
 
 
 def _precision_table(found: dict[str, Any]) -> str:
-    """CPU seconds of all solvers at equal error, and their ratios to the propagator's, or to those of ``ts``."""
+    """Return CPU seconds of all solvers at equal error, and their ratios to the propagator's, or to those of ``ts``."""
     names = solver_names(found)
     # The last engine of this package: the propagator, which is faster than ts where it applies.
     engine = [name for name in names if name.startswith("vipetsc")][-1]
@@ -109,7 +109,7 @@ def _precision_table(found: dict[str, Any]) -> str:
 
 
 def _reference_table(found: dict[str, Any]) -> str:
-    """How far other solvers at the edge of double precision lie from the reference."""
+    """Return how far other solvers at the edge of double precision lie from the reference."""
     reference = found["reference"]
     lines = [f"| reference: {reference['solver']}, to {reference['end']:g} s | distance from it |", "|---|---|"]
     lines += [f"| {name} | {value:.1e} |" for name, value in reference["separation"].items()]
@@ -117,7 +117,7 @@ def _reference_table(found: dict[str, Any]) -> str:
 
 
 def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
-    """An entry of the table: CPU seconds, with the ratio if there is one; "-" for none."""
+    """Return an entry of the table: CPU seconds, with the ratio if there is one; "-" for none."""
     if seconds is None:
         return "-"
     if ratio:
@@ -126,7 +126,7 @@ def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
 
 
 def _whole_table(found: dict[str, Any]) -> str:
-    """CPU time of the built-in case inside a program that has started, and of a right-hand side."""
+    """Return CPU time of the built-in case inside a program that has started, and of a right-hand side."""
     lines = ["| inside the program | CPU time |", "|---|---|"]
     for engine, seconds in found["whole"].items():
         lines.append(f"| built-in case up to `run.h5`, {engine} | {seconds:.2f} s |")
@@ -136,14 +136,14 @@ def _whole_table(found: dict[str, Any]) -> str:
 
 
 def _members_table(found: dict[str, Any]) -> str:
-    """CPU time of one more member of a sweep."""
+    """Return CPU time of one more member of a sweep."""
     lines = ["| one more member of a sweep | CPU s |", "|---|---|"]
     lines += [f"| {kind} | {seconds:.3g} |" for kind, seconds in found["members"].items()]
     return "\n".join(lines)
 
 
 def _paper_table(found: dict[str, Any]) -> str:
-    """CPU time of the paper over all ranks, by stage, the longest first."""
+    """Return CPU time of the paper over all ranks, by stage, the longest first."""
     budget = found["paper"]
     lines = ["| stage of the paper | CPU s of all ranks |", "|---|---|", f"| all | {sum(budget.values()):.0f} |"]
     for stage, seconds in sorted(budget.items(), key=lambda item: -item[1]):
@@ -152,7 +152,7 @@ def _paper_table(found: dict[str, Any]) -> str:
 
 
 def _builds_table(found: dict[str, Any]) -> str:
-    """Set-up and files of large lattices."""
+    """Return set-up and files of large lattices."""
     lines = [
         "| cells | sites | ranks | set-up (s) | velocities written (GB) | in (s) | peak GiB a rank |",
         "|---" * 7 + "|",
@@ -168,7 +168,7 @@ def _builds_table(found: dict[str, Any]) -> str:
 
 
 def _scaling_table(found: dict[str, Any]) -> str:
-    """Wall time and memory over cells and ranks."""
+    """Return wall time and memory over cells and ranks."""
     lines = [
         "| engine | cells | ranks | ms per 2e-4 s | two ranks gain (bare memory gains) | peak GiB a rank"
         " | fraction of bandwidth limit |",
@@ -191,7 +191,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
 
 
 def _power(value: float) -> str:
-    """A power of ten as ``1e-8``, not ``1e-08``."""
+    """Return a power of ten as ``1e-8``, not ``1e-08``."""
     return f"{value:.0e}".replace("e-0", "e-")
 
 
@@ -211,7 +211,7 @@ def draw(found: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def work_precision_figure(found: dict[str, Any]) -> Figure:
-    """A figure of the CPU seconds over the relative error of all sampled velocities, for each solver."""
+    """Return a figure of the CPU seconds over the relative error of all sampled velocities, for each solver."""
     figure = style.new_figure(4.6, 3.0)
     axes = figure.subplots()
     for name in solver_names(found):
@@ -236,7 +236,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
 
 
 def scaling_figure(found: dict[str, Any]) -> Figure:
-    """A figure of wall time and memory over the number of cells, for each engine on one rank and on two."""
+    """Return a figure of wall time and memory over the number of cells, for each engine on one rank and on two."""
     figure = style.new_figure(style.PAGE, 2.6)
     left, right = figure.subplots(1, 2)
     for engine in dict.fromkeys(row["engine"] for row in found["scaling"]):

@@ -61,7 +61,7 @@ def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
 
 
 def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
-    """The rows of one rank and of two at one length, as medians over ``rounds``, in which they take turns."""
+    """Return the rows of one rank and of two at one length, as medians over ``rounds``, in which they take turns."""
     turns: dict[int, list[dict]] = {1: [], 2: []}
     # The same work at all lengths, a million cells times an interval, within bounds that can be timed and waited for.
     intervals = max(10, min(200, 1_000_000 // cells))
@@ -94,7 +94,7 @@ def builds(sizes: Iterable[tuple[int, int]]) -> list[dict]:
 
 
 def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
-    """CPU seconds of the built-in case from start to ``run.h5``, by engine: median of ``rounds`` after a warm-up."""
+    """Return CPU seconds of the built-in case up to ``run.h5``, by engine: median of ``rounds`` after a warm-up."""
     seconds: dict[str, list[float]] = {name: [] for name in engines()}
     for turn in range(rounds + 1):
         for engine, found in seconds.items():

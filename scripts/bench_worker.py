@@ -46,7 +46,7 @@ def triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, s: float) -> None:
 
 
 def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
-    """Bandwidth in GB/s of STREAM's triad on all ranks at once: the best of ``turns``, with 24 bytes an element."""
+    """Return bandwidth in GB/s of STREAM's triad on all ranks at once: best of ``turns``, 24 bytes an element."""
     # By default three arrays of 64 MB each, which exceed the caches of a processor: the memory itself is measured.
     a = np.zeros(size)
     b = np.ones(size)
@@ -65,7 +65,7 @@ def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
 
 
 def peak() -> float:
-    """The largest resident size of any rank so far in GiB."""
+    """Return the largest resident size of any rank so far in GiB."""
     return COMM.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX) / 2**20
 
 
@@ -105,7 +105,7 @@ def time_intervals(engine: str, cells: int, intervals: int) -> dict:
 
 
 def spent(run: EngineRun, done: int, intervals: int) -> dict[str, float]:
-    """The time of each of ``EVENTS`` on this rank in ms a sample interval, over ``intervals``.
+    """Return the time of each of ``EVENTS`` on this rank in ms a sample interval, over ``intervals``.
 
     ``run`` has reached the sample ``done``.
     """
@@ -160,7 +160,7 @@ def build(cells: int, sites: int) -> dict:
 
 
 def _spread(cells: int, sites: int) -> Case:
-    """A case with evenly spread ``sites``, which no wave reaches in its three samples."""
+    """Return a case with evenly spread ``sites``, which no wave reaches in its three samples."""
     # Sites are away from both ends, because the first end is driven.
     places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
     table = {

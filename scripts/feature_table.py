@@ -79,7 +79,7 @@ class Column:
     is_system: bool = False
 
     def table(self, feature: Feature) -> Table | None:
-        """The table of the case with ``feature``, as of a case file; None if the verb reads no section that has it."""
+        """Return the table of a case file with ``feature``; None if the verb reads no section that has it."""
         changes = feature.system_changes if self.is_system else feature.changes
         if changes is None:
             return None
@@ -90,7 +90,7 @@ class Column:
         return merged(merged(merged(BASE, self.sections), changes), feature.scaled.get(self.heading, {}))
 
     def answer(self, feature: Feature) -> str:
-        """``YES``, ``UNREAD``, or the sentence that refuses ``feature``."""
+        """Return ``YES``, ``UNREAD``, or the sentence that refuses ``feature``."""
         table = self.table(feature)
         if table is None:
             return UNREAD
@@ -104,7 +104,7 @@ class Column:
 
 
 def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
-    """A copy of ``table`` with the ``changes``, which go into tables within tables too; None removes a key."""
+    """Return a copy of ``table`` with the ``changes``, which go into tables within tables too; None removes a key."""
     result = dict(table)
     for key, value in changes.items():
         if isinstance(value, dict) and isinstance(result.get(key), dict):
@@ -114,19 +114,19 @@ def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
 
 
 def _sentences(error: CaseError) -> str:
-    """The remedies of ``error``, each once, without the keys and the values of the small case."""
+    """Return the remedies of ``error``, each once, without the keys and the values of the small case."""
     return SEPARATOR.join(dict.fromkeys(problem.remedy for problem in error.problems))
 
 
 def _propagator_refusal(case: Case) -> str:
-    """Why the propagator does not suit ``case``."""
+    """Return why the propagator does not suit ``case``."""
     from vipetsc.dynamics.propagator.step_choice import refusal
 
     return refusal(case.model()) or ""
 
 
 def _modes_refusal(case: Case) -> str:
-    """Why linear modes of ``case`` are not computed."""
+    """Return why linear modes of ``case`` are not computed."""
     from vipetsc.studies.linear_modes import check_modes
 
     try:
@@ -192,19 +192,19 @@ def _contacts(**changes: Any) -> Table:
 
 
 def _grains(cell: Table) -> Table:
-    """Changes after which contacts alone join the cells, and are pressed at rest."""
+    """Return changes after which contacts alone join the cells, and are pressed at rest."""
     joining = {"pair": [1, 1], "next_cell": True, "sites": _all_but_the_last(BASE)}
     pressed = {"side": "minus", "clearance": 0.0, "precompression": 2e-4, "restitution": 1.0}
     return _lattice(cell=cell, ends="free") | _contacts(**joining, **pressed)
 
 
 def _all_but_the_last(table: Table) -> list[int]:
-    """The cells of a lattice that have a next cell."""
+    """Return the cells of a lattice that have a next cell."""
     return list(range(1, table["lattice"]["cells"]))
 
 
 def _own_contacts(*contacts: tuple[int, float]) -> Table:
-    """Changes after which the second mass of [nnm.own] has these ``contacts``, pairs of a host and a clearance in m."""
+    """Return changes that give the second mass of [nnm.own] ``contacts``, pairs of a host and a clearance in m."""
     pairs = [{"host": host, "resonator": 2, "clearance": clearance} for host, clearance in contacts]
     return {"nnm": {"own": {"contacts": pairs}}}
 
@@ -351,7 +351,7 @@ FEATURES: tuple[Feature, ...] = (
 
 @cache
 def answers() -> Mapping[str, Sequence[str]]:
-    """The answer of each column to each feature, by the feature's name."""
+    """Return the answer of each column to each feature, by the feature's name."""
     return {feature.name: [column.answer(feature) for column in COLUMNS] for feature in FEATURES}
 
 

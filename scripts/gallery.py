@@ -30,20 +30,20 @@ MOST = {".png": 125_000, ".gif": 1_500_000}  # bytes
 
 
 def pages() -> dict[str, Path]:
-    """The pages of the gallery by name, in the order of its index."""
+    """Return the pages of the gallery by name, in the order of its index."""
     names: list[str] = re.findall(r"\]\(gallery/([\w-]+)\.md\)", INDEX.read_text(encoding="utf-8"))
     return {name: INDEX.with_suffix("") / f"{name}.md" for name in names}
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The commands in the blocks ``sh`` of a page, in order, each as its words."""
+    """Return the commands in the blocks ``sh`` of a page, in order, each as its words."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     lines = "".join(blocks).splitlines()
     return [shlex.split(line, comments=True) for line in lines if line.strip()]
 
 
 def pictures(page: Path) -> list[Path]:
-    """The files of the pictures that a page shows."""
+    """Return the files of the pictures that a page shows."""
     links = re.findall(r"!\[[^]]*\]\((\S+)\)", page.read_text(encoding="utf-8"))
     return [(page.parent / link).resolve() for link in links]
 

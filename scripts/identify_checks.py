@@ -42,7 +42,7 @@ CLEARANCES = (1.32e-3, 1.20e-3, 1.08e-3, 0.96e-3, 0.90e-3)
 
 
 def work_of(table: dict[str, Any]) -> Identification:
-    """The identification of the case ``table``, ready for its fits."""
+    """Return the identification of the case ``table``, ready for its fits."""
     plan = IdentifyCase.from_table(table)
     return Identification(plan, read_measured_records(plan), StopRequest())
 
@@ -123,7 +123,7 @@ def derivatives(folder: Path, picture: Path) -> None:
 
 
 def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float, float, float]]:
-    """Errors of derivatives by a clearance in windows that end after more and more impacts; a row for each window.
+    """Return errors of derivatives by a clearance in windows of more and more impacts; a row for each.
 
     A row has the number of impacts, the largest derivative by the logarithm of the clearance in m/s, its largest
     relative error, and the relative error of the change that it predicts for 0.1 %.
@@ -138,7 +138,7 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
     slopes = misfit.jacobian(z, [1.0], [0]).reshape(-1, len(misfit.noise[0])) * misfit.noise[0]
 
     def moved(step: float) -> np.ndarray:
-        """The velocities of a run whose clearance is exp(``step``) times as large."""
+        """Return the velocities of a run whose clearance is exp(``step``) times as large."""
         case = work.plan.case_of([work.plan.parameters[0].from_coordinate(z[0] + step)])
         return np.asarray(run_of(case)["points/velocity"].values)
 

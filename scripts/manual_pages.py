@@ -102,7 +102,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
 
 
 def contents(caption: str, names: list[str], hidden: bool = True) -> str:
-    """A table of contents with the pages ``names``; if ``hidden``, it is in the margin alone."""
+    """Return a table of contents with the pages ``names``; if ``hidden``, it is in the margin alone."""
     options = ":maxdepth: 1\n"
     if hidden:
         options = ":hidden:\n"
@@ -112,7 +112,7 @@ def contents(caption: str, names: list[str], hidden: bool = True) -> str:
 
 
 def case_files(text: str) -> str:
-    """The case files that commands in ``text`` name, as sections of a page."""
+    """Return the case files that commands in ``text`` name, as sections of a page."""
     blocks = []
     for name in dict.fromkeys(re.findall(r"\bruns/[\w/-]+\.toml", text)):
         path = ROOT / name
@@ -122,7 +122,7 @@ def case_files(text: str) -> str:
 
 
 def notebook_page(path: Path) -> str:
-    """The cells of a notebook as a page: text, blocks of code, and the pictures that cells draw."""
+    """Return the cells of a notebook as a page: text, blocks of code, and the pictures that cells draw."""
     parts = []
     for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
         text = "".join(cell["source"])
@@ -171,12 +171,12 @@ def add_static(folder: Path) -> None:
 
 
 def dotted(path: Path) -> str:
-    """The name of a folder or module as it is imported."""
+    """Return the name of a folder or module as it is imported."""
     return ".".join(path.relative_to(ROOT).with_suffix("").parts)
 
 
 def interface(package: Path) -> str:
-    """The page of a folder: the docstrings of its modules and of their public names."""
+    """Return the page of a folder: the docstrings of its modules and of their public names."""
     lines = [f"# {dotted(package)}", ""]
     first = package / "__init__.py"
     for path in [first, *sorted(set(package.glob("*.py")) - {first})]:
@@ -194,7 +194,7 @@ def interface(package: Path) -> str:
 
 
 def public(tree: ast.Module | ast.ClassDef) -> Iterator[Named]:
-    """Classes and functions of a module, or methods of a class, that have a docstring and no leading underscore."""
+    """Yield classes and functions of a module, or methods of a class, with a docstring and no leading underscore."""
     seen = set()
     for node in tree.body:
         if isinstance(node, Named) and not node.name.startswith("_") and ast.get_docstring(node):
@@ -205,7 +205,7 @@ def public(tree: ast.Module | ast.ClassDef) -> Iterator[Named]:
 
 
 def described(node: Named, depth: int = 6) -> Iterator[str]:
-    """The lines of the directive of a name: its signature, its docstring and, of a class, the methods within it.
+    """Yield the lines of the directive of a name: its signature, its docstring and, of a class, the methods within it.
 
     ``depth`` is the number of colons that open the directive, fewer for one within another.
     """
@@ -233,7 +233,7 @@ def described(node: Named, depth: int = 6) -> Iterator[str]:
 
 
 def prose(node: Named | ast.Module) -> str:
-    """The docstring of ``node`` as Markdown, in which no character is taken for a heading, a tag or a table."""
+    """Return the docstring of ``node`` as Markdown, in which no character is taken for a heading, a tag or a table."""
     # Headings become bold words: as headings they would enter the page's table of contents.
     text = re.sub(r"(?m)^(.+)\n-{3,}$", r"**\1**\n", ast.get_docstring(node) or "")
     text = text.replace("::\n", ":\n")

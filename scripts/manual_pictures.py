@@ -84,7 +84,7 @@ COMMANDS = (
 
 
 def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Relative displacement in m and force in N (step,) during an impact of a free pair of masses.
+    """Return relative displacement in m and force in N (step,) during an impact of a free pair of masses.
 
     The pair has the reduced ``mass`` in kg and approaches at ``SPEED``; ``clearance`` is in m.
     """
@@ -201,7 +201,7 @@ def named_cell(run: xr.Dataset) -> Figure:
 
 
 def drawn(folder: Path, draw: Callable[[], Figure]) -> Image.Image:
-    """The picture of a figure, drawn in the package's style."""
+    """Return the picture of a figure, drawn in the package's style."""
     path = folder / "drawn.png"
     with style.rc_style():
         style.save(draw(), path)

@@ -134,7 +134,7 @@ class Budget:
         return run_in_memory(case, MPI.COMM_SELF, StopRequest())[0]
 
     def _motion(self, run: xr.Dataset) -> PairMotion:
-        """The relative motion at the sites in a ``run`` as of `_run`."""
+        """Return the relative motion at the sites in a ``run`` as of `_run`."""
         chain = self.case.model().chain
         cells = chain.sites.cells
         return PairMotion.between(run, (cells - cells.min()).tolist(), chain.sites.pairs)
@@ -188,7 +188,7 @@ class Budget:
         return float(energies.into[int(self.data.attrs["drive_band"]) :].sum()), energies.dissipated
 
     def scatter(self, amplitude: float) -> Fractions:
-        """Standard deviations over runs near ``amplitude``: of log10 of the upper bands, and of the dissipated part."""
+        """Return standard deviations of runs near ``amplitude``: log10 of the upper bands, and the dissipated part."""
         modes = ModalParts.of(self.case.model().chain).modes
         # A mode at the band's edge belongs to the band, whatever its last digits are.
         above = modes.frequency > self.burst.bands[int(self.data.attrs["drive_band"])].low * (1 - 1e-9)
@@ -205,7 +205,7 @@ class Budget:
 
 
 def _at(times: np.ndarray, given: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Complex ``values`` at the ``given`` times, interpolated at other ``times``; 0 beyond the last given one."""
+    """Return complex ``values`` at the ``given`` times, interpolated at other ``times``; 0 beyond the last."""
     return np.asarray(
         np.interp(times, given, values.real, right=0.0) + 1j * np.interp(times, given, values.imag, right=0.0)
     )

@@ -23,7 +23,7 @@ jax.config.update("jax_platforms", "cpu")
 
 
 def words_in(path: str) -> Iterator[str]:
-    """The words of the parameter file ``path``, one after the other."""
+    """Yield the words of the parameter file ``path``, one after the other."""
     with open(path, encoding="utf-8") as file:
         yield from file.read().split()
 
@@ -64,7 +64,7 @@ class Lattice:
         self.times = np.arange(int(samples)) * interval * self.rate
 
     def derivative(self, t: jax.Array, y: jax.Array, _: None) -> jax.Array:
-        """Time derivative of y (displacement or velocity, mass, cell)."""
+        """Return time derivative of y (displacement or velocity, mass, cell)."""
         u = y[0]
         # Cells of zeros beyond the ends are fixed walls; at free ends their springs are left out below.
         outside = jnp.pad(u, ((0, 0), (1, 1)))
@@ -90,7 +90,7 @@ class Lattice:
         return jnp.stack([y[1], acceleration.at[self.driven].add(jnp.where(driving, burst, 0.0))])
 
     def solver(self) -> Callable[[float, float], diffrax.Solution]:
-        """The compiled solution as a function of the two tolerances."""
+        """Return the compiled solution as a function of the two tolerances."""
         term = diffrax.ODETerm(self.derivative)
         times = jnp.asarray(self.times)
 
