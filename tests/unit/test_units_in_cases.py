@@ -7,7 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.conftest import small_case
+from tests.rigs import TWO_MASSES
 from vipetsc.case import Case, CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.units import PREFIXES, SYMBOLS, in_unit
 
 WALL = {"end": "left", "waveform": "harmonic", "frequency": 500.0}
@@ -64,6 +67,48 @@ def test_a_case_with_units_is_the_case_in_si():
     lattice = {"preset": "four-band", "ends": "fixed", "cells": 24}
     moved = Case.from_table({"lattice": lattice, "drive": WALL | {"amplitude": "1 mm"}, "time": {"end": 0.05}})
     assert moved.drive.amplitude == 1e-3
+
+
+def test_ranges_of_keys_that_vary_have_units():
+    """A search varies a key between texts with units, and a frequency response its frequency."""
+    table = {"lattice": {"cells": 20}, "contacts": {"sites": [5, 9], "clearance": 2e-4}}
+    for wanted, values in (({"log": ["0.1 mm", "1 mm"]}, (1e-4, 1e-3)), (["0.1 mm", "0.2 mm"], (1, 2))):
+        search = table | {"optimise": {"variables": {"contacts": {"clearance": wanted}}}}
+        (variable,) = OptimiseCase.from_table(search).variables()
+        assert (variable.low, variable.high) == values
+    # The search begins with the choice that is the case's.
+    assert (variable.choices, variable.start) == ((1e-4, 2e-4), 2)
+
+    for over, varying, fixed, read in (
+        ("frequency", ["150 Hz", "160 Hz"], [1.0], {"range": [300 * math.pi, 320 * math.pi]}),
+        ("amplitude", [1.0, 2.0], ["150 Hz"], {"fixed": [300 * math.pi]}),
+        ("contacts.clearance", ["0.1 mm", "1 mm"], [1.0], {"range": [1e-4, 1e-3]}),
+    ):
+        nfrc = {"source": "force", "over": over, "range": varying, "fixed": fixed}
+        drive = {"waveform": "harmonic", "frequency": 1000.0, "amplitude": 1.0}
+        options = NfrcCase.from_table(table | {"drive": drive, "nfrc": nfrc}).nfrc
+        ((key, values),) = read.items()
+        assert getattr(options, key) == pytest.approx(values, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("family", "values"),
+    [
+        ({"clearance": {"linear": ["700 mm", "0.8 m"], "count": 2}}, [0.7, 0.8]),
+        ({"clearance": ["700 mm", "0.8 m"]}, [0.7, 0.8]),
+        # The exponent is that of the second law alone.
+        ({"law": ["bilinear", "power"]}, ["bilinear", "power"]),
+    ],
+)
+def test_values_of_a_family_are_read_as_those_of_a_sweep(family, values):
+    """Units are read, and each law takes its own of the keys that all members have."""
+    ((key, _),) = family.items()
+    contacts = TWO_MASSES["contacts"] | ({"exponent": 2.0} if key == "law" else {})
+    options = TWO_MASSES["nfrc"] | {"family": {"contacts": family}}
+    curves = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": options}).every_curve()
+    assert [curve.values[f"contacts.{key}"] for curve in curves] == values
+    taken = [getattr(curve.case.contacts, key) for curve in curves]
+    assert taken == values if key == "law" else taken == [[value] for value in values]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Sweeps, which are many cases in one file: the section ``[sweep]`` of a case file, and its members."""
 
-import copy
 import hashlib
 import itertools
 import json
@@ -17,13 +16,11 @@ import tomli_w
 
 from vipetsc.case.case import Case, StudyCase
 from vipetsc.case.case_file import CaseFile
-from vipetsc.case.contacts import keys_of_other_laws
 from vipetsc.case.html import html_table
 from vipetsc.case.reading import Table, put, read_section
 from vipetsc.case.schema import number
-from vipetsc.case.section import CaseError, Problem, Section, described, unit_at
-from vipetsc.case.units import in_unit
-from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
+from vipetsc.case.section import CaseError, Problem, Section, described
+from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, table_with, varied_values
 from vipetsc.plugins import without_folders
 from vipetsc.wording import counted, shortened
 
@@ -34,7 +31,6 @@ MOST_TRIED_SITES = 200_000
 # Ramp, in periods, of a harmonic drive that goes on from the run before: the full force is there at once, as far as a
 # ramp, which must be positive, allows. A sine has grown to 6e-3 of its amplitude by then.
 SHORT_RAMP = 1e-3
-LAW = "contacts.law"
 # A key, and the beginnings of those that it fills in.
 MATRICES = "lattice.cell.matrices"
 OF_MATRICES = tuple(f"lattice.cell.{key}" for key in ("masses", "springs", "grounding"))
@@ -92,13 +88,9 @@ class Sweep(StudyCase):
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
 
-        values: Values = {}
         given = dict(leaves(varying))
-        for key, value in given.items():
-            try:
-                values[key] = values_in(in_unit(value, unit_at(Case.sections(), key, table)))
-            except ValueError as error:
-                problems.append(Problem(f"sweep.{key}", value, str(error)))
+        values, wrong_values = varied_values(given, "sweep", table, Case.sections())
+        problems += wrong_values
         if not given:
             remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
@@ -166,24 +158,8 @@ class Sweep(StudyCase):
 
     def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
         """Return table of the member with that ``index`` on every axis, and the problems of keys that cannot be set."""
-        table = copy.deepcopy(self.table)
-        problems: list[Problem] = []
-        for axis, i in zip(self.axes, index, strict=True):
-            for key, values in axis.items():
-                # A copy, since members must not have one list or table in common.
-                problems += put(table, key, copy.deepcopy(values[i]))
-
-        # Where laws vary, each takes its own of the keys that all members have: a rigid stop has no stiffness.
-        varied = {key for axis in self.axes for key in axis}
-        contacts = table.get("contacts")
-        if LAW in varied and isinstance(contacts, dict):
-            for key in keys_of_other_laws(str(contacts.get("law"))):
-                if f"contacts.{key}" not in varied:
-                    contacts.pop(key, None)
-                each = contacts.get("each")
-                if isinstance(each, dict) and f"contacts.each.{key}" not in varied:
-                    each.pop(key, None)
-        return table, problems
+        pairs = zip(self.axes, index, strict=True)
+        return table_with(self.table, {key: values[i] for axis, i in pairs for key, values in axis.items()})
 
     def member(self, number: int) -> SweepMember:
         """Return the member ``number`` (from 0) in the order of the axes, the last varying fastest."""

@@ -1,14 +1,17 @@
 """Keys that vary in a case file: their values, the axes that they form, and their short names."""
 
+import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from vipetsc.case.contacts import keys_of_other_laws
 from vipetsc.case.disorder import SEED
-from vipetsc.case.reading import LARGEST, Table
-from vipetsc.case.section import Problem
+from vipetsc.case.reading import LARGEST, Table, put
+from vipetsc.case.section import Problem, Section, unit_at
+from vipetsc.case.units import in_unit
 
 # Every rank lists the names of all members: 0.6 s and 70 MB for a million.
 MOST_MEMBERS = 1_000_000
@@ -17,7 +20,9 @@ MOST_MEMBERS = 1_000_000
 DIGITS = 12
 ROUNDINGS = 8
 RANGES = {"log", "linear", "whole"}  # the last one only in searches
+LAW = "contacts.law"
 Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
+Varied = tuple[Values, list[Problem]]
 
 
 def short_names(keys: Sequence[str]) -> dict[str, str]:
@@ -89,6 +94,43 @@ def _without_rounding(value: float, largest: float) -> float:
         return decimal
     # All other values keep their bits, of which the names of members are hashes.
     return value
+
+
+def varied_values(given: Mapping[str, Any], at: str, table: Table, kinds: Mapping[str, type[Section]]) -> Varied:
+    """Return values of the keys that are ``given`` with theirs at the path ``at``, in the keys' units, and problems.
+
+    Keys are those of the ``table`` of a case, whose sections are of these ``kinds``.
+    """
+    values: Values = {}
+    problems: list[Problem] = []
+    for key, value in given.items():
+        try:
+            values[key] = values_in(in_unit(value, unit_at(kinds, key, table)))
+        except ValueError as error:
+            problems.append(Problem(f"{at}.{key}", value, str(error)))
+    return values, problems
+
+
+def table_with(table: Table, chosen: Mapping[str, Any]) -> tuple[Table, list[Problem]]:
+    """Return a copy of the ``table`` of a case with ``chosen`` values of keys, and problems of keys without a place.
+
+    Where laws vary, each takes its own of the keys that all cases have: a rigid stop has no stiffness.
+    """
+    table = copy.deepcopy(table)
+    problems: list[Problem] = []
+    for key, value in chosen.items():
+        # A copy, since cases must not have one list or table in common.
+        problems += put(table, key, copy.deepcopy(value))
+
+    contacts = table.get("contacts")
+    if LAW in chosen and isinstance(contacts, dict):
+        for key in keys_of_other_laws(str(contacts.get("law"))):
+            if f"contacts.{key}" not in chosen:
+                contacts.pop(key, None)
+            each = contacts.get("each")
+            if isinstance(each, dict) and f"contacts.each.{key}" not in chosen:
+                each.pop(key, None)
+    return table, problems
 
 
 def axes_of(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:

@@ -6,9 +6,10 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from vipetsc.case.reading import Table, put
+from vipetsc.case.case import Case
+from vipetsc.case.reading import Table
 from vipetsc.case.section import Problem
-from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
+from vipetsc.case.value_ranges import Values, leaves, short_names, table_with, varied_values
 from vipetsc.wording import distinct
 
 # To read a member takes half a millisecond, but to follow its curve takes seconds to minutes: a thousand are a day.
@@ -49,16 +50,9 @@ def family_of(table: Table) -> tuple[Family, list[Problem]]:
         remedy = "give keys of the case with their values, as in: [nfrc.family] contacts.clearance = [1e-4, 2e-4]"
         return Family([], table), [Problem("nfrc.family", section, remedy)]
 
-    values: Values = {}
-    problems: list[Problem] = []
-    for key, value in given.items():
-        if key.partition(".")[0] not in SECTIONS:
-            problems.append(Problem(f"nfrc.family.{key}", value, f"only keys of {', '.join(SECTIONS)} can vary"))
-            continue
-        try:
-            values[key] = values_in(value)
-        except ValueError as error:
-            problems.append(Problem(f"nfrc.family.{key}", value, str(error)))
+    values, problems = varied_values(given, "nfrc.family", table, Case.sections())
+    for key in [key for key in given if key.partition(".")[0] not in SECTIONS]:
+        problems.append(Problem(f"nfrc.family.{key}", given[key], f"only keys of {', '.join(SECTIONS)} can vary"))
 
     # One more than is allowed, rather than all: the product of a few ranges may exceed the memory.
     combinations = list(itertools.islice(itertools.product(*values.values()), MOST_MEMBERS + 1))
@@ -72,13 +66,11 @@ def family_of(table: Table) -> tuple[Family, list[Problem]]:
     expanded["nfrc"]["family"] = {key: list(of_key) for key, of_key in values.items()}
     names = [_texts(of_key) for of_key in values.values()]
     members = []
+    alone = table | {"nfrc": {key: value for key, value in table["nfrc"].items() if key != "family"}}
     for texts, combination in zip(itertools.product(*names), combinations, strict=True):
-        member = copy.deepcopy(table)
-        del member["nfrc"]["family"]
         chosen = dict(zip(values, combination, strict=True))
-        for key, value in chosen.items():
-            # A copy, since members must not have one list or table in common.
-            problems += put(member, key, copy.deepcopy(value))
+        member, wrong = table_with(alone, chosen)
+        problems += wrong
         members.append(FamilyMember(name="-".join(_named(values, texts)), values=chosen, table=member))
     return Family(members=members, table=expanded), problems
 

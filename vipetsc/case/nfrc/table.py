@@ -1,12 +1,14 @@
 """The section ``[nfrc]``."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from vipetsc.case.case import Case
 from vipetsc.case.nfrc.varied_key import is_key
 from vipetsc.case.schema import Finite, Positive, Range, once
-from vipetsc.case.section import Section, described
+from vipetsc.case.section import Section, described, unit_at
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
 
@@ -107,6 +109,16 @@ class NfrcTable(Section):
     largest_step: Positive = described("largest arclength step", 0.1)
     tolerance: Positive = described("largest norm of the residual over the clearance", 1e-11)
     max_newton: int = described("largest number of Newton steps", 10, ge=1)
+
+    @classmethod
+    def unit_of(cls, key: str, table: Mapping[str, Any]) -> str:
+        """Return the unit of a ``key``; frequencies that vary, or are fixed, are in rad/s."""
+        over = table.get("over", "amplitude")
+        if key == "range" and is_key(over):
+            return unit_at(Case.sections(), over, {})
+        if (key, over) in (("range", "frequency"), ("fixed", "amplitude")):
+            return "rad/s"
+        return super().unit_of(key, table)
 
     @property
     def varies_key(self) -> bool:

@@ -15,6 +15,8 @@ from vipetsc.case.quantities import OF_PRESET, table_of
 from vipetsc.case.reading import LARGEST, Table, put, value_at
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import number
+from vipetsc.case.section import unit_at
+from vipetsc.case.units import in_unit
 from vipetsc.case.value_ranges import RANGES
 
 IN_ROWS = ("contacts.", "lattice.profiles.")  # keys with lists over the sites or the cells
@@ -171,6 +173,7 @@ def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
 
 def row_of(key: str, given: Any, table: Table) -> VariableRow:
     """Return the variables of the ``key`` of a case, from its range or list; raises ValueError with the remedy."""
+    given = in_unit(given, unit_at(Case.sections(), key, table))
     if isinstance(given, list):
         if len(given) < 2:
             raise ValueError("give two values or more")
