@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
+from vipetsc.lattice.compliance.by_elimination import DirectCompliance
+from vipetsc.lattice.compliance.by_modes import ModalCompliance
 from vipetsc.lattice.compliance.by_waves import WaveCompliance
 from vipetsc.lattice.compliance.dense import DenseCompliance
 from vipetsc.lattice.sites import sites_at
@@ -160,12 +162,24 @@ def test_the_flux_is_energy_times_group_velocity():
         compliance.incident(2700.0, 1)
 
 
+@pytest.mark.parametrize("damping", [0.0, 0.4])
+def test_a_force_on_one_mass_of_a_free_lattice_moves_its_pairs_as_by_elimination(damping):
+    """What all modes leave of the motion as a rigid body does not move a pair, however slow it is."""
+    cell = CELLS["tense"]
+    cell = replace(cell, springs=tuple(replace(spring, damping=damping) for spring in cell.springs))
+    chain = chain_of(cell, 6, (1, 4), "free")
+    omega = np.array([0.1, 30.0, 700.0, 5000.0])
+    found = ModalCompliance(chain, points=((2, 0), (5, 3))).response(omega)
+    expected = DirectCompliance(chain, points=((2, 0), (5, 3))).response(omega)
+    assert relative_error(found, expected) < 1e-7
+
+
 def test_a_long_lattice_costs_what_a_short_one_does():
     """The number of unknowns does not grow with the cells; with losses a long lattice is as an infinite one."""
     cell = CELLS["four-band"]
     long = chain_of(cell, 1_000_000, (500_000,))
-    assert WaveCompliance(chain_of(cell, 40, (20,))).cells == [0, 20, 39]
-    assert WaveCompliance(long).cells == [0, 500_000, 999_999]
+    assert WaveCompliance(chain_of(cell, 40, (20,))).loaded_cells == [0, 20, 39]
+    assert WaveCompliance(long).loaded_cells == [0, 500_000, 999_999]
     # A wave of this frequency, at 429 cells/s, decays by a factor e within 4300 cells.
     omega = DRIVEN - 0.1j
     assert relative_error(WaveCompliance(long).at(omega), WaveCompliance(long, infinite=True).at(omega)) < 1e-11

@@ -49,7 +49,7 @@ class ChainCompliance(ABC):
         return contacts(self.chain).mass_pairs()
 
     @property
-    def _loaded_cells(self) -> list[int]:
+    def loaded_cells(self) -> list[int]:
         """The cells whose masses are rows of ``loads``."""
         return list(range(self.chain.cells))
 
@@ -58,7 +58,7 @@ class ChainCompliance(ABC):
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
         dofs = self.chain.cell.dofs
         of_points = [(WALL, cell * dofs + mass) for cell, mass in self.points]
-        return incidence([*self._elements, *of_points], masses_of(self._loaded_cells, dofs))
+        return incidence([*self._elements, *of_points], masses_of(self.loaded_cells, dofs))
 
     def signed(self, forces: ArrayLike) -> np.ndarray:
         """Return factors (pairs and points,) of ``loads`` for ``forces`` in N.

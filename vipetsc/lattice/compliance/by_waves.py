@@ -91,7 +91,7 @@ class WaveCompliance(ChainCompliance):
         return pass_bands(self.chain.cell)[-1].high
 
     @cached_property
-    def cells(self) -> list[int]:
+    def loaded_cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
         joined = [mass for pair in self._elements for mass in pair if mass != WALL]
         loaded = {*(mass // self.chain.cell.dofs for mass in joined), *(cell for cell, _ in self.points)}
@@ -109,10 +109,6 @@ class WaveCompliance(ChainCompliance):
     @property
     def _elements(self) -> list[tuple[int, int]]:
         return contacts(self.chain, self._topology).mass_pairs()
-
-    @property
-    def _loaded_cells(self) -> list[int]:
-        return self.cells
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Return the motions of ``ChainCompliance.response``."""
@@ -188,7 +184,7 @@ class WaveCompliance(ChainCompliance):
         solution = self._solve(np.array([omega], complex), self._load_of(np.asarray(forces, complex)))
         waves = solution.waves
         half = waves.factor.shape[1] // 2
-        size = len(self.cells) * self.chain.cell.dofs
+        size = len(self.loaded_cells) * self.chain.cell.dofs
 
         # The first stretch goes on to lower cells, the last one to higher ones.
         u = solution.unknowns[0, :, 0]
@@ -208,11 +204,11 @@ class WaveCompliance(ChainCompliance):
     def _transmitted(self, wave: IncidentWave, amplitude: complex, waves: BlochWaves) -> complex:
         """Return amplitude beyond the last loaded cell, scaled as ``waves``, of a ``wave`` of ``amplitude`` in m."""
         channel = wave.channel
-        steps = self.cells[-1] + 1 - wave.origin
+        steps = self.loaded_cells[-1] + 1 - wave.origin
         if wave.direction < 0:
             # Waves to lower cells come after those to higher ones.
             channel += waves.factor.shape[1] // 2
-            steps = self.cells[0] - wave.origin
+            steps = self.loaded_cells[0] - wave.origin
         state = waves.state[0, :, channel]
         shape = cell_between(self.chain.cell, waves, state, wave.factor * state)
         scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
@@ -221,7 +217,7 @@ class WaveCompliance(ChainCompliance):
     @cached_property
     def _stretches(self) -> list[Stretch]:
         """The stretches without loads, from lower to higher cells; a ring's last one leads back to the first."""
-        cells = self.cells
+        cells = self.loaded_cells
         last = len(cells) - 1
         stretches = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
         if self.infinite:
@@ -250,11 +246,11 @@ class WaveCompliance(ChainCompliance):
         coupling = blocks.out @ blocks.into.T
         half = blocks.out.shape[1]
         stretches = self._stretches
-        size = len(self.cells) * d
+        size = len(self.loaded_cells) * d
         total = size + sum(stretch.unknowns(half) for stretch in stretches)
 
         matrix = np.zeros((len(omega), total, total), complex)
-        at = [slice(i * d, i * d + d) for i in range(len(self.cells))]
+        at = [slice(i * d, i * d + d) for i in range(len(self.loaded_cells))]
         dynamic = blocks.stiffness - omega[:, None, None] ** 2 * np.diag(chain.cell.masses)
         for cell in at:
             matrix[:, cell, cell] += dynamic
@@ -295,7 +291,7 @@ class WaveCompliance(ChainCompliance):
 
     def _displacement(self, cell: int, solution: _Solution) -> np.ndarray:
         """Return the displacement (dofs,) of a ``cell`` under the first load, at the first frequency."""
-        cells = self.cells
+        cells = self.loaded_cells
         d = self.chain.cell.dofs
         unknowns = solution.unknowns[0, :, 0]
         if cell in cells:
@@ -319,7 +315,7 @@ class WaveCompliance(ChainCompliance):
 
         In a stretch without a beginning the last cell has 0, those before it negative numbers.
         """
-        cells = self.cells
+        cells = self.loaded_cells
         if stretch.left is None:
             if cell >= cells[0]:
                 return None
