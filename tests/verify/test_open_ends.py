@@ -462,3 +462,13 @@ def test_bands_of_a_damped_cell_show_its_decay():
 
     # An undamped cell has no third panel.
     assert len(runs.bands(four_band(), 1000.0).axes) == 2
+
+
+@pytest.mark.parametrize(("bound", "cells", "loss"), [(0.1, 10, 8), (1e-4, 10, 10), (1e-5, 10, 13), (1e-7, 20, 17)])
+def test_an_end_is_the_shortest_and_weakest_that_takes_enough(bound, cells, loss):
+    """Its dashpots leave exp(-loss) of the fastest wave's energy: 2 v loss = strength times length, v in cells/s."""
+    case = Case.from_table({}, [f"lattice.absorbing.reflection={bound}"])
+    fastest = max(wave[2] for wave in waves_at(case.lattice.unit_cell(), case.drive.frequency))
+    end = case.lattice.absorbing
+    assert end.cells == cells
+    assert end.strength * end.cells == pytest.approx(2 * fastest * loss, rel=1e-12)
