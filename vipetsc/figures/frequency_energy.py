@@ -269,7 +269,8 @@ def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
         number = orbits["orbits/number"].values[k]
         nearest = int(np.abs(regular["number"].values - number).argmin())
         region = REGIONS[int(regular["region"][nearest])]
-        axes.set_title(f"{region}\n{float(f'{energy:.2g}'):g} J", loc="center", fontsize=7)
+        rounded = float(f"{energy:.2g}")
+        axes.set_title(f"{region}\n{style.with_prefix(rounded, 'J')}", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
     grid[0].set_ylabel(r"$\dot u$/max")
     heading = f"({tag}) Orbits"
