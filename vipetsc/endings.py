@@ -28,6 +28,10 @@ class Ending(Enum):
         "ends at an equilibrium: at E = {energy:.9g} J, f = {frequency:.6g} Hz the motion begins where the forces "
         "almost balance"
     )
+    STOP_AT_REST = (
+        "ends at a stop: at E = {energy:.9g} J, f = {frequency:.6g} Hz the motion comes to rest on a rigid stop, on "
+        "the side where it has struck none; nnm follows no motion beyond it"
+    )
     # Of branches that have met themselves or another one.
     CLOSED = "closed: it has come back to its first point"
     CLOSED_ON_ITSELF = "closed on itself: {where}"

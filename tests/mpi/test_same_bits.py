@@ -153,6 +153,13 @@ def sharing_masses(engine: str) -> Case:
     return joined(engine, [11, 12, 13], 0.3, "periodic", time={"end": 0.03})
 
 
+def squeezed(engine: str) -> Case:
+    """Return a mass with two stops without clearance, one of them to a mass of the other rank."""
+    each = {"pair": [[1, 1], [0, 1]], "next_cell": [True, False], "side": ["minus", "plus"]}
+    contacts = {"clearance": 0.0, "pair": None, "next_cell": None, "side": None, "each": each}
+    return joined(engine, [12, 13], 0.7, contacts=contacts, time={"end": 0.03})
+
+
 def exponent(engine: str) -> Case:
     """Return a run with a Lyapunov exponent, whose companion lies on all ranks too."""
     time = EXPONENT_OF_CHAIN["time"] | {"engine": engine, "end": 0.2}
@@ -180,6 +187,7 @@ ACROSS = {
     wide_band: ("propagator",),
     sticking: BOTH,
     sharing_masses: ("propagator",),
+    squeezed: ("propagator",),
     exponent: BOTH,
     users_law: BOTH,
 }

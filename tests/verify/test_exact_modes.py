@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -654,6 +655,13 @@ def test_one_mass_has_the_period_of_its_formula(side):
     assert grazing.energy == pytest.approx(2.0, rel=1e-9)
 
 
+def test_a_branch_ends_where_its_rest_comes_to_the_stop_of_the_other_side():
+    """With stops 1 m and 1.4 m away that is at E = k (1.4 m)^2/2, and one period is that of a stop on one side."""
+    (branch,) = followed(one_mass(clearance_minus=1.4), Ending.STOP_AT_REST)
+    assert branch.points[-1].energy == pytest.approx(2.0 * 1.4**2, rel=1e-8)
+    assert branch.points[-1].period == pytest.approx(np.arcsin(1 / 1.4) + np.pi / 2, rel=1e-8)
+
+
 def two_masses(*stops: ContactPair) -> System:
     """Two masses on three springs, with rigid ``stops``."""
     return System.assemble([1.0, 2.0], [(None, 0, 3.0), (0, 1, 2.0), (None, 1, 1.0)], stops)
@@ -772,6 +780,42 @@ def test_two_stops_that_are_touched_at_one_instant_make_one_corner():
     for point in struck:
         amplitude = np.sqrt(point.energy / 6.0)
         assert point.period == pytest.approx(4 * np.arcsin(1 / amplitude) / np.sqrt(6.0), rel=1e-10, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("own", "side", "mode"), [(CHAIN, "both", 3), (CHAIN, "plus", 1), (CHAIN, "plus", 2), (TWINS, "both", 2)]
+)
+def test_a_branch_leaves_its_corner_by_tangent_and_bend(own, side, mode):
+    """Orbits that strike at small speeds s lie at x + s t + s^2 b: first and second differences converge with s."""
+    nnm = {"system": "own", "modes": [mode], "points": 105, "own": own}
+    case = NnmCase.from_table({"name": "corner", "contacts": {"law": "rigid", "side": side}, "nnm": nnm})
+    shooting = ShootingMethod(case).shooting
+    (branch,) = follow_all(case, None, MPI.COMM_SELF)
+    point = next(point for point in branch.points if point.kind == "grazing" and point.episodes == 0)
+    touch = np.append(point.x, point.period)
+    corner = shooting.turned_at_corner(point)
+    frame = shooting.frame(corner.point, "relative")
+    length = np.linalg.norm(frame.direction(corner.point))
+    bend = frame.direction(replace(corner.point, tangent=corner.bend))
+
+    errors = []
+    along = []
+    squares = []
+    for step in (0.02, 0.01, 0.005):
+        guess = frame.xi + step * frame.tangent + (step / length) ** 2 * bend
+        orbit = frame.measures(frame.correct(guess, step), frame.tangent)
+        arc = shooting.arc(orbit.x, orbit.period)
+        time, contact = arc.events[0, :2]
+        before = shooting.flow.arc(arc.start, time * (1 - 1e-9), orbit.period).end
+        speed = abs(shooting.system.contact_rows[int(contact)] @ before[shooting.system.dofs :])
+        moved = np.append(orbit.x, orbit.period) - touch
+        errors.append(np.linalg.norm(moved / speed - corner.point.tangent))
+        along.append(moved @ corner.bend / (corner.bend @ corner.bend))
+        squares.append(speed**2)
+    assert errors[-1] < 0.03 * np.linalg.norm(corner.point.tangent)
+    np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 2.0, rtol=0.06)
+    # The corner itself is known to the branch's smallest step, which differences of two orbits do not have.
+    np.testing.assert_allclose(np.diff(along) / np.diff(squares), 1.0, rtol=0.02)
 
 
 def test_a_stop_that_yields_makes_no_corner():

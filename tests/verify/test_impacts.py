@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -20,6 +22,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.store import RunMemory
 
+EXAMPLES = Path(vipetsc.__file__).parent / "examples"
 ENGINES = ["ts", "propagator"]
 GRAVITY = 2.0  # m/s^2
 RAMP = 0.1  # s
@@ -204,6 +207,48 @@ def test_masses_that_stick_go_on_together(engine):
     np.testing.assert_allclose(log["loss"].sum(), 0.4, rtol=1e-9)
 
 
+def squeezed(engine: str, restitution: list[float], stops: dict[str, Any]) -> Case:
+    """Nine free masses on springs; a mass away from the drive has stops without clearance on either side."""
+    spring = {"start": 1, "end": 1, "stiffness": 7e4, "next_cell": True}
+    table = {
+        "lattice": {"cells": 9, "ends": "free", "cell": {"masses": [0.1], "springs": [spring]}},
+        "contacts": {"law": "rigid", "clearance": 0.0, "sites": stops["sites"]}
+        | {"each": {"restitution": restitution} | {key: stops[key] for key in ("pair", "next_cell", "side")}},
+        "drive": {"amplitude": 200.0, "frequency": 550.0, "cycles": 4, "cell": 5},
+        "time": {"end": 0.06, "sample_interval": 5e-4, "engine": engine},
+    }
+    return Case.from_table(table)
+
+
+BESIDE = {"sites": [1, 2], "pair": [[1, 1], [0, 1]], "next_cell": [True, False], "side": ["minus", "plus"]}
+THREE = {
+    "sites": [1, 2, 2],
+    "pair": [[1, 1], [0, 1], [1, 1]],
+    "next_cell": [True, False, True],
+    "side": ["minus", "plus", "minus"],
+}
+
+
+@pytest.mark.parametrize(
+    ("stops", "restitution"),
+    [(BESIDE, [0.7, 0.7]), (BESIDE, [1.0, 0.0]), (BESIDE, [0.3, 0.9]), (THREE, [0.7, 0.3, 0.5])],
+)
+def test_masses_between_stops_without_clearance_wait_for_their_wave(stops, restitution):
+    """The front of a wave, far below what is resolved, makes no endless impacts; both engines have one motion."""
+    motions = []
+    for engine in ENGINES:
+        log, data = impacts(squeezed(engine, restitution, stops))
+        u = data["displacement"].values[:, :, 0]
+        scale = np.abs(u).max()
+        for cell, joined_cells, side in zip(stops["sites"], stops["next_cell"], stops["side"], strict=True):
+            w = u[:, cell] - u[:, cell - 1] if joined_cells else u[:, cell - 1]
+            sign = 1 if side == "plus" else -1
+            assert (sign * w).max() <= 1e-9 * scale
+        assert len(log["site"]) < 200
+        motions.append(u / scale)
+    np.testing.assert_allclose(*motions, rtol=0, atol=1e-9)
+
+
 PUSH = {"waveform": "step", "ramp": RAMP, "amplitude": 3.0, "cell": 1}
 LOOP = {
     "lattice": {"cells": 1, "cell": {"masses": [1.0, 2.0, 3.0], "springs": [], "contact": [1, 2]}},
@@ -325,6 +370,18 @@ def test_a_sweep_has_rigid_stops_beside_others():
     assert [law.law for law in laws] == ["rigid", "bilinear", "power"]
     assert [law.each and law.each.stiffness for law in laws] == [None, [1e9], [1e9]]
     assert [law.exponent for law in laws] == [None, None, 1.2]
+
+
+def test_a_sweep_leaves_out_the_parameters_of_a_registered_law():
+    """A shipped law takes none of them, a rigid stop no stiffness either."""
+    table = tomllib.loads((EXAMPLES / "own-law.toml").read_text())
+    table["plugins"]["modules"] = [str(EXAMPLES / "own_law.py")]
+    table["sweep"] = {"contacts": {"law": ["rubber-stop", "bilinear", "rigid"]}}
+    members = list(Sweep.from_table(table).members())
+    assert not [problem for member in members for problem in member.problems]
+    contacts = [member.case.contacts for member in members]
+    assert [law.parameters for law in contacts] == [{"b": 1e7}, None, None]
+    assert [law.stiffness for law in contacts] == [2e5, 2e5, None]
 
 
 def test_a_motion_beyond_the_stop_is_refused():

@@ -86,6 +86,8 @@ def keys_of_other_laws(law: str) -> list[str]:
     keys = [key for key, parameter in PARAMETERS.items() if parameter.law != law]
     if law == RIGID:
         keys += YIELDING
+    if registered_law(law) is None:
+        keys.append("parameters")
     return keys
 
 

@@ -280,6 +280,10 @@ def first_change(
                 c[k] = form.factor * b[k] + form.offset
             near = form.tolerance
             if contacts[i].rigid:
+                # What stays within the tolerance strikes nothing: the front of a wave has roots at all magnitudes, on
+                # which impacts that are no motion would follow one another without an end.
+                if max(-c.min(), c.max()) <= near:
+                    continue
                 # A blow on another site may have left it a little beyond its stop: it lands where it comes back there.
                 near = max(near, c[0])
             position = first_upcrossing_after_start(c, near)

@@ -379,13 +379,16 @@ def _strike(
 ) -> None:
     """Strike the rigid site ``i`` at its stop on a ``side``: an impulse, an episode, and a new mode.
 
-    It flies on, or sticks where its flight would be too short, and in any case if it ``rests``.
+    It flies on, or sticks where its flight would be too short or too low, and in any case if it ``rests``.
     """
     site = contacts[i]
     speed = side * motion[i, 1]
     pressing = side * motion[i, 2]
     rebound = site.restitution * speed
-    sticks = rests or (pressing >= 0.0 and 2.0 * rebound <= site.flight * pressing)
+    # Its next flight is too short, or does not leave the tolerance of its landing.
+    is_brief = 2.0 * rebound <= site.flight * pressing
+    is_low = 0.5 * rebound * rebound <= site.tolerance * pressing
+    sticks = rests or (pressing >= 0.0 and (is_brief or is_low))
     if not sticks and pressing < 0.0 and 0.5 * speed * speed <= -pressing * site.tolerance:
         # It would turn by itself within the tolerance of its landing: no impact, and no loss.
         tracks.sites[i].counts.grazes += 1

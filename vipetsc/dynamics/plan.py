@@ -70,7 +70,9 @@ def check_ranks(plan: RunPlan, ranks: int) -> None:
         mass = int(plan.model.shared_masses[0])
         cell = mass // plan.model.chain.cell.dofs + 1
         reason = f"rigid stops that share a mass, as in cell {cell}: blows pass from mass to mass at one instant, which"
-        remedy = f"{reason} {TS} follows on one rank alone; start it without mpirun, or use the {PROPAGATOR}"
+        remedy = f"{reason} {TS} follows on one rank alone; start it without mpirun"
+        if not plan.case.petsc_options and refusal(plan.model) is None:
+            remedy = f"{remedy}, or use the {PROPAGATOR}"
         raise CaseError([Problem("contacts.sites", None, remedy)])
 
 

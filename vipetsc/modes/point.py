@@ -102,6 +102,10 @@ class OrbitProblem(PeriodicProblem[Point]):
         """
         return np.inf
 
+    def rests_on_stop(self, point: Point) -> bool:
+        """Return whether an orbit begins at rest on a rigid stop, as far as steps resolve it."""
+        return False
+
     def has_corner(self, before: Point, after: Point) -> bool:
         """Return whether the branch has a corner between two points, where no step is short enough for the guards."""
         return False

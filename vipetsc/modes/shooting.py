@@ -231,6 +231,8 @@ DEGENERATE = 1e-12
 AHEAD = 0.01
 # Rows of touches that differ by less than this are those of one contact, of which samples are near each touch.
 ALIKE = 0.01
+# A motion whose rest is within this fraction of the clearance of a rigid stop is at it. It is the last of its branch.
+RESTS = 1e-9
 # Samples of an arc in which contacts that graze are looked for: a parabola through three of them has to err by less
 # than ``TOUCH``.
 SAMPLES = 2000
@@ -562,7 +564,8 @@ class Shooting(OrbitProblem):
 
         Let the speed there be s. To first order the orbit changes by a jump of the velocity, -2 mu s M^-1 h^T at the
         instant of the touch, while the largest w, without the jump, exceeds D by s^2/(2 |w''|): H' (dx, dT) and what
-        the jump makes of H add up to 0, and dw = 0. To second order x changes along the gradients of w.
+        the jump makes of H add up to 0, and dw = 0. To second order x changes along the gradients of w: where the first
+        order changes w' at the touch by dw', the largest w grows by dw'^2/(2 |w''|) in any case.
         """
         arc = self.arc(point.x, point.period)
         u = self._samples(arc, point.period)
@@ -573,25 +576,42 @@ class Shooting(OrbitProblem):
         n = self.system.dofs
         jump = np.zeros(n)
         rises = []
-        bends = []
+        rates = []
+        stops = []
         # Several touches at one speed, by a symmetry, count each.
         for number, place in touches:
             row = self.system.contact_rows[number]
             moved = row / self.system.masses
             side = np.sign(u[place] @ row)
-            # A little before the touch, so that the arc to it strikes nothing.
-            time = (place - AHEAD) * arc.duration / SAMPLES
+            # A little before the touch, so that the arc to it strikes nothing; first by the sample, then by w' there.
+            interval = arc.duration / SAMPLES
+            ahead = AHEAD * interval
+            time = place * interval - ahead
+            near = self.flow.arc(arc.start, time, point.period).end
+            stop = abs(moved @ self.system.forces(near[:n]))
+            time += side * (row @ near[n:]) / stop - ahead
             before = self.flow.arc(arc.start, time, point.period).sensitivity
             rest = np.linalg.solve(before.T, arc.sensitivity[self.zero].T).T
             jump += rest[:, n:] @ (-2 * side * moved / (row @ moved))
-            rises.append(side * row @ before[:n, self.free])
-            bends.append(0.5 / abs(moved @ self.system.forces(u[place])))
+            rate = side * row @ before[n:, self.free]
+            rises.append(side * row @ before[:n, self.free] + ahead * rate)
+            rates.append(rate)
+            stops.append(stop)
 
         # By least squares, since the touches of one contact have equal rows. The shortest bend has all speeds alike.
         matrix = np.vstack([self.jacobian(arc), np.pad(rises, [(0, 0), (0, 1)])])
         tangent = np.linalg.lstsq(matrix, np.append(-jump, np.zeros(len(rises))), rcond=None)[0]
-        bend = np.linalg.lstsq(np.array(rises), np.array(bends), rcond=ALIKE)[0]
+        bends = (1.0 - (np.array(rates) @ tangent[:-1]) ** 2) / (2.0 * np.array(stops))
+        bend = np.linalg.lstsq(np.array(rises), bends, rcond=ALIKE)[0]
         return Corner(replace(point, tangent=tangent), np.append(bend, 0.0))
+
+    def rests_on_stop(self, point: Point) -> bool:
+        """Return whether an orbit begins at rest on a rigid stop, as far as steps resolve it."""
+        if not (self.map.starts_at_rest and self.system.has_rigid_stops):
+            return False
+        w = self.system.contact_rows @ point.x
+        clearances = self.system.clearances_at(w)
+        return bool((self.system.is_rigid & (np.abs(w) >= (1 - RESTS) * clearances)).any())
 
     def has_corner(self, before: Point, after: Point) -> bool:
         """Return whether a rigid stop is first struck, or no longer, between two points."""

@@ -60,16 +60,19 @@ def curvature(series: np.ndarray, s: float) -> float:
 
 
 @kernel
-def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, length: float) -> float:
+def _onset_on_side(series: np.ndarray, site: Any, side: int, change: float, curvature: float, length: float) -> float:
     """Return the first s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
 
-    ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
-    meets the clearance nothing can have happened.
+    ``change`` in m bounds how far w goes from its start over the length. ``curvature`` bounds |w''| there, so that a
+    parabola bounds w towards this side: up to where that meets the clearance nothing can have happened.
     """
     tolerance = site.tolerance
     clearance = gap_of(site, side)
     # No stop on this side.
     if clearance == np.inf:
+        return 2.0
+    # What stays within the tolerance strikes no rigid stop (``contact.changes.first_change``).
+    if site.rigid and abs(side * series[0] - clearance) + change <= tolerance:
         return 2.0
 
     s = 0.0
@@ -118,6 +121,6 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
     if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
 
-    plus = _onset_on_side(series, site, 1, curvature, length)
-    minus = _onset_on_side(series, site, -1, curvature, length)
+    plus = _onset_on_side(series, site, 1, bound - abs(series[0]), curvature, length)
+    minus = _onset_on_side(series, site, -1, bound - abs(series[0]), curvature, length)
     return min(plus, minus)

@@ -263,6 +263,8 @@ class GuardedSteps:
         """Return the point itself, if it has left the range of energies or frequencies, or is almost an equilibrium."""
         if self.problem.acceleration(point) < NEAR_EQUILIBRIUM:
             return point, Ending.EQUILIBRIUM.with_numbers(energy=point.energy, frequency=point.frequency)
+        if self.problem.rests_on_stop(point):
+            return point, Ending.STOP_AT_REST.with_numbers(energy=point.energy, frequency=point.frequency)
         low, high = self.control.energy
         # The first motion has the energy asked for by its linear mode alone: springs and pressed contacts that are not
         # linear change it. A branch may therefore begin outside the range and come into it.
@@ -291,10 +293,13 @@ class GuardedSteps:
         """Return a sentence on contacts that graze in the orbit of a ``point``, and on keys that help, or ""."""
         try:
             numbers = self.problem.grazing(point)
+            corner = self.problem.turned_at_corner(point)
         except FlowError:
             return ""
         if not numbers:
             return ""
+        if corner is not None:
+            return f"rigid stop {numbers[0]} is touched there, and no orbit was found beyond that corner; "
         graze = f"contact {numbers[0]} grazes"
         if len(numbers) > 1:
             graze = f"contacts {', '.join(map(str, numbers))} graze"
