@@ -69,7 +69,7 @@ def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
         ({"sensors": [SENSOR | {"cell": 7}]}, "sensors[1].cell", "the lattice has the cells 1 to 6"),
         ({"sensors": [SENSOR | {"mass": 5}]}, "sensors[1].mass", "a cell has the masses 1 to 4"),
         ({"sensors": [SENSOR | {"column": "w"}]}, "sensors[1].column", "no column of that name; there are t, v"),
-        ({"sensors": [SENSOR | {"quantity": "force"}]}, "sensors[1].cell", "give drive in place of cell"),
+        ({"sensors": [SENSOR | {"quantity": "force"}]}, "sensors[1].cell", "use drive in place of cell"),
         ({"rate": 1e3}, "time", "one of both"),
         ({"begin": 0.005, "end": 0.01}, "end", "leaves 6 samples"),
         ({"initial": {"kind": "velocity", "cell": 9, "velocity": 1.0}}, "initial.cell", "outside the lattice"),

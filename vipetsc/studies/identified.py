@@ -441,8 +441,9 @@ def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:
 def summary_of(data: xr.Dataset) -> str:
     """Return a table of the results, with a line for every parameter, and the warnings."""
     lines = [
-        f"{data.sizes['parameter']} parameters from {data.sizes['datum']} values of {data.sizes['channel']} channels;"
-        f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys"
+        f"{counted(data.sizes['parameter'], 'parameter')} from {counted(data.sizes['datum'], 'value')} of"
+        f" {counted(data.sizes['channel'], 'channel')};"
+        f" {counted(data.sizes['start'], 'start')}, {counted(int(data['starts/valley'].max()), 'valley')}"
     ]
     lines += parameter_lines(data, IdentifyCase.of(data).options.confidence)
     lines += [_channel_line(data.isel(channel=row)) for row in range(data.sizes["channel"])]

@@ -18,6 +18,7 @@ from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated
 from vipetsc.studies.designs import OptimumSearch
 from vipetsc.studies.sampler import front
+from vipetsc.wording import counted
 
 LAYOUT = {
     "design": ("design", "1", "number of a design; 0 is the initial case"),
@@ -250,7 +251,9 @@ def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
     unit = plan.amplitude_unit
     reasons = [reason for reason in data["reason"].values if reason]
     counts = [f"{data.attrs[name]} {text}" for name, text in COUNTED.items() if name in data.attrs]
-    lines = [f"{data.sizes['design']} designs, {', '.join(counts)}; {len(reasons)} designs failed"]
+    lines = [
+        f"{counted(data.sizes['design'], 'design')}, {', '.join(counts)}; {counted(len(reasons), 'design')} failed"
+    ]
     if reasons:
         lines.append(f"  such as: {reasons[0]}")
     lines += [f"  {number}: {objective.describe(unit)}" for number, objective in enumerate(plan.options.objective, 1)]

@@ -22,6 +22,7 @@ from vipetsc.parallel import StoppedError, StopRequest, StudyError, on_every_ran
 from vipetsc.progress import Progress
 from vipetsc.sources import source_key
 from vipetsc.studies.pool import TaskPool
+from vipetsc.wording import counted
 
 Key = str | float | tuple[str, float] | tuple[str, float, int]
 RUN = "run"  # the kind of a record, where a study has one kind
@@ -139,7 +140,9 @@ class RecordedRuns:
 
         self.compute(keys, work, what=what, progress=progress, fail=None if allow_failures else fail)
         if self.pool.stopped:
-            raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command continues")
+            raise StoppedError(
+                f"stopped on request with {counted(len(self.records), 'run')}; the same command continues"
+            )
 
         # Every rank has to raise: one that went on alone would wait for the others for ever.
         reasons = [reason for from_rank in self.comm.allgather(failed) for reason in from_rank]

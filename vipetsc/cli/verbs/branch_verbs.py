@@ -189,7 +189,7 @@ def branch_table(branch: "Branch") -> str:
     from vipetsc.modes.branches.regions import slope_laws, tongues
 
     regular = branch.regular()
-    lines = [f"{branch.name}: {len(regular)} points; {branch.ended.sentence}"]
+    lines = [f"{branch.name}: {counted(len(regular), 'point')}; {branch.ended.sentence}"]
     if regular:
         energy = branch.column("energy")
         frequency = branch.column("frequency")
@@ -207,7 +207,9 @@ def branch_table(branch: "Branch") -> str:
 
     passed = tongues(branch)
     if passed:
-        lines.append(f"  {len(passed)} tongues of internal resonances: {', '.join(f'{k}:1' for k in passed)}")
+        lines.append(
+            f"  {counted(len(passed), 'tongue')} of internal resonances: {', '.join(f'{k}:1' for k in passed)}"
+        )
     for region, law in slope_laws(branch).items():
         lines.append(
             f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"

@@ -47,7 +47,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
     if options.amplitudes:
         low = min(options.amplitudes)
         high = max(options.amplitudes)
-        amplitudes = f"{len(options.amplitudes)} amplitudes, {low:g} to {high:g} {amplitude_unit(case)}"
+        amplitudes = f"{counted(len(options.amplitudes), 'amplitude')}, {low:g} to {high:g} {amplitude_unit(case)}"
     else:
         amplitudes = f"{options.count} amplitudes, from the first contact to {options.span:g} times its amplitude"
 
