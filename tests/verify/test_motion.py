@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 from tests.conftest import run_of, simulated, with_sections
+from tests.zoo_by_scipy import lattice_by_scipy
 from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.waveforms import waveform_of
 from vipetsc.dynamics import simulate
@@ -516,8 +517,6 @@ def test_a_mass_that_creeps_onto_a_stop_comes_to_rest_on_it(cells, coupling, gro
 CELLS = 12
 MASSES = (4e-3, 2e-3)
 STIFFNESS = (1e4, 5e3)
-# Quadratic and cubic coefficients by the spring's cell and number: one in a cell, one between cells, one to a wall.
-TERMS = {(6, 2): (3e6, 4e9), (9, 1): (-2e6, 1e10), (CELLS, 1): (2e6, 5e9)}
 SPRINGS = [
     {"start": 1, "end": 1, "stiffness": STIFFNESS[0], "next_cell": True},
     {"start": 1, "end": 2, "stiffness": STIFFNESS[1]},
@@ -550,39 +549,18 @@ def changed(*, lattice: dict[str, Any] | None = None, **sections: Any) -> Case:
     return Case.from_table(TABLE | sections | {"lattice": merged})
 
 
-def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
-    """Forces (mass,) in N of all springs and their energy in J at displacements ``u`` (mass,) in m, between two walls.
-
-    A spring with the elongation z pulls with k z + q z^2 + c z^3.
-    """
-    forces = np.zeros(len(u))
-    energy = 0.0
-    for cell in range(CELLS + 1):
-        # Cell 0 is the left wall, whose only spring is the one to the first cell.
-        springs = [(1, 2 * cell - 2, 2 * cell)]
-        if cell:
-            springs.append((2, 2 * cell - 2, 2 * cell - 1))
-        for number, start, end in springs:
-            q, c = TERMS.get((cell, number), (0.0, 0.0))
-            k = STIFFNESS[number - 1]
-            # Walls do not move.
-            z = (u[end] if end < len(u) else 0.0) - (u[start] if start >= 0 else 0.0)
-            pull = k * z + q * z**2 + c * z**3
-            energy += k * z**2 / 2 + q * z**3 / 3 + c * z**4 / 4
-            if start >= 0:
-                forces[start] += pull
-            if end < len(u):
-                forces[end] -= pull
-    return forces, energy
-
-
 def test_the_system_of_normal_modes_has_the_springs():
     """The forces and the energy of the system for normal modes are those of all springs."""
     nnm = {"system": "chain", "modes": [1], "energy": [0.0, 1.0]}
     table = {key: TABLE[key] for key in ("name", "lattice", "contacts")}
     system = System.from_case(NnmCase.from_table(table | {"nnm": nnm}))
     u = 1e-3 * np.random.default_rng(1).standard_normal(2 * CELLS)
-    forces, energy = forces_and_energy(u)
+    lattice = lattice_by_scipy(TABLE)
+    forces = sum(spring.force(u) for spring in lattice.curved) - lattice.stiffness @ u
+    energy = u @ lattice.stiffness @ u / 2
+    for spring in lattice.curved:
+        z = spring.row @ u
+        energy += spring.quadratic * z**3 / 3 + spring.cubic * z**4 / 4
     # The system's forces stand on the left side of the equations of motion.
     np.testing.assert_allclose(system.forces(u), -forces, rtol=1e-10, atol=1e-10 * np.abs(forces).max())
     assert system.energy(u, 0 * u) == pytest.approx(energy, rel=1e-12)
