@@ -1,7 +1,7 @@
 """A plugin of pytest that writes the table of slow tests: ``scripts/test --durations``.
 
 It measures the CPU time of each test function, as a mean over its parameters, with its fixtures and child processes.
-CPU times depend little on what else the machine does. Tests that are not slow together take less than a minute; so that
+CPU times depend little on what else the machine does. Tests that are not slow together take about a minute; so that
 this stays so, a function with hundreds of parameters is slow too.
 """
 
