@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
+from vipetsc.lattice import Chain, Spring, UnitCell, Variation, bloch, diatomic, four_band
 from vipetsc.lattice.compliance.by_elimination import DirectCompliance
 from vipetsc.lattice.compliance.by_modes import ModalCompliance
 from vipetsc.lattice.compliance.by_waves import WaveCompliance
 from vipetsc.lattice.compliance.dense import DenseCompliance
+from vipetsc.lattice.damped import damped_waves
+from vipetsc.lattice.ends import EndSection, Side, condensed, reflections
 from vipetsc.lattice.sites import sites_at
 
 pytestmark = pytest.mark.parallel(1)
@@ -160,6 +162,19 @@ def test_the_flux_is_energy_times_group_velocity():
     assert wave.wavenumber == pytest.approx(kappa, rel=1e-9)
     with pytest.raises(ValueError, match="no wave of band 1"):
         compliance.incident(2700.0, 1)
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free"])
+@pytest.mark.parametrize("end", ["left", "right"])
+def test_an_end_without_dashpots_sends_back_all_of_each_waves_energy(ends, end):
+    """The energies of the waves that go back add up to that of the one that comes, also where these are two."""
+    # Two rows of masses that are joined in each cell, with two waves of one frequency.
+    cell = UnitCell((1.0, 1.0), (Spring(0, 0, 1e4, True), Spring(1, 1, 4e3, True), Spring(0, 1, 3e3)), 0, 1)
+    waves = damped_waves(cell, 110.0)
+    assert np.all(Side.at(end, waves).decay() < 1e-7)
+    other = Variation(masses=np.array([[1.5, 0.7], [0.6, 1.2], [2.0, 1.0]]))
+    z = condensed(EndSection(Chain(cell, 3, ends, variation=other), 2, end), np.array([110.0]))[0]
+    assert reflections(z, waves, end) == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.4])

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 
 from vipetsc.lattice import (
     Chain,
+    Drive,
     Spring,
     ToneBurst,
     UnitCell,
@@ -127,10 +128,14 @@ def test_modes_of_equal_masses_are_those_of_the_formula(ends):
 @pytest.mark.parametrize(("start", "stop"), [(0.0, 1e-3), (0.02, 0.03)])
 @ENDS
 def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
-    """The closed form of the response to a burst is the integral of exp(i omega (stop - t)) times the force."""
+    """The closed form of the response to a burst is the integral of exp(i omega (stop - t)) times the force.
+
+    So is that to its derivative, by which a wall moves the end of a dashpot.
+    """
     burst = ToneBurst(3.0, DRIVEN, 4)
     modes_ = linear_modes(Chain(CELLS["four-band"], 12, ends))
     found = burst.response(modes_.frequency, start, stop)
+    by_dashpot = Drive(burst, 0, 0, damping=2.0).response(modes_.frequency, start, stop)
 
     if start >= burst.duration:
         assert not found.any()
@@ -139,9 +144,9 @@ def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
     s, weights = np.polynomial.legendre.leggauss(200)
     last = min(stop, burst.duration)
     t = start + (last - start) * (s + 1) / 2
-    integrand = np.exp(1j * modes_.frequency[:, None] * (stop - t)) * burst.force(t)
-    expected = integrand @ weights * (last - start) / 2
-    assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    turned = np.exp(1j * modes_.frequency[:, None] * (stop - t)) * weights * (last - start) / 2
+    assert found == pytest.approx(turned @ burst.force(t), rel=1e-9, abs=1e-12)
+    assert by_dashpot == pytest.approx(turned @ burst.rate(t), rel=1e-9, abs=1e-9)
 
 
 # Intervals in s within the force, from its beginning to its end, and beyond its end.
