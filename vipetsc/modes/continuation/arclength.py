@@ -246,7 +246,8 @@ class GuardedSteps:
             )
         if self.problem.has_corner(before, after):
             # Steps come to the corner itself, where the branch has another tangent.
-            return Verdict(accepted=False, step=after.step * LEAST_FACTOR, why="the branch has a corner")
+            why = "the branch has a corner, beyond which a rigid stop is first struck, or no longer"
+            return Verdict(accepted=False, step=after.step * LEAST_FACTOR, why=why, remedy="nnm.first_step")
         size, guard = largest_change(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
             # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
