@@ -42,3 +42,11 @@ def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name,
 
     assert ended.returncode == os.EX_TEMPFAIL == 75
     assert ended.stderr == said
+
+
+def test_a_signal_that_nohup_has_set_aside_stays_so():
+    """A process that ignores SIGHUP from its start, as under nohup, is not ended by it."""
+    ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+    program = ignoring + REQUESTED.format(name="SIGHUP")
+    ended = subprocess.run([sys.executable, "-c", program], check=False)
+    assert ended.returncode == 0
