@@ -129,6 +129,20 @@ def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
     assert warning in aliased.attrs["left_out"]
 
 
+def test_what_is_asked_for_is_measured_and_what_is_left_out_has_one_reason(run):
+    """Maps are not taken without being asked for; of several reasons the first one is named, without a warning."""
+    assert set(analyse(run, ["kinetic_energy"]).data_vars) == {"kinetic_energy"}
+    transfer = analyse(run, ["ibtet"])
+    assert "bands/energy" in transfer
+    assert not {"bands/kinetic_energy", "bands/total", "dispersion", "entropy/masked"} & set(transfer.variables)
+
+    instant = analyse(run.isel(time=[0], cell=[0]))
+    assert json.loads(instant.attrs["warnings"]) == []
+    reasons = dict(sentence.split(": ")[::-1] for sentence in instant.attrs["left_out"].split("; "))
+    assert reasons["fewer than two samples were recorded"] == "dispersion, partition, entropy, bands, ibtet"
+    assert reasons["a single cell was recorded"] == "wavenumber_content"
+
+
 def test_the_ends_of_a_record_are_not_in_the_means(run):
     """The transfer is the mean fraction of energy above the drive, without the last 2 % of the record."""
     measured = analyse(run, ["ibtet", "bands/kinetic_energy"])

@@ -93,10 +93,10 @@ def _aliased_in_time(record: VelocityRecord) -> str:
 
     That is so beyond the Nyquist limit.
     """
-    bands = wave_bands(record.model.chain.cell)
-    if not bands or record.interval * bands[-1].high < np.pi:
+    # Without waves the highest frequency is 0; a single sample has no interval (NaN).
+    top = max((band.high for band in wave_bands(record.model.chain.cell)), default=0.0)
+    if not record.interval * top >= np.pi:
         return ""
-    top = bands[-1].high
     return f"fields stored every {record.interval:.4g} s resolve {np.pi / record.interval:.5g} of {top:.5g} rad/s"
 
 
