@@ -69,9 +69,15 @@ def test_the_first_direct_solver_that_petsc_has_is_taken(monkeypatch, ranks, pac
     assert transformation.solver == solver
 
 
-def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch):
-    # An entry None in sys.modules makes the import fail.
-    monkeypatch.setitem(sys.modules, "slepc4py", None)
+@pytest.mark.parametrize("built_for_another_numpy", [False, True])
+def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch, tmp_path, built_for_another_numpy):
+    if built_for_another_numpy:
+        (tmp_path / "slepc4py.py").write_text('raise ValueError("numpy.dtype size changed")')
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, "slepc4py", raising=False)
+    else:
+        # An entry None in sys.modules makes the import fail.
+        monkeypatch.setitem(sys.modules, "slepc4py", None)
     with pytest.raises(CaseError, match=r"slepc4py: is needed only for modes of long lattices .*apt install slepc-dev"):
         load_slepc()
 

@@ -46,7 +46,8 @@ def load_slepc() -> Any:
     """Return the module ``slepc4py.SLEPc``, which begins with PETSc's options; raises CaseError where it is missing."""
     try:
         from slepc4py import SLEPc
-    except ImportError as error:
+    # ValueError: it was built for another version of numpy.
+    except (ImportError, ValueError) as error:
         remedy = "is needed only for modes of long lattices and multipliers of whole lattices"
         how = "apt install slepc-dev python3-slepc4py; conda-forge: slepc4py; it must belong to the PETSc of petsc4py"
         raise CaseError([Problem("slepc4py", None, f"{remedy} ({error}); Debian: {how}")], "this machine") from None
