@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.models import CLEARANCE
+from tests.models import CLEARANCE, KERSCHEN
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.system import System
@@ -84,3 +84,21 @@ def test_a_contact_pressed_to_ground_holds_a_lattice():
         "contacts": [{"host": 0, "resonator": 1, "clearance": 0.0}],
     }
     NnmCase.from_table({"contacts": contacts, "nnm": {"system": "own", "modes": [1], "own": own}})
+
+
+@pytest.mark.parametrize(
+    ("begun", "resumed", "goes_on"),
+    [
+        ({}, {"direction": "both"}, True),
+        ({"direction": "both"}, {"points": 7}, True),
+        ({}, {"direction": "down"}, False),
+        ({"direction": "down"}, {"direction": "both"}, False),
+        ({"forced": [1]}, {"forced": [2]}, False),
+        ({"method": "balance"}, {"method": "damped"}, False),
+    ],
+)
+def test_a_branch_that_goes_on_is_the_one_that_was_begun(begun, resumed, goes_on):
+    """Keys that leave a branch's file what it is may change; a branch the other way, or another force, is another."""
+    nnm = {"system": "own", "own": KERSCHEN, "energy": [1e-3, 1.0]}
+    first, second = (NnmCase.from_table({"nnm": nnm | keys}) for keys in (begun, resumed))
+    assert (first.physics() == second.physics()) == goes_on

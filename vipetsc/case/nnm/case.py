@@ -73,7 +73,10 @@ class NnmCase(CaseFile):
     output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "nnm"
-    kept_by_resume: ClassVar[str] = "the system and the map with which its branches were started"
+    kept_by_resume: ClassVar[str] = (
+        "the system, and the method, truncation, starts, downward direction and forced mass of [nnm], with which its "
+        "branches were started"
+    )
     refuses: ClassVar[Mapping[str, str]] = {
         "absorbing ends": "absorbing ends are dashpots, and free motions then decay"
     }
@@ -183,7 +186,9 @@ class NnmCase(CaseFile):
         nnm = self.nnm
         # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
-        return self.lattice, self.contacts, nnm.system, nnm.custom, begun
+        # A branch that is followed downwards alone has the name that one upwards has otherwise.
+        goes_down = nnm.direction == "down"
+        return self.lattice, self.contacts, nnm.system, nnm.custom, begun, goes_down, nnm.forced
 
     @property
     def by_balance(self) -> bool:
