@@ -232,19 +232,22 @@ def _is_odd(lattice: LatticeTable) -> bool:
 def check_method(nnm: NnmTable) -> Iterator[Problem]:
     """Yield problems with keys of another method than the one by which motions are found."""
     foreign: tuple[str, ...]
+    is_shot = nnm.method == "shooting" and nnm.system != "condensed"
+    if not is_shot and nnm.chart != "relative":
+        yield Problem("nnm.chart", nnm.chart, "harmonic balance has one chart; remove it, or use shooting")
     if nnm.method == "damped":
         if nnm.system == "condensed":
             yield Problem("nnm.method", "damped", 'needs all masses: nnm.system = "chain", "reduced" or "own"')
-        for key in ("switch", "orbits_at", "start_frequency", "start_sites"):
+        for key in ("switch", "orbits_at", "start_frequency", "start_sites", "forced"):
             if getattr(nnm, key):
                 yield Problem(f"nnm.{key}", getattr(nnm, key), "applies to motions without loss; remove it")
         return
-    if nnm.system == "condensed" or nnm.method == "balance":
-        method = "shooting"
-        foreign = ("switch",)
-    else:
+    if is_shot:
         method = "harmonic balance"
         foreign = ("start_frequency", "start_sites")
+    else:
+        method = "shooting"
+        foreign = ("switch",)
     for key in foreign:
         given = getattr(nnm, key)
         if given:
