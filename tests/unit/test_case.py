@@ -210,3 +210,21 @@ def test_a_key_whose_name_begins_with_that_of_an_invalid_one_is_checked_too():
     """A wrong type of ``clearance`` does not hide that ``clearance_minus`` is too large."""
     found = problems({"contacts": {"clearance": "wide", "clearance_minus": 1e60}})
     assert list(found) == ["contacts.clearance", "contacts.clearance_minus"]
+
+
+@pytest.mark.parametrize(
+    "change, word",
+    [
+        ("contacts.sites[3]=5", "has 2 entries"),
+        ("contacts.sites[1]=", "set the whole list"),
+        ("contacts.sites[0]=5", "count from 1"),
+        ("contacts.restitution[1]=0.5", "or set contacts.restitution"),
+        ("drive.more[1].amplitude=3", "or set drive.more"),
+        ("contacts.sitse[1]=5", "unknown key"),
+    ],
+)
+def test_an_entry_that_a_list_does_not_have(change, word):
+    """It is not a misspelt key: the message says how entries count, and that a list is made longer as a whole."""
+    with pytest.raises(CaseError) as caught:
+        Case.from_table({"contacts": {"sites": [20, 30]}}, [change])
+    assert word in str(caught.value)

@@ -281,9 +281,8 @@ def _below(place: Any, key: str, put_missing: bool = False) -> Any:
 def _put_item(entries: list[Any], index: int, path: str, value: Any) -> list[Problem]:
     """Set the entry ``index`` (from 0) of a list; returns the problem if there is none."""
     if index >= len(entries) or value is None:
-        return [
-            Problem(path, value, f"the list has the entries 1 to {len(entries)}, which can be changed, not removed")
-        ]
+        count = f"{len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
+        return [Problem(path, value, f"the list has {count}; to add or remove one, set the whole list")]
     entries[index] = value
     return []
 
@@ -321,7 +320,11 @@ def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     """Return the problem of a key that is not one of ``valid``, with the nearest one that is."""
     parents, dot, key = path.rpartition(".")
     near = nearest(key, valid)
+    entry = re.fullmatch(r"(.+)\[\d+\]", key)
     remedy = f"valid keys: {', '.join(sorted(valid))}"
+    if entry and entry[1] in valid:
+        # "masses[0]", or an entry of what is not given as a list.
+        return Problem(path, value, f"there is no such entry; entries count from 1, or set {parents}{dot}{entry[1]}")
     if near:
         remedy = f"did you mean {parents}{dot}{near}?"
     return Problem(path, value, f"unknown key; {remedy}")
