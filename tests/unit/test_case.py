@@ -228,3 +228,9 @@ def test_an_entry_that_a_list_does_not_have(change, word):
     with pytest.raises(CaseError) as caught:
         Case.from_table({"contacts": {"sites": [20, 30]}}, [change])
     assert word in str(caught.value)
+
+
+def test_names_of_points_are_refused_in_words():
+    """The user sees which characters a name may have, not a regular expression."""
+    found = problems({"output": {"points": [{"name": "a b", "cell": 1}]}})["output.points[1].name"]
+    assert "letters, digits" in found and "^" not in found

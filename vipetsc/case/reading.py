@@ -363,6 +363,10 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         if item["loc"][-1] == "cell" and "place" in _section_at(kind, item["loc"][:-1]).model_fields:
             remedy = "missing; give the cell, or on a strip the place"
         return Problem(path, None, remedy)
+    if item["type"] == "string_pattern_mismatch":
+        # The key's description says what the pattern is for.
+        fields = _section_at(kind, item["loc"][:-1]).model_fields
+        message = f"is not valid: {fields[item['loc'][-1]].description}"
     value = item["input"]
     details = item.get("ctx", {})
     for limit in ("ge", "gt", "le", "lt"):
