@@ -131,6 +131,7 @@ M, K, C = beam()
     "matrices, cell, sections, word",
     [
         ({"M": _full_mass()}, {}, {}, "lumped"),
+        ({"M": M + 1e-2 * M[0, 0] * (np.eye(42, k=40) + np.eye(42, k=-40))}, {}, {}, "1 and 1 of the next cell"),
         ({"M": M - 2 * np.diag(np.diag(M) * (np.arange(42) == 5))}, {}, {}, "freedom 6"),
         ({"M": M * (np.arange(42) != 7)}, {}, {}, "freedom 8"),
         ({"M": K, "K": M}, {}, {}, "order"),

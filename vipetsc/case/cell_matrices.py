@@ -230,9 +230,13 @@ def _masses(mass: _Assembled) -> list[float]:
         )
     if not _is_diagonal(mass):
         i, j = np.argwhere(_couplings(mass))[0] + 1
+        # One that couples with itself does so from cell to cell.
+        other = f"{j}"
+        if i == j:
+            other = f"{j} of the next cell"
         reason = "contacts, drives and points act on single masses"
         remedy = "have the program write lumped masses, rotary inertia included"
-        raise MatrixError(f"M couples degrees of freedom {i} and {j}, but {reason}: {remedy}")
+        raise MatrixError(f"M couples degrees of freedom {i} and {other}, but {reason}: {remedy}")
     return masses.tolist()
 
 
