@@ -160,6 +160,26 @@ def squeezed(engine: str) -> Case:
     return joined(engine, [12, 13], 0.7, contacts=contacts, time={"end": 0.03})
 
 
+def strip(engine: str) -> Case:
+    """Return a strip with stops to the ground and between rows, rigid ones and others, on both sides of all cuts."""
+    each = {
+        "pair": [[0, 1], [3, 4], [0, 2], [3, 4], [0, 2], [0, 3]],
+        "law": ["rigid", "rigid", "hertz", "rigid", "hertz", "rigid"],
+    }
+    return Case.from_table({
+        "lattice": {"cells": 24, "strip": {"rows": 5, "mass": 0.01, "stiffness": 1e4}},
+        "contacts": {
+            "sites": [5, 6, 8, 9, 12, 13],
+            "clearance": 1e-4,
+            "stiffness": 1e8,
+            "restitution": 0.8,
+            "each": each,
+        },
+        "drive": {"amplitude": 20.0, "waveform": "harmonic", "frequency": 1000.0, "place": [3, 2]},
+        "time": {"end": 0.04, "engine": engine},
+    })  # fmt: skip
+
+
 def exponent(engine: str) -> Case:
     """Return a run with a Lyapunov exponent, whose companion lies on all ranks too."""
     time = EXPONENT_OF_CHAIN["time"] | {"engine": engine, "end": 0.2}
@@ -188,6 +208,7 @@ ACROSS = {
     sticking: BOTH,
     sharing_masses: ("propagator",),
     squeezed: ("propagator",),
+    strip: BOTH,
     exponent: BOTH,
     users_law: BOTH,
 }
@@ -201,7 +222,11 @@ ON_THREE = [
     (wide_band, "propagator"),
     (sticking, "ts"),
     (sharing_masses, "propagator"),
+    (strip, "ts"),
+    (strip, "propagator"),
 ]
+# Two ranks lie between two others.
+ON_FOUR = [(joined_cells, "ts"), (sticking, "ts"), (curved_springs, "propagator"), (strip, "ts"), (strip, "propagator")]
 
 
 def assert_as_alone(create: Any, engine: str) -> None:
@@ -225,9 +250,8 @@ def test_three_ranks_have_the_bits_of_one(create, engine):
 
 
 @pytest.mark.parallel([4])
-@pytest.mark.parametrize(("create", "engine"), [(joined_cells, "ts"), (sticking, "ts"), (curved_springs, "propagator")])
+@pytest.mark.parametrize(("create", "engine"), ON_FOUR)
 def test_four_ranks_have_the_bits_of_one(create, engine):
-    """Two ranks lie between two others."""
     assert_as_alone(create, engine)
 
 

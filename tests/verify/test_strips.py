@@ -219,6 +219,42 @@ def test_a_curved_spring_pulls_alike_seen_from_either_end(edges):
 CONTACTS = {"places": [[3, 2]], "law": "bilinear", "stiffness": 5 * K, "clearance": 1e-3}
 
 
+ROWS = 5
+
+
+def stops(engine, ends, mirrored):
+    """Return a strip with stops to the ground and one between rows, rigid ones and others, or its mirror image."""
+
+    def row(j):
+        return ROWS + 1 - j if mirrored else j
+
+    each = {
+        "pair": [[0, row(1)], [row(2), row(3)], [0, row(3)], [0, row(5)]],
+        "law": ["rigid", "rigid", "hertz", "rigid"],
+        "restitution": [0.8, 0.5, 0.8, 0.0],
+    }
+    case = Case.from_table({
+        "lattice": {"cells": 24, "ends": ends, "strip": {"rows": ROWS, "mass": M, "stiffness": K}},
+        "contacts": {"sites": [4, 5, 6, 7], "clearance": 2e-5, "stiffness": 1e8, "each": each},
+        "drive": {"amplitude": 20.0, "waveform": "harmonic", "frequency": 1000.0, "place": [3, row(2)]},
+        "time": {"end": 0.04, "engine": engine},
+    })  # fmt: skip
+    data, result = simulated(case)
+    assert result.statistics["engine"] == engine
+    assert set(data["impacts/site"].values.tolist()) == {1, 2, 3, 4}
+    return data["displacement"].values
+
+
+@pytest.mark.parametrize("ends", ["fixed", "periodic"])
+def test_a_strip_with_rows_exchanged_moves_as_the_mirror_image(ends):
+    """So it does by both engines, which agree."""
+    ts, propagator = (stops(engine, ends, False) for engine in ("ts", "propagator"))
+    size = np.abs(ts).max()
+    np.testing.assert_allclose(stops("ts", ends, True)[..., ::-1], ts, rtol=0, atol=1e-11 * size)
+    np.testing.assert_allclose(stops("propagator", ends, True)[..., ::-1], propagator, rtol=0, atol=1e-11 * size)
+    np.testing.assert_allclose(ts, propagator, rtol=0, atol=1e-8 * size)
+
+
 def test_modes_responses_and_fits_of_a_strip(tmp_path):
     """The lowest mode and its grazing energy, the response to a force, and a clearance that is found again."""
     cells = 4
