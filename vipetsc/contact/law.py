@@ -28,6 +28,9 @@ LANDED = 1e-10
 # of displacements: contacts that are less deep than the tolerance have no onset and no separation of their own. A stop
 # without clearance keeps the larger tolerance, below which the front of a wave passes through w = 0 again and again.
 ROUNDINGS = 1000 * float(np.finfo(float).eps)
+# Nor may it be less than so many roundings of the scale of displacements, however small the clearance: w is the
+# difference of two of them, and no step would land on less.
+LEAST_ROUNDINGS = 10 * float(np.finfo(float).eps)
 # Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. The modes
 # UNSWITCHED and RESTING have the force of max(x, 0), without loss; a rigid site is free or STUCK.
 FREE = 0
@@ -136,7 +139,8 @@ def create_contacts(
     sites["tolerance"] = LANDED * sites["scale"]
     apart = gaps.min(axis=1) > 0
     rounded = ROUNDINGS * np.maximum(sites["scale"], scale)
-    sites["tolerance"][apart] = np.minimum(sites["tolerance"], rounded)[apart]
+    least = LEAST_ROUNDINGS * scale
+    sites["tolerance"][apart] = np.clip(sites["tolerance"], least, rounded)[apart]
     sites["approach"] = 1.0
     sites["elastic"] = elastic_records(per_site)
     sites["damping"] = [dampings[law] for law in per_site]
