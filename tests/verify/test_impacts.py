@@ -247,6 +247,45 @@ def test_masses_between_stops_without_clearance_wait_for_their_wave(stops, resti
     np.testing.assert_allclose(*motions, rtol=0, atol=1e-9)
 
 
+def ring(engine: str) -> Case:
+    """A ring of five cells with two stops without clearance in the driven one."""
+    springs = [
+        {"start": 3, "end": 1, "stiffness": 5.9e4, "next_cell": True, "damping": 2.0},
+        {"start": 1, "end": 2, "stiffness": 2.9e4},
+        {"start": 2, "end": 3, "stiffness": 5.3e4},
+    ]
+    each = {"pair": [[0, 2], [3, 1]], "side": ["minus", "minus"], "restitution": [1.0, 0.7]}
+    return Case.from_table({
+        "lattice": {"cells": 5, "ends": "periodic", "cell": {"masses": [0.13, 0.47, 0.11], "springs": springs}},
+        "contacts": {"law": "rigid", "clearance": 0.0, "sites": [4, 4], "each": each},
+        "drive": {"amplitude": 280.0, "frequency": 550.0, "cycles": 4, "cell": 4},
+        "time": {"end": 0.02, "engine": engine},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("create", [ring, lambda engine: squeezed(engine, [1.0, 0.7], BESIDE)])
+def test_a_site_that_touches_at_rest_is_logged_where_it_is_pushed(create, engine):
+    """At a stop without clearance it sticks before the front of a wave arrives, which may pull."""
+    impulse = simulate(create(engine)).dataset["impacts/impulse"].values
+    assert impulse.size > 5
+    assert impulse.min() > 1e-9 * impulse.max()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("clearance", [1e-12, 1e-15])
+def test_a_clearance_may_be_as_small_as_the_rounding_of_the_motion(clearance, engine):
+    table = {
+        "lattice": {"cells": 40},
+        "contacts": {"law": "rigid", "clearance": clearance, "restitution": 0.7},
+        "drive": {"amplitude": 60.0},
+        "time": {"end": 0.03, "engine": engine},
+    }
+    result = simulate(Case.from_table(table))
+    assert result.complete, result.sentence
+    assert result.statistics["landings"] < 1.2 * result.statistics["switches"]
+
+
 PUSH = {"waveform": "step", "ramp": RAMP, "amplitude": 3.0, "cell": 1}
 LOOP = {
     "lattice": {"cells": 1, "cell": {"masses": [1.0, 2.0, 3.0], "springs": [], "contact": [1, 2]}},

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.changes import MOVED, Extremes, extremes, shortest_beginning, shortest_impact, switching
+from vipetsc.contact.changes import MOVED, RELEASED, Extremes, extremes, shortest_beginning, shortest_impact, switching
 from vipetsc.contact.law import (
     CLOSED,
     FREE,
@@ -256,9 +256,19 @@ def _switch_rigid_sites(
         if contacts[i].rigid and contacts[i].mode == FREE and np.isnan(episode.separation):
             episode.separation = t
             episode.loss += energies[i]
-            tracks.log[tracks.closed[0]] = episode
-            tracks.closed[0] += 1
+            if episode.impulse > _least_impulse(contacts[i]):
+                tracks.log[tracks.closed[0]] = episode
+                tracks.closed[0] += 1
     return switched
+
+
+@kernel
+def _least_impulse(site: Any) -> float:
+    """Return the impulse in N s below which the contact of a rigid ``site`` is no impact.
+
+    At a stop without clearance a site sticks before the front of a wave arrives; if that pulls, nothing has happened.
+    """
+    return RELEASED * site.reduced_mass * abs(site.approach)
 
 
 @kernel
@@ -668,6 +678,11 @@ class ImpactTracker:
 
         modes = self.contacts["mode"]
         in_contact = np.flatnonzero((modes != FREE) & (np.abs(modes) != RESTING))
+        impulse = self.tracks.sites["episode"]["impulse"]
+        at_rest = [
+            i for i in in_contact if self.contacts["rigid"][i] and impulse[i] <= _least_impulse(self.contacts[i])
+        ]
+        in_contact = np.setdiff1d(in_contact, at_rest)
         still_open = self.tracks.sites["episode"][in_contact]
         still_open["loss"] += energies[in_contact]
         return np.concatenate([closed, still_open])
