@@ -31,11 +31,14 @@ from small_pictures import save_small
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
+from mpi4py import MPI
+
 from vipetsc import follow
-from vipetsc.case import Case
+from vipetsc.case import Case, NnmCase
 from vipetsc.figures import schematics, style
 from vipetsc.io.read import open_run
 from vipetsc.lattice import Contact
+from vipetsc.modes.branches.follow import follow_all
 
 PICTURES = ROOT / "vipetsc/manual/pictures"
 NOTEBOOKS = ROOT / "vipetsc/manual/notebooks"
@@ -172,6 +175,42 @@ def followed() -> Figure:
     return figure
 
 
+def rigid_branches() -> Figure:
+    """Draw frequency over energy of a mass between rigid stops, and with one of them, by ``nnm`` and by the formula."""
+    own = {
+        "masses": [1.0],
+        "springs": [{"start": 0, "end": 1, "stiffness": 4.0}],
+        "contacts": [{"host": 0, "resonator": 1, "clearance": 1.0}],
+    }
+    nnm = {"system": "own", "modes": [1], "energy": [0.05, 60.0], "own": own}
+    # Beyond the corner: the spring's energy at the stops is 2 J, its frequency 2 rad/s.
+    energy = np.geomspace(2.0, 60.0, 400)
+    to_stop = np.arcsin(np.sqrt(2.0 / energy)) / 2
+    exact = {"both": 4 * to_stop, "plus": 2 * to_stop + np.pi / 2}
+
+    figure = style.new_figure(style.COLUMN, 2.6)
+    axes = figure.subplots()
+    for side, colour, label in (("both", style.BLUE, "stops on both sides"), ("plus", style.VERMILION, "one stop")):
+        case = NnmCase.from_table({"name": "stops", "contacts": {"law": "rigid", "side": side}, "nnm": nnm})
+        (branch,) = follow_all(case, None, MPI.COMM_SELF)
+        axes.plot(energy, 1 / exact[side], color=style.BLACK, lw=2.5, alpha=0.3, label=None)
+        axes.plot(
+            [point.energy for point in branch.points],
+            [1 / point.period for point in branch.points],
+            "o-",
+            color=colour,
+            lw=0.8,
+            ms=2.5,
+            label=label,
+        )
+        corner = next(point for point in branch.points if point.kind == "grazing")
+        axes.plot(corner.energy, 1 / corner.period, "s", color=style.BLACK, ms=5, zorder=5)
+    axes.plot([], [], color=style.BLACK, lw=2.5, alpha=0.3, label="formula")
+    axes.set(xscale="log", xlabel="Energy (J)", ylabel="Frequency (Hz)", xlim=(0.05, 60))
+    axes.legend(loc="upper left")
+    return figure
+
+
 def named_cell(run: xr.Dataset) -> Figure:
     """Draw the cell and the lattice of a ``run``, and write the words host, resonator and stop at its boxes."""
     figure = schematics.unit_cell(run, None)
@@ -246,6 +285,7 @@ def main(arguments: list[str] | None = None) -> int:
         with open_run(folder / "four-band/run.h5") as run:
             save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png", WIDTH, MOST)
             save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png", WIDTH, MOST)
+        save_small(drawn(folder, rigid_branches), PICTURES / "nnm-rigid.png", WIDTH, MOST)
         save_small(drawn(folder, followed), PICTURES / "follow.png", WIDTH, MOST)
         for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
             draw_notebook(notebook, folder)
