@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import vipetsc
+from vipetsc.modes.problem import ContinuationError
 
 
 def special(curve, kind):
@@ -82,3 +83,12 @@ def test_closed_branch_is_followed_once():
     (circle,) = others
     assert circle.attrs["ending"].startswith("closed")
     np.testing.assert_allclose(circle["x"].values[:, 0] ** 2 + (circle["p"].values - 0.5) ** 2, 0.04, atol=1e-7)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.4])
+def test_no_solution_at_the_beginning(x):
+    """x^2 + 1 has none; at x = 0 the derivative is singular too. Another curve can be followed thereafter."""
+    with pytest.raises(ContinuationError, match="no solution at p = 0"):
+        vipetsc.follow(lambda x, p: x**2 + 1, [x], 0.0, 1.0)
+    (curve,) = vipetsc.follow(lambda x, p: x - p, [0.0], 0.0, 1.0)
+    assert curve["x"].values[-1, 0] == pytest.approx(1.0)

@@ -77,6 +77,8 @@ LARGEST_RESIDUAL = 1e-9
 # A Newton step from a residual within rounding that leaves more than this fraction of it cannot make it smaller: but
 # for rounding, a step from so small a residual would leave its square.
 STAGNANT = 0.25
+# PETSc's number of the error that a dense matrix has no factors.
+SINGULAR_MATRIX = 71
 # PETSc's reason for a residual that is not finite; 3.25 has renamed it.
 NOT_FINITE = next(
     value
@@ -156,6 +158,10 @@ class DenseNewton:
                 self._snes.solve(None, self._xi)
         except FlowError as error:
             return Attempt(False, str(error), self._history, guess, left_domain=True)
+        except PETSc.Error as error:
+            if error.ierr != SINGULAR_MATRIX:
+                raise
+            return Attempt(False, "the derivative is singular", self._history, guess)
 
         reason = self._snes.getConvergedReason()
         # The array is a view of the vector, which the next call overwrites.
