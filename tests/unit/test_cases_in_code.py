@@ -154,3 +154,10 @@ def test_a_table_that_is_none_is_a_problem_of_the_case(call, key):
     with pytest.raises(CaseError) as caught:
         call()
     assert key in [problem.key for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize("without, word", [(["drve"], "did you mean drive"), ("drive", "unknown key")])
+def test_sections_that_are_left_out_exist(without, word):
+    """A misspelt section, or a name in place of a list of names, does not silently leave out nothing."""
+    with pytest.raises(CaseError, match=word):
+        Case().varied(without=without)

@@ -23,7 +23,7 @@ from vipetsc.case.inhomogeneity import check_inhomogeneity, check_right_wall
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.points import check_points
-from vipetsc.case.reading import Table, read_section
+from vipetsc.case.reading import Table, read_section, unknown_key
 from vipetsc.case.resolve import (
     build_chain,
     cells_of_sites,
@@ -38,7 +38,7 @@ from vipetsc.case.resolve import (
 )
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
-from vipetsc.case.section import Problem, Section
+from vipetsc.case.section import CaseError, Problem, Section
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
@@ -236,8 +236,14 @@ class Case(CaseFile):
         named in ``without`` begin with their defaults instead of the values of this case.
         """
         table = self.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
+        left_out = list(without)
+        sections = {*Case.model_fields, *type(self).model_fields}
+        unknown = [unknown_key(section, None, sections) for section in left_out if section not in sections]
+        if unknown:
+            raise CaseError(unknown, "without")
+
         # First what is left out, then what changes: a section may be begun anew with some keys.
-        for section in without:
+        for section in left_out:
             table.pop(section, None)
         for section, values in changes.items():
             if not isinstance(values, Mapping):
