@@ -547,6 +547,39 @@ def test_a_duffing_oscillator_has_the_conservative_frequency():
         assert point.period == pytest.approx(period, rel=1e-8)
 
 
+PAIR = {
+    "masses": [1.0, 2.0],
+    "springs": [{"start": 1, "end": 2, "stiffness": 1.0}],
+    "smooth": [{"start": 1, "end": 2, "quadratic": 0.3, "cubic": 0.3}],
+}
+RING = {
+    "masses": [1.0, 1.0, 1.2, 1.0],
+    "springs": [{"start": i, "end": i % 4 + 1, "stiffness": 1.0} for i in (1, 2, 3, 4)],
+    "contacts": [{"host": 1, "resonator": 2, "clearance": 0.3}],
+}
+
+
+@pytest.mark.parametrize(
+    ("system", "mode", "contacts"),
+    [(PAIR, 2, {}), (RING, 4, {"law": "hertz", "stiffness": 2.0, "side": "plus"})],
+    ids=["two masses", "ring with a stop"],
+)
+def test_free_systems_have_damped_modes_with_a_mean(system, mode, contacts):
+    """Where nothing holds the system and forces have a mean, damped modes without loss are the conservative motions."""
+    nnm = {"system": "own", "own": system, "modes": [mode], "energy": [0.0, 0.5], "points_at": {"energy": [0.4]}}
+    frequencies = []
+    for method in ("balance", "damped"):
+        case = NnmCase.from_table({"name": "x", "nnm": nnm | {"method": method}, "contacts": contacts})
+        (branch,) = follow_all(case, None, MPI.COMM_SELF)
+        (point,) = (p for p in branch.points if p.kind == "energy@0.4")
+        frequencies.append(point.frequency)
+    assert frequencies[1] == pytest.approx(frequencies[0], rel=1e-8)
+    # The centre of mass stays where it is, in the mean as at every time.
+    means = point.x[1:].reshape(len(system["masses"]), -1)[:, 0]
+    assert abs(system["masses"] @ means) < 1e-10
+    assert np.abs(means).max() > 1e-3
+
+
 def test_small_motions_are_the_complex_modes():
     """Frequency and damping ratio are |lambda| and -Re lambda/|lambda| of the linear modes, up to zeta^2."""
     state = np.block([[np.zeros((2, 2)), np.eye(2)], [-STIFFNESS, -DAMPING]])

@@ -12,12 +12,14 @@ else up to zeta^2. Without loss zeta is 0, and the motions are the conservative 
 
     [K + i k Om C - ((k Om)^2 + 2 i k zeta Om^2) M] U_k + B^T F_k(B U) = 0,    Im phi^T M U_1 = 0,
 
-where the last equation fixes the phase with the linear mode phi. Unknowns are the real and imaginary parts of the
+where the last equation fixes the phase with the linear mode phi. Rigid motions that nothing resists leave the mean
+open; that of the motion's centre of mass is taken to be 0. Unknowns are the real and imaginary parts of the
 harmonics of all masses, odd ones alone if all forces are odd, zeta, and Om. Derivatives are exact. The energy is the
 mean of the mechanical one over a period, which changes within it.
 """
 
 import numpy as np
+from scipy.linalg import null_space
 
 from vipetsc.modes.balance.harmonic_balance import RealUnknowns
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
@@ -26,6 +28,8 @@ from vipetsc.modes.system import System
 
 # Step of the difference by which the energy's change along a branch is computed, in unknowns of order one.
 ALONG = 1e-6
+# A motion is rigid if it stretches springs, contacts and nonlinear springs by less than this fraction of the largest.
+RIGID = 1e-12
 
 
 class DampedBalance(RealUnknowns):
@@ -44,6 +48,12 @@ class DampedBalance(RealUnknowns):
         self.pair_rows = np.vstack([system.contact_rows, system.spring_rows])
         frequencies, shapes = system.linear_modes()
         self.stiffness = float(frequencies[mode] ** 2 * system.masses.max())
+        # What no spring and no contact holds is held in the mean by springs, which have no force where the centre of
+        # mass is at rest: all other forces between masses that move together have the sum 0.
+        largest = np.abs(system.stiffness_at_rest).max()
+        rigid = null_space(np.vstack([system.stiffness_at_rest / largest, self.pair_rows]), rcond=RIGID)
+        momenta = system.masses[:, None] * rigid / system.masses.max()
+        self.holding = self.stiffness * momenta @ momenta.T
         quarter = np.zeros((system.dofs, order + 1), complex)
         quarter[:, 1] = 1j * system.masses * shapes[:, mode]
         self.phase_row = unit(self.pack(quarter))
@@ -73,6 +83,7 @@ class DampedBalance(RealUnknowns):
         rates = (self.orders * omega)[:, None, None]
         masses = np.diag(self.system.masses)
         linear = self.system.stiffness_at_rest + 1j * rates * (self.damping - 2 * zeta * omega * masses)
+        linear[self.orders == 0] += self.holding
         return np.asarray(linear - rates**2 * masses)
 
     def residual(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
