@@ -688,6 +688,18 @@ def test_one_mass_has_the_period_of_its_formula(side):
     assert grazing.energy == pytest.approx(2.0, rel=1e-9)
 
 
+def test_the_cell_of_the_built_in_lattice_has_rigid_modes():
+    """Both modes of the reduced model reach their stops, and their frequencies rise from there on."""
+    table = {"name": "four-band", "contacts": {"law": "rigid"}, "nnm": {"points": 80}}
+    branches = follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)
+    assert len(branches) == 2
+    for branch in branches:
+        struck = [point for point in branch.regular() if point.episodes]
+        assert len(struck) > 10, branch.ended.sentence
+        frequencies = [point.frequency for point in struck]
+        assert frequencies[-1] > frequencies[0] > branch.points[0].frequency
+
+
 def test_a_branch_ends_where_its_rest_comes_to_the_stop_of_the_other_side():
     """With stops 1 m and 1.4 m away that is at E = k (1.4 m)^2/2, and one period is that of a stop on one side."""
     (branch,) = followed(one_mass(clearance_minus=1.4), Ending.STOP_AT_REST)
