@@ -390,6 +390,28 @@ def test_both_directions_are_two_branches(tmp_path):
     assert all("a warning" in label for label in labels.values())
 
 
+@pytest.mark.parametrize("method", ["balance", "damped"])
+def test_pictures_of_harmonics_join_both_directions(method, tmp_path):
+    """The curve of a branch that begins in its middle has all energies, also with other numbers of harmonics."""
+    ground = {"start": 0, "end": 1}
+    own = {
+        "masses": [1.0],
+        "springs": [ground | {"stiffness": 1.0}],
+        "smooth": [ground | {"cubic": 1.0}],
+        "dashpots": [ground | {"damping": 0.02}],
+    }
+    nnm = {"system": "own", "method": method, "modes": [1], "own": own, "energy": [0.01, 10.0], "start_energy": 0.1}
+    case = NnmCase.from_table({"nnm": nnm | {"direction": "both"}})
+    up, down = follow_all(case, tmp_path, MPI.COMM_SELF)
+
+    with Files() as files:
+        pictures = {one.stem: one.draw() for one in drawings("branches", [tmp_path], files, ["branch"])}
+    for branch, parts in ((up, [up, down]), (down, [down])):
+        energies = np.concatenate([[point.energy for point in part.points] for part in parts])
+        low, high = pictures[f"branch-{branch.name}"].get_axes()[0].dataLim.intervalx
+        assert (low, high) == pytest.approx((energies.min(), energies.max()))
+
+
 def follow_masses(
     folder: Path, listener: Listener | None = None, stop: StopRequest | None = None, **nnm: Any
 ) -> Branch[Any]:

@@ -454,6 +454,8 @@ def softening(method: str, energy: float = 1.0, masses: int = 1, stiffness: floa
     }
     own["springs"] += [{"start": mass, "end": mass + 1, "stiffness": 0.1} for mass in range(1, masses)]
     nnm = {"system": "own", "method": method, "modes": [1], "energy": [0.0, energy], "own": own, "harmonics": 255}
+    if method == "damped":
+        own["dashpots"] = [{"start": 0, "end": 1, "damping": 0.02}]
     (branch,) = follow_all(NnmCase.from_table({"nnm": nnm}), None, MPI.COMM_SELF)
     return branch
 
@@ -488,6 +490,15 @@ def test_a_branch_ends_at_the_saddle(method, law, last, period):
         # Near the saddle the period depends on the last digits of the start.
         if abs(start - 1) > 1e-4:
             assert point.period == pytest.approx(period(start), rel=1e-9 + 1e-7 / abs(start - 1))
+
+
+@pytest.mark.parametrize(("law", "last"), [("quadratic", 1 / 6), ("cubic", 1 / 4)])
+def test_a_damped_branch_ends_at_the_saddle(law, last):
+    """The energy that is added keeps the motion going up to the saddle, beyond which nothing is periodic."""
+    branch = softening("damped", **{law: -1.0})
+    assert "equilibrium" in branch.ended.sentence
+    assert branch.points[-1].energy == pytest.approx(last, rel=1e-6)
+    assert max(point.truncation for point in branch.points) < 1e-3
 
 
 @pytest.mark.parametrize(

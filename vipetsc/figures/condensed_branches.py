@@ -12,11 +12,9 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
 from vipetsc.figures.branch_curves import draw_branch, draw_losses
-from vipetsc.figures.frequency_energy import MARKS
+from vipetsc.figures.frequency_energy import MARKS, read_branch
 from vipetsc.figures.page import Page
 from vipetsc.figures.panels import annotate_empty
-from vipetsc.io.branch_kinds import kind_names
-from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import wave_bands
 
 # Smallest displacement that is drawn, over the largest: localised motions decay to rounding, 1e-16.
@@ -33,10 +31,7 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     If one of the branches has losses, their damping is drawn as well. Raises OSError or ValueError for a file that
     holds no condensed branch.
     """
-    branches = []
-    for path in paths:
-        with open_netcdf(path, "branch", ("harmonics", "elongation", "kind")) as file:
-            branches.append(file.load().assign(kind=("point", kind_names(file))))
+    branches = [read_branch(path, ("harmonics", "elongation", "kind")) for path in paths]
 
     # All rows have the panels that one of them needs, so that their axes stand below each other.
     columns = 3

@@ -6,23 +6,18 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.frequency_energy import HOLLOW, MARKS
+from vipetsc.figures.frequency_energy import HOLLOW, MARKS, read_branch
 from vipetsc.figures.page import Page
-from vipetsc.io.branch_kinds import kind_names
-from vipetsc.io.netcdf import open_netcdf
 
 
 def damped_modes(paths: Sequence[Path]) -> Figure:
     """Draw frequency and damping ratio of the branches in ``paths`` over their energies, with special points."""
-    branches = []
-    for path in paths:
-        with open_netcdf(path, "branch", ("energy", "frequency", "damping_ratio", "kind")) as file:
-            branches.append(file.load())
+    branches = [read_branch(path, ("energy", "frequency", "damping_ratio", "kind")) for path in paths]
 
     page = Page.of(2, len(branches), height=3.6, sharex="col")
     for column, branch in zip(page.grid.T, branches, strict=True):
         energy = branch["energy"].values
-        kinds = kind_names(branch)
+        kinds = branch["kind"].values
         for axes, name in zip(column, ("frequency", "damping_ratio"), strict=True):
             values = branch[name].values
             axes.plot(energy, values, color=style.BLACK)

@@ -75,7 +75,7 @@ def backbone(paths: Sequence[Path]) -> Figure:
     Each branch has a column. A panel is there if one of the branches has what it shows. Raises OSError or ValueError
     for a file that holds no branch.
     """
-    branches = [_read(path) for path in paths]
+    branches = [read_branch(path, NEEDS) for path in paths]
 
     # All columns have the panels that one of them needs, so that their axes are side by side.
     has_orbits = any(_holds(branch, "orbits/number") for branch in branches)
@@ -113,26 +113,34 @@ def backbone(paths: Sequence[Path]) -> Figure:
     return figure
 
 
-def _read(path: Path) -> xr.Dataset:
-    """Return the branch in ``path``, joined to the one towards smaller energies if the mode has both."""
-    branch = _load(path)
+def read_branch(path: Path, needs: Sequence[str]) -> xr.Dataset:
+    """Return the branch in ``path``, joined to the one towards smaller energies if the mode has both.
+
+    ``needs`` are the variables by which a branch of this kind is known. Raises OSError or ValueError without them.
+    """
+    branch = _load(path, needs)
     below = path.with_name(f"{path.stem}{DOWN}.h5")
     if not below.exists():
         return branch
 
     # Backwards, and without the start, which both have.
-    down = _load(below).isel(point=slice(None, 0, -1))
+    down = _load(below, needs).isel(point=slice(None, 0, -1))
     down = down.assign(number=-down["number"])
     if "tangent_period" in down:
         down = down.assign(tangent_period=-down["tangent_period"])
-    both = [name for name, values in branch.items() if "point" in values.dims and name in down]
+    # Unknowns of branches with other numbers of harmonics are not joined: pictures do not need them.
+    both = [
+        name
+        for name, values in branch.items()
+        if "point" in values.dims and name in down and down[name].shape[1:] == values.shape[1:]
+    ]
     joined = xr.concat([down[both], branch[both]], dim="point")
     return branch.drop_dims("point").assign(joined)
 
 
-def _load(path: Path) -> xr.Dataset:
+def _load(path: Path, needs: Sequence[str]) -> xr.Dataset:
     """Return the branch in ``path`` with the kinds of its points in words."""
-    with open_netcdf(path, "branch", NEEDS) as file:
+    with open_netcdf(path, "branch", needs) as file:
         branch = file.load()
     return branch.assign(kind=("point", kind_names(branch)))
 

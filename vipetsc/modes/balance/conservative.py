@@ -161,17 +161,6 @@ class ConservativeMotions(FreeMotions[HarmonicBalance]):
         """Return the equations of motions with harmonics up to ``order``."""
         return HarmonicBalance(self.compliance, self.forces, order=order, odd=self.forces.odd, cosines=True)
 
-    def acceleration(self, point: Point) -> float:
-        """Return the largest acceleration where a motion rests, over that of a harmonic motion of the same size.
-
-        A motion rests at the phases 0 and pi, of which the smaller value counts.
-        """
-        harmonics = self.balance(point.order).unpack(point.x).real
-        orders = np.arange(point.order + 1)
-        at_zero = np.abs(harmonics @ orders**2).max()
-        at_pi = np.abs(harmonics @ (orders**2 * (-1.0) ** orders)).max()
-        return float(min(at_zero, at_pi) / np.abs(harmonics).sum(axis=1).max())
-
     def from_mode(self, z: np.ndarray, omega: float) -> Point:
         """Return motion near a linear mode of frequency ``omega`` (rad/s) with the elongations ``z`` (pairs,) in m."""
         return self.refined(self.guess(self.one_harmonic(z), omega))

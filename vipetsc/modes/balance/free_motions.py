@@ -217,6 +217,17 @@ class FreeMotions(OrbitProblem, Generic[E]):
     def new_equations(self, order: int) -> E:
         """Return the equations of motions with harmonics up to ``order``."""
 
+    def acceleration(self, point: Point) -> float:
+        """Return the largest acceleration where a motion rests, over that of a harmonic motion of the same size.
+
+        A motion rests at the phases 0 and pi, of which the smaller value counts.
+        """
+        harmonics = self.balance(point.order).unpack(point.x).real
+        orders = np.arange(point.order + 1)
+        at_zero = np.abs(harmonics @ orders**2).max()
+        at_pi = np.abs(harmonics @ (orders**2 * (-1.0) ** orders)).max()
+        return float(min(at_zero, at_pi) / np.abs(harmonics).sum(axis=1).max())
+
     def balance(self, order: int) -> E:
         """Return the equations of motions with harmonics up to ``order``, made once."""
         if order not in self._equations:
