@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import vipetsc
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.cost import expected_episodes
+from vipetsc.dynamics.cost import MOVING_ON, expected_episodes
 from vipetsc.dynamics.plan import choose_engine
 from vipetsc.lattice.sites import sites_at
 
 CYCLES = 10
+EXAMPLES = Path(vipetsc.__file__).parent / "examples"
 
 
 def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: float) -> Model:
@@ -49,6 +52,15 @@ def test_contacts_are_expected_of_every_pair_at_every_stop(contacts, stops):
     burst = {"cycles": CYCLES}
     assert expected_episodes(chain_with_a_stop(contacts, burst, over=2.0)) == pytest.approx(stops * CYCLES / 2)
     assert expected_episodes(chain_with_a_stop(contacts, burst, over=0.99)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("example", "came"), [("four-band", 181), ("stops", 95), ("three-mass", 100), ("damped", 393), ("disorder", 210)]
+)
+def test_the_contacts_of_shipped_bursts_are_foretold_within_a_factor_of_two(example, came):
+    """``came`` are the contacts of the runs; with disorder they depend on its seed."""
+    model = Case.load(EXAMPLES / f"{example}.toml").model()
+    assert 0.5 < MOVING_ON * expected_episodes(model) / came < 2.0
 
 
 def test_a_sine_that_does_not_end_is_beyond_a_clearance_all_the_time():

@@ -131,6 +131,18 @@ def test_a_ball_bounces_in_a_geometric_series_and_rests(restitution, engine):
     assert data["displacement"].values[-1].item() == pytest.approx(-1.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_ball_without_loss_bounces_for_ever(engine):
+    """With r = 1 all impacts have one speed v, are 2 v/g apart, and have the impulse 2 v."""
+    log, _ = impacts(ball(1.0, engine, time={"end": 60.0}))
+    speed = -log["approach_velocity"]
+    assert len(speed) > 25
+    np.testing.assert_allclose(speed, speed[0], rtol=1e-11)
+    np.testing.assert_allclose(np.diff(log["onset"]), 2 * speed[0] / GRAVITY, rtol=1e-10)
+    np.testing.assert_allclose(log["impulse"], 2 * speed[0], rtol=1e-11)
+    assert not log["loss"].any()
+
+
 @pytest.mark.parametrize("damping", ["exact", "paper"])
 @pytest.mark.parametrize(("law", "least", "factor"), [("bilinear", 1e4, 100.0), ("hertz", 1e5, 1000.0)])
 def test_stiff_stops_come_to_the_rigid_answer_with_the_duration_of_their_contact(law, least, factor, damping):

@@ -168,6 +168,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         ("begins with", begins_with),
         *_drive_rows(case),
         ("wave/clearance", _closing(model)),
+        ("contacts", _contacts_of_burst(model)),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("points", ", ".join(map(partial(point_text, case), case.output.points or []))),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
@@ -185,6 +186,18 @@ def _closing(model: Model) -> str:
         return ""
     ratios = wave_over_clearance(model).max(axis=1)
     return first_few([f"{ratio:.3g}" if ratio < np.inf else "touching" for ratio in ratios])
+
+
+def _contacts_of_burst(model: Model) -> str:
+    """Return about how many contacts a burst causes; "" without a burst of one wave, a site, or a contact."""
+    from vipetsc.dynamics.cost import MOVING_ON, expected_episodes
+
+    if not (model.chain.sites and sends_one_wave(model)) or model.drive.repeats:
+        return ""
+    count = MOVING_ON * expected_episodes(model)
+    if not 0 < count < np.inf:
+        return ""
+    return f"about {float(f'{count:.2g}'):g}, within a factor of two; more where waves return to the sites"
 
 
 def _drive_rows(case: Case) -> Rows:
