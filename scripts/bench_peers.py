@@ -221,7 +221,8 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         u = y[:n]
         force = stiffness @ -u
-        push = contact.force(u[resonator] - u[host], clearance)
+        w = u[resonator] - u[host]
+        push = contact.elastic_force(w - clearance) - contact.elastic_force(-w - clearance)
         force[host] += push
         force[resonator] -= push
         force[driven] += drive.force(t)

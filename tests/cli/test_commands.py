@@ -60,7 +60,7 @@ run --log no/run.log -> --log
 run run.toml --out thesis -> --out
 run run.toml --out thesis --force -> --out
 fly -> fly
-plot nowhere -> run.h5
+plot nowhere -> no such folder
 plot text -> run.h5
 plot foreign -> branch
 analyse thesis -> run.h5

@@ -98,7 +98,7 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
 
     # After ``count`` modes the search looks for missed ones, and ends with the first mode that is not nearer.
     assert len(starts) <= count + 3
-    every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
+    every = np.array([mode_frequency(chain, number) for number in range(1, matrices.size + 1)])
     nearest = np.sort(every[np.argsort(np.abs(every - near), kind="stable")[:count]])
     assert modes.frequency == pytest.approx(nearest, rel=1e-9, abs=1e-3)
     assert modes.residual.max() < 1e-9
