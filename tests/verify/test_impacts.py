@@ -218,14 +218,17 @@ def test_masses_that_stick_go_on_together(engine):
 
 
 def squeezed(engine: str, restitution: list[float], stops: dict[str, Any]) -> Case:
-    """Nine free masses on springs; a mass away from the drive has stops without clearance on either side."""
-    spring = {"start": 1, "end": 1, "stiffness": 7e4, "next_cell": True}
+    """Nine free masses on springs; a mass away from the drive has stops without clearance on either side.
+
+    With these numbers the propagator found impacts without end before the wave arrives.
+    """
+    spring = {"start": 1, "end": 1, "stiffness": 71659.84644628169, "next_cell": True}
     table = {
-        "lattice": {"cells": 9, "ends": "free", "cell": {"masses": [0.1], "springs": [spring]}},
+        "lattice": {"cells": 9, "ends": "free", "cell": {"masses": [0.10012481406840146], "springs": [spring]}},
         "contacts": {"law": "rigid", "clearance": 0.0, "sites": stops["sites"]}
         | {"each": {"restitution": restitution} | {key: stops[key] for key in ("pair", "next_cell", "side")}},
-        "drive": {"amplitude": 200.0, "frequency": 550.0, "cycles": 4, "cell": 5},
-        "time": {"end": 0.06, "sample_interval": 5e-4, "engine": engine},
+        "drive": {"amplitude": 203.24667862356733, "frequency": 550.0, "cycles": 4, "cell": 5},
+        "time": {"end": 0.06, "samples": 121, "engine": engine},
     }
     return Case.from_table(table)
 

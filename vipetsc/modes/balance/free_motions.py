@@ -220,7 +220,8 @@ class FreeMotions(OrbitProblem, Generic[E]):
     def acceleration(self, point: Point) -> float:
         """Return the largest acceleration where a motion rests, over that of a harmonic motion of the same size.
 
-        A motion rests at the phases 0 and pi, of which the smaller value counts.
+        A motion rests at the phases 0 and pi, of which the smaller value counts. With dashpots its masses rest a little
+        apart; near an equilibrium all of them still hardly accelerate there.
         """
         harmonics = self.balance(point.order).unpack(point.x).real
         orders = np.arange(point.order + 1)
